@@ -1,4 +1,4 @@
-"""Cost of the equations of motion with 1 to 64 exciters.
+"""Cost of the equations of motion, and of a step of averaged runs, with 1 to 64 exciters.
 
     python benchmarks/exciters/cost_by_count.py
 
@@ -63,14 +63,33 @@ def row(count: int) -> tuple[int, int, float, float]:
     return operations(field, state), flops, first, min(later)
 
 
+def averaged_row(count: int) -> tuple[float, float]:
+    """Return seconds of the first averaged run, and of a step of a later one."""
+    scene, times = screen(count), []
+    for _ in range(5):
+        begun = time.process_time()
+        run = jv.envelope(scene, 5.0, save="window", throw=False)
+        jax.block_until_ready(run.omega)
+        times.append(time.process_time() - begun)
+    return times[0], min(times[1:]) / int(run.steps + run.rejected)
+
+
 def main() -> None:
     first = None
+    print("equations of motion")
     print("exciters  program operations  arithmetic operations  first call  later call (each relative to 1 exciter)")
     for count in COUNTS:
         found = row(count)
         first = found if first is None else first
         ratios = "  ".join(f"{a / b:8.2f}" for a, b in zip(found, first, strict=True))
         print(f"{count:8d}  {found[0]:6d} {found[1]:6d} {found[2]:7.2f} s {1e9 * found[3]:8.0f} ns   {ratios}")
+    first = None
+    print("averaged run, 5 s\nexciters  first call  step of a later call (each relative to 1 exciter)")
+    for count in COUNTS:
+        averaged = averaged_row(count)
+        first = averaged if first is None else first
+        ratios = "  ".join(f"{a / b:8.2f}" for a, b in zip(averaged, first, strict=True))
+        print(f"{count:8d}  {averaged[0]:7.2f} s {1e6 * averaged[1]:8.1f} us   {ratios}")
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ antiphase paper in general form.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import equinox as eqx
@@ -59,6 +59,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.linear import LinearModel, linear_model, require_circular, require_terms, turning_loads
+from jaxvib.equations.model import Group, grouped, ungroup
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, within
 from jaxvib.machine.carrier import Mount
@@ -110,10 +111,13 @@ class Averaged(eqx.Module):
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G or None, (nd, nd), where M includes the loads' masses
     - `port` (levers, p, nd): B and, if loads have stations, T, of each exciter, in the p directions of the mount;
       `input_matrix`: M^-1 times their transposes, (levers, p, nd)
-    - `levers` g (levers, count): 1 and, if loads have stations, s_j in m; 0 for the rows of other exciters
+    - `levers` g (levers, count): 1 and, if loads have stations, s_j in m; 0 for the rows of other exciters. None if there would
+      be more rows than coordinates: then `port` and `input_matrix` have a row B_j for each mass, and the equations are solved
+      for the accelerations of the coordinates, so that their cost is linear in the number of masses
     - `unbalance` S_j kg m, `inertia` I_j kg m^2, `drag` D_j N m s of each rotating mass, all (count,)
-    - of each exciter: `drives`; `counts`, the number of its loads, 0 for an unbalance; `directions` of rotation
-    - `owners` (levers,): the exciter of each row of `levers`
+    - `groups` of the exciters' drives, see `Group`
+    - of each exciter: `counts`, the number of its loads, 0 for an unbalance; `directions` of rotation
+    - `owners`: the exciter of each row of `port`
     """
 
     stiffness: Array
@@ -121,21 +125,27 @@ class Averaged(eqx.Module):
     gyroscopic: Array | None
     input_matrix: Array
     port: Array
-    levers: Array
+    levers: Array | None
     unbalance: Array
     inertia: Array
     drag: Array
-    drives: tuple[Drive, ...]
+    groups: tuple[Group[Drive], ...]
     axes: tuple[int, ...] = eqx.field(static=True)
     counts: tuple[int, ...] = eqx.field(static=True)
     directions: tuple[int, ...] = eqx.field(static=True)
     owners: tuple[int, ...] = eqx.field(static=True)
 
     @property
+    def drives(self) -> tuple[Drive, ...]:
+        """The drives of the exciters, in order."""
+        return tuple(ungroup(self.groups, (group.part for group in self.groups)))
+
+    @property
     def is_prescribed(self) -> np.ndarray:
         """True for the unbalances under ideal drives, whose speed is prescribed, (count,)."""
-        flags = [[count == 0 and drive.ideal] * max(count, 1) for count, drive in zip(self.counts, self.drives, strict=True)]
-        return np.concatenate(flags)
+        ideal = {k for group in self.groups if group.part.ideal for k in group.members}
+        each = [[count == 0 and k in ideal] * max(count, 1) for k, count in enumerate(self.counts)]
+        return np.concatenate(each)
 
     @property
     def free_shifts(self) -> int:
@@ -144,6 +154,18 @@ class Averaged(eqx.Module):
 
     def __call__(self, t: Array, state: Amplitudes) -> Amplitudes:
         """Return the time derivative of `state` at time `t`."""
+        acceleration, rate, _ = self._accelerations(t, state)
+        turn = 1j * jnp.mean(state.rate)
+        return Amplitudes(
+            displacement=state.velocity - turn * state.displacement,
+            velocity=acceleration - turn * state.velocity,
+            rate=rate,
+            phase=state.rate - turn.imag,
+        )
+
+    def _accelerations(self, t: Array, state: Amplitudes) -> tuple[Array, Array, Array]:
+        """Return the acceleration A (nd,), the accelerations of the masses (count,), and the forward circular part of A at each
+        mass (count,)."""
         speeds = self.rotor_speeds(t, state.rate)
         at = jnp.cos(state.phase) + 1j * jnp.sin(state.phase)
         free = self.driving_torque(t, speeds, state.rate) / self.inertia
@@ -158,9 +180,10 @@ class Averaged(eqx.Module):
         output_row = jnp.sum(self.port * jnp.conj(circle), axis=1)
 
         def unbalance_force(rate: Array) -> Array:
-            return jnp.sum(levers * (self.unbalance * at * (state.rate**2 - 1j * rate))[None, :], axis=-1)
+            force = self.unbalance * at * (state.rate**2 - 1j * rate)
+            return force if levers is None else jnp.sum(levers * force[None, :], axis=-1)
 
-        if levers.shape[0] > unforced.shape[0]:
+        if levers is None:
             acceleration, forward = self._solve_in_coordinates(input_column, output_row, at, unforced, unbalance_force(free))
             rate = free + mean_torque(self.unbalance, jnp.conj(at) * forward) / self.inertia
         else:
@@ -172,40 +195,97 @@ class Averaged(eqx.Module):
             forward = jnp.sum(levers * _with_conjugate(alone, mirrored, right)[:, None], axis=0)
             rate = free + mean_torque(self.unbalance, jnp.conj(at) * forward) / self.inertia
             acceleration = unforced + jnp.sum(input_column * unbalance_force(rate)[:, None], axis=0)
-        turn = 1j * jnp.mean(state.rate)
-        return Amplitudes(
-            displacement=state.velocity - turn * state.displacement,
-            velocity=acceleration - turn * state.velocity,
-            rate=rate,
-            phase=state.rate - turn.imag,
-        )
+        return acceleration, rate, forward
 
-    def _solve_in_coordinates(
-        self, input_column: Array, output_row: Array, at: Array, unforced: Array, force: Array
-    ) -> tuple[Array, Array]:
+    def shifted_inverse(self, t: Array, state: Amplitudes, shift: Array) -> Callable[[Amplitudes], Amplitudes]:
+        """Return the function that maps r to the solution x of (shift - J) x = r, with the Jacobian J of this field at `state`.
+
+        A mass depends on the other masses only through the changes z of V and of Omega. For given z its own two unknowns follow
+        from one division. The remaining equations for z are few, and the cost is linear in the number of masses:
+
+            (shift - a - b/shift) dw = Re(c^H dA) + r_w + (b/shift) (r_psi - dOmega),   shift dpsi = dw - dOmega + r_psi
+            (shift + i Omega) (dY, dV) = (dV - i Y dOmega + r_Y, dA - i V dOmega + r_V),   dOmega = mean of dw
+
+        Here a and b are the derivatives of a mass's acceleration w' with respect to its speed and its phase, Re(c^H dA) is its
+        derivative along the change dA of the acceleration, and dA follows from the equation of the carrier.
+        """
+        _, rate, forward = self._accelerations(t, state)
+        omega, nd = jnp.mean(state.rate), state.velocity.shape[0]
+        turn, circle = jnp.cos(state.phase) + 1j * jnp.sin(state.phase), self._circle()
+        u, v = (jnp.sum(each, axis=1) for each in (self.input_matrix * circle, self.port * jnp.conj(circle)))
+        if self.levers is not None:
+            u, v = (jnp.matmul(self.levers.T, each, precision="highest") for each in (u, v))
+
+        def free(w: Array) -> Array:
+            return self.driving_torque(t, self.rotor_speeds(t, w), w) / self.inertia
+
+        def gyroscopic_speed(w: Array) -> Array:
+            return self.gyroscopic_speed(self.rotor_speeds(t, w))
+
+        by_rate = jax.jvp(free, (state.rate,), (jnp.ones_like(state.rate),))[1]
+        by_phase = self.unbalance * (jnp.conj(turn) * forward).real / (2.0 * self.inertia) / shift
+        own = 1.0 / (shift - by_rate - by_phase)
+        force = self.unbalance * turn * (state.rate**2 - 1j * rate)
+        spin = shift + 1j * omega
+
+        def completed(z: Array, r: Amplitudes) -> tuple[Array, Amplitudes]:
+            """Return what is left of the equations for the changes z, and the solution if nothing is left."""
+            dv, domega = z[:nd] + 1j * z[nd : 2 * nd], z[2 * nd]
+            da = spin * dv + 1j * state.velocity * domega - r.velocity
+            dy = (dv - 1j * state.displacement * domega + r.displacement) / spin
+            along = mean_torque(self.unbalance, jnp.conj(turn) * jnp.sum(v * da[None, :], axis=-1)) / self.inertia
+            dw = own * (along + r.rate + by_phase * (r.phase - domega))
+            dpsi = (dw - domega + r.phase) / shift
+            dforce = self.unbalance * turn * (2.0 * state.rate * dw - 1j * (shift * dw - r.rate)) + 1j * force * dpsi
+            carrier = jnp.sum(u * dforce[:, None], axis=0) - times(self.stiffness, dy) - times(self.damping, dv)
+            if self.gyroscopic is not None:
+                speed, change = jax.jvp(gyroscopic_speed, (state.rate,), (dw,))
+                carrier = carrier - times(self.gyroscopic, speed * dv + change * state.velocity)
+            left = da - carrier
+            return jnp.concatenate([left.real, left.imag, (domega - jnp.mean(dw))[None]]), Amplitudes(dy, dv, dw, dpsi)
+
+        nothing = jax.tree.map(jnp.zeros_like, state)
+        unit = jnp.eye(2 * nd + 1, dtype=rate.dtype)
+        inverse = unrolled_inverse(jax.vmap(lambda z: completed(z, nothing)[0], out_axes=1)(unit))
+
+        def solve(r: Amplitudes) -> Amplitudes:
+            left = completed(jnp.zeros_like(unit[0]), r)[0]
+            return completed(-jnp.sum(inverse * left[None, :], axis=1), r)[1]
+
+        return solve
+
+    def _solve_in_coordinates(self, u: Array, v: Array, at: Array, unforced: Array, force: Array) -> tuple[Array, Array]:
         """Return the acceleration A (nd,) and its forward circular part at each rotating mass (count,).
 
         It is the solution of (1 - sum_j h_j u_j v_j^T) A + sum_j h_j e^{2 i psi_j} u_j conj(v_j)^T conj(A) = right side, with
         u_j = M^-1 B_j^T e and v_j = e^H B_j. The cost is linear in the number of rotating masses.
         """
-        u, v = (jnp.matmul(self.levers.T, each, precision="highest") for each in (input_column, output_row))
         weighted = (self.unbalance**2 / (4.0 * self.inertia))[:, None] * u
         alone = jnp.eye(unforced.shape[0]) - jnp.matmul(weighted.T, v, precision="highest")
         mirrored = jnp.matmul((weighted * (at**2)[:, None]).T, jnp.conj(v), precision="highest")
-        acceleration = _with_conjugate(alone, mirrored, unforced + jnp.sum(input_column * force[:, None], axis=0))
+        acceleration = _with_conjugate(alone, mirrored, unforced + jnp.sum(u * force[:, None], axis=0))
         return acceleration, times(v, acceleration)
 
     def rotor_speeds(self, t: Array, rate: Array) -> list[Array]:
-        """Return the speed of each exciter's rotor in its direction, rad/s, from the rates (count,) of the rotating masses."""
+        """Return the rotor speeds of each group in their directions, rad/s, from the rates (count,) of the rotating masses."""
+
+        def speed(drive: Drive, first: Array | None) -> Array:
+            return drive.rotor_speed(t, None if first is None else (jnp.zeros_like(t), first))
+
         begins = np.cumsum([0, *(max(count, 1) for count in self.counts)])
+        first = (begins[list(group.members)] for group in self.groups)
         return [
-            drive.rotor_speed(t, None if drive.ideal else (jnp.zeros_like(t), rate[begin]))
-            for drive, begin in zip(self.drives, begins, strict=False)
+            group.each(speed, None if group.part.ideal else rate[at[0] if at.size == 1 else at])
+            for group, at in zip(self.groups, first, strict=True)
         ]
 
+    def by_exciter(self, values: Sequence[Array]) -> list[Array]:
+        """Return the values of each exciter from those of each group."""
+        return ungroup(self.groups, values)
+
     def gyroscopic_speed(self, speeds: Sequence[Array]) -> Array:
-        """Return the mean of the rotors' `speeds`, anticlockwise, by which the gyroscopic matrix is multiplied, rad/s."""
-        turned = [n if way == 1 else -n for way, n in zip(self.directions, speeds, strict=True)]
+        """Return the mean of the `rotor_speeds`, anticlockwise, by which the gyroscopic matrix is multiplied, rad/s."""
+        turned = [n if way == 1 else -n for way, n in zip(self.directions, self.by_exciter(speeds), strict=True)]
         return turned[0] if len(turned) == 1 else sum(turned[1:], turned[0]) / len(turned)
 
     def driving_torque(self, t: Array, speeds: Sequence[Array], rate: Array) -> Array:
@@ -214,23 +294,43 @@ class Averaged(eqx.Module):
         The torque is 0 for an unbalance of prescribed speed. `t`, s; `speeds` of the rotors, see `rotor_speeds`; `rate`
         (count,) rad/s.
         """
-        if len(self.drives) == 1 and self.counts[0]:
+        if len(self.counts) == 1 and self.counts[0]:
             return self.drag * (speeds[0] - rate)
-        torques, begin = [], 0
-        for drive, count, n in zip(self.drives, self.counts, speeds, strict=True):
-            here = slice(begin, begin + max(count, 1))
-            motor = drive.torque_and_inertia(t, n)
-            torques.append(self.drag[here] * (n - rate[here]) if count or motor is None else motor[0][None])
-            begin = here.stop
-        return jnp.concatenate(torques)
+        torques = []
+        for group, masses, n in zip(self.groups, self._masses_of_groups(), speeds, strict=True):
+            motor, count = group.each(lambda drive, n: drive.torque_and_inertia(t, n), n), self.counts[group.members[0]]
+            if count or motor is None:
+                n = n if n.ndim == 0 else jnp.repeat(n, max(count, 1))
+                torques.append(self.drag[masses] * (n - rate[masses]))
+            else:
+                torques.append(motor[0][None] if n.ndim == 0 else motor[0])
+        return self._in_order(torques)
 
     def _prescribed_acceleration(self, t: Array) -> Array:
         """Return the accelerations of the masses of prescribed speed, 0 for others, (count,) rad/s^2."""
         each = []
-        for drive, count in zip(self.drives, self.counts, strict=True):
-            change = None if count else drive.rotor_acceleration(t)
-            each.append(jnp.zeros(max(count, 1), self.drag.dtype) if change is None else change[None])
-        return jnp.concatenate(each)
+        for group in self.groups:
+            count = self.counts[group.members[0]]
+            change = None if count else group.each(lambda drive: drive.rotor_acceleration(t))
+            if change is None:
+                each.append(jnp.zeros(len(group.members) * max(count, 1), self.drag.dtype))
+            else:
+                each.append(change[None] if change.ndim == 0 else change)
+        return self._in_order(each)
+
+    def _masses_of_groups(self) -> list[slice | np.ndarray]:
+        """Return the numbers of the rotating masses of each group."""
+        ends = np.cumsum([max(count, 1) for count in self.counts])
+        each = [np.arange(end - max(count, 1), end) for count, end in zip(self.counts, ends, strict=True)]
+        found = (np.concatenate([each[k] for k in group.members]) for group in self.groups)
+        return [slice(at[0], at[-1] + 1) if at[-1] - at[0] + 1 == at.size else at for at in found]
+
+    def _in_order(self, values: Sequence[Array]) -> Array:
+        """Return values (count,) of all masses in order from those of each group."""
+        masses = np.arange(self.drag.size)
+        places = np.concatenate([masses[at] for at in self._masses_of_groups()])
+        together = jnp.concatenate(values)
+        return together if np.array_equal(places, masses) else together[np.argsort(places)]
 
     def ripple(self, state: Amplitudes) -> Array:
         """Return the amplitude of each load's angle under the dropped torque, (count,) rad.
@@ -238,7 +338,7 @@ class Averaged(eqx.Module):
         S |e^T B i Omega V| / (2 I (2 Omega)^2)
         """
         backward = times(jnp.sum(self.port * self._circle(), axis=1), state.velocity)
-        backward = jnp.sum(self.levers * backward[:, None], axis=0)
+        backward = backward if self.levers is None else jnp.sum(self.levers * backward[:, None], axis=0)
         size = magnitude(backward)
         omega = jnp.abs(jnp.mean(state.rate))
         turning = omega > 0.0
@@ -307,6 +407,11 @@ def averaged_model(model: LinearModel) -> Averaged:
     stiffness, damping = solved[:, :n], solved[:, n : 2 * n]
     solved_gyroscopic = None if gyroscopic is None else solved[:, 2 * n + p :]
     input_matrix = solved[:, 2 * n : 2 * n + p].T.reshape(port.shape)
+    owners = tuple(k for k, mount in enumerate(mounts) for _ in mount.levers)
+    counts = tuple(0 if exciter.loads is None else exciter.loads.count for exciter in exciters)
+    if in_coordinates := len(owners) > n:
+        port, input_matrix = _rows_of_masses(levers, port), _rows_of_masses(levers, input_matrix)
+        owners = tuple(k for k, each in enumerate(levers) for _ in range(each.shape[1]))
     numbers = (_rotating_masses(exciter, model.mass.dtype) for exciter in exciters)
     unbalance, inertia, drag = (parts[0] if len(parts) == 1 else jnp.concatenate(parts) for parts in zip(*numbers, strict=True))
     return Averaged(
@@ -315,15 +420,15 @@ def averaged_model(model: LinearModel) -> Averaged:
         gyroscopic=solved_gyroscopic,
         input_matrix=input_matrix,
         port=port,
-        levers=levers[0] if len(levers) == 1 else _block_diagonal(levers),
+        levers=None if in_coordinates else levers[0] if len(levers) == 1 else _block_diagonal(levers),
         unbalance=unbalance,
         inertia=inertia,
         drag=drag,
-        drives=tuple(exciter.drive for exciter in exciters),
+        groups=grouped([exciter.drive for exciter in exciters], counts),
         axes=mounts[0].axes,
-        counts=tuple(0 if exciter.loads is None else exciter.loads.count for exciter in exciters),
+        counts=counts,
         directions=tuple(exciter.direction for exciter in exciters),
-        owners=tuple(k for k, mount in enumerate(mounts) for _ in mount.levers),
+        owners=owners,
     )
 
 
@@ -348,6 +453,12 @@ def _rotating_masses(exciter: Exciter, dtype: jnp.dtype) -> tuple[Array, Array, 
     unbalance = each(loads.mass * loads.radius)
     inertia = each(loads.inertia_factor() * loads.mass * loads.radius**2)
     return unbalance, inertia, each(loads.drag * loads.radius**2)
+
+
+def _rows_of_masses(levers: Sequence[Array], rows: Array) -> Array:
+    """Return the rows (count, p, nd) of all masses from those of the exciters' levers (levers, p, nd)."""
+    each = jnp.split(rows, np.cumsum([len(own) for own in levers])[:-1])
+    return jnp.concatenate([jnp.einsum("lj,lpa->jpa", *pair, precision="highest") for pair in zip(levers, each, strict=True)])
 
 
 def _block_diagonal(blocks: Sequence[Array]) -> Array:

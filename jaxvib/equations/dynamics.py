@@ -6,11 +6,10 @@ import dataclasses
 import functools
 import itertools
 import operator
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -24,7 +23,7 @@ from jaxvib.equations.exciter import (
     signed,
     without_coupling,
 )
-from jaxvib.equations.model import Model, assemble
+from jaxvib.equations.model import Group, Model, assemble, grouped, stack_members, ungroup
 from jaxvib.equations.sliding import ContactSolution
 from jaxvib.equations.state import State
 from jaxvib.machine.carrier import Mount
@@ -33,40 +32,6 @@ from jaxvib.machine.effects.terms import RotorImbalance, SupportForce
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import small_inverse, small_solve, solve_definite, times
-from jaxvib.runtime.structure import leaf_key
-
-_MIN_GROUP_SIZE = 8
-"""Smallest number of exciters of equal structure that are computed as one group."""
-
-
-class _Group(eqx.Module):
-    """One exciter, or many of equal structure as one whose arrays have a leading axis over them.
-
-    `members`: the numbers of the exciters.
-    """
-
-    exciter: RotorDynamics
-    members: tuple[int, ...] = eqx.field(static=True)
-
-    def each(self, function: Callable[..., Any], *values: Any) -> Any:
-        """Return function(exciter, *values) of each member."""
-        return (function if len(self.members) == 1 else eqx.filter_vmap(function))(self.exciter, *values)
-
-
-def _stack_members(members: Sequence[int], trees: Sequence[Any]) -> Any:
-    """Return the trees of the `members` as one tree, with a leading axis over the members if there are several."""
-    if len(members) == 1:
-        return trees[members[0]]
-    return jax.tree.map(lambda *x: jnp.stack(x), *(trees[k] for k in members))
-
-
-def _ungroup(groups: Iterable[_Group], trees: Iterable[Any]) -> list[Any]:
-    """Return the trees of all exciters in the order of the exciters, from the trees of their groups."""
-    of_exciter = {}
-    for group, tree in zip(groups, trees, strict=True):
-        for i, k in enumerate(group.members):
-            of_exciter[k] = tree if len(group.members) == 1 else jax.tree.map(lambda x, i=i: x[i], tree)
-    return [of_exciter[k] for k in range(len(of_exciter))]
 
 
 class _Support(eqx.Module):
@@ -90,7 +55,7 @@ class Dynamics(eqx.Module):
     - `input_matrix` M^-1 P^T (nd, nP): acceleration per force on the rows
     - `accelerance` P M^-1 P^T (nP, nP), and `rows` P (nP, nd)
     - `mass` M (nd, nd) if P has more rows than there are coordinates, otherwise None
-    - `groups` of the exciters, see `_Group`; `supports`, a place for each `SupportForce`
+    - `groups` of the exciters, see `Group`; `supports`, a place for each `SupportForce`
     """
 
     stiffness: Array
@@ -100,13 +65,13 @@ class Dynamics(eqx.Module):
     accelerance: Array
     rows: Array
     mass: Array | None
-    groups: tuple[_Group, ...]
+    groups: tuple[Group[RotorDynamics], ...]
     supports: tuple[_Support, ...]
 
     @property
     def exciters(self) -> list[RotorDynamics]:
         """The exciters of the scene, in order."""
-        return _ungroup(self.groups, (group.exciter for group in self.groups))
+        return ungroup(self.groups, (group.part for group in self.groups))
 
     def __call__(self, t: Array, state: State) -> State:
         """Return the time derivative of `state` at time `t`.
@@ -116,7 +81,7 @@ class Dynamics(eqx.Module):
         equation per row, for any number of platforms and loads. If there are more rows than coordinates, q'' follows from
         (M + P^T W P) q'' = M q''_free - P^T g instead.
         """
-        states = [_stack_members(group.members, state.exciters) for group in self.groups]
+        states = [stack_members(group.members, state.exciters) for group in self.groups]
         speeds = self._each(lambda exciter, own: exciter.drive.rotor_speed(t, own.rotor), states)
         unforced = self._unforced(state, speeds)
         housings = self._each(lambda exciter: exciter.housing_speed(state.velocity))
@@ -136,11 +101,11 @@ class Dynamics(eqx.Module):
             )
         solved, carrier = solve(contacts)
         rolling = contacts
-        if any(group.exciter.can_slide for group in self.groups):
+        if any(group.part.can_slide for group in self.groups):
             sliding = self._each(lambda exciter, *given: exciter.slide(*given[:2], *given[2]), motions, contacts, solved)
             solved, carrier = solve(sliding)
         rates = self._each(lambda exciter, *given: exciter.rates(*given[:2], *given[2]), motions, rolling, solved)
-        return State(state.velocity, carrier, exciters=_ungroup(self.groups, rates))
+        return State(state.velocity, carrier, exciters=ungroup(self.groups, rates))
 
     def _each(self, function: Callable[..., Any], *values: Sequence[Any]) -> list[Any]:
         """Return function(exciter, *values) of each exciter, by group."""
@@ -167,7 +132,7 @@ class Dynamics(eqx.Module):
         """Return the accelerations of the carrier without exciters."""
         flow = -times(self.stiffness, state.displacement) - times(self.damping, state.velocity)
         if self.gyroscopic is not None:
-            each = _ungroup(self.groups, speeds)
+            each = ungroup(self.groups, speeds)
             speed = each[0] if len(each) == 1 else sum(each[1:], each[0]) / len(each)
             flow = flow - speed * times(self.gyroscopic, state.velocity)
         effects = self.exciters[0].effects if self.supports else ()
@@ -276,7 +241,7 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
     """Return `vector_field` of a scene that is already assembled. `solve` returns x of a x = b, where a is the mass matrix."""
     scene, carrier, gyroscopic = model.scene, model.carrier, model.mounts[0].gyroscopic
     exciters = [_exciter_dynamics(*each, scene.effects) for each in zip(scene.exciters, model.mounts, strict=True)]
-    groups, moving = _groups(exciters), []
+    groups, moving = grouped(exciters), []
     for k in itertools.chain.from_iterable(group.members for group in groups):
         turn = exciters[k].turn
         moving += [*model.mounts[k].rows[: exciters[k].row_count], *([] if turn is None else [turn])]
@@ -297,16 +262,6 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
         groups=groups,
         supports=tuple(map(_Support, model.supports, rest)),
     )
-
-
-def _groups(exciters: Sequence[RotorDynamics]) -> tuple[_Group, ...]:
-    """Return exciters in groups of equal structure. A group of fewer than `_MIN_GROUP_SIZE` is divided into single exciters."""
-    kinds: dict[Hashable, list[int]] = {}
-    for k, exciter in enumerate(exciters):
-        leaves, structure = jax.tree.flatten(exciter)
-        kinds.setdefault((structure, *map(leaf_key, leaves)), []).append(k)
-    groups = [group for kind in kinds.values() for group in ([kind] if len(kind) >= _MIN_GROUP_SIZE else [[k] for k in kind])]
-    return tuple(_Group(_stack_members(members, exciters), tuple(members)) for members in sorted(groups))
 
 
 def _exciter_dynamics(exciter: Exciter, mount: Mount, shared: tuple[Effect, ...]) -> RotorDynamics:

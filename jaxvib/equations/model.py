@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -14,6 +17,55 @@ from jaxvib.machine.carrier import Carrier, Mount
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import SupportForce
 from jaxvib.machine.scene import Scene
+from jaxvib.runtime.structure import leaf_key
+
+_MIN_GROUP_SIZE = 8
+"""Smallest number of parts of equal structure that are computed as one group."""
+
+Part = TypeVar("Part")
+
+
+class Group(eqx.Module, Generic[Part]):
+    """One part of an exciter, or many of equal structure as one whose arrays have a leading axis over them.
+
+    `members`: the numbers of their exciters.
+    """
+
+    part: Part
+    members: tuple[int, ...] = eqx.field(static=True)
+
+    def each(self, function: Callable[..., Any], *values: Any) -> Any:
+        """Return function(part, *values) of each member."""
+        return (function if len(self.members) == 1 else eqx.filter_vmap(function))(self.part, *values)
+
+
+def grouped(parts: Sequence[Part], kinds: Sequence[Hashable] | None = None) -> tuple[Group[Part], ...]:
+    """Return parts in groups of equal structure, and of equal `kinds` if these are given.
+
+    A group of fewer than `_MIN_GROUP_SIZE` is divided into single parts.
+    """
+    alike: dict[Hashable, list[int]] = {}
+    for k, part in enumerate(parts):
+        leaves, structure = jax.tree.flatten(part)
+        alike.setdefault((structure, kinds and kinds[k], *map(leaf_key, leaves)), []).append(k)
+    groups = [group for same in alike.values() for group in ([same] if len(same) >= _MIN_GROUP_SIZE else [[k] for k in same])]
+    return tuple(Group(stack_members(members, parts), tuple(members)) for members in sorted(groups))
+
+
+def stack_members(members: Sequence[int], trees: Sequence[Any]) -> Any:
+    """Return the trees of the `members` as one tree, with a leading axis over the members if there are several."""
+    if len(members) == 1:
+        return trees[members[0]]
+    return jax.tree.map(lambda *x: jnp.stack(x), *(trees[k] for k in members))
+
+
+def ungroup(groups: Iterable[Group], trees: Iterable[Any]) -> list[Any]:
+    """Return the trees of all exciters in the order of the exciters, from the trees of their groups."""
+    of_exciter = {}
+    for group, tree in zip(groups, trees, strict=True):
+        for i, k in enumerate(group.members):
+            of_exciter[k] = tree if len(group.members) == 1 else jax.tree.map(lambda x, i=i: x[i], tree)
+    return [of_exciter[k] for k in range(len(of_exciter))]
 
 
 class Model(eqx.Module):

@@ -26,6 +26,7 @@ from jax import Array
 
 from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torque
 from jaxvib.equations.linear import ExcitedModel, LinearModel, linear_model, rotating_direction
+from jaxvib.equations.model import grouped
 from jaxvib.machine.carrier import Mount
 from jaxvib.machine.drives.drive import ConstantSpeed, Drive, Motor
 from jaxvib.machine.effects.base import has_term, terms_of
@@ -91,7 +92,7 @@ class TorqueBalance(eqx.Module):
         return self.averaged.driving_torque(jnp.full_like(rate[0], LATE), self.rotor_speeds(rate), rate)
 
     def rotor_speeds(self, rate: Array) -> list[Array]:
-        """Return the speed of each exciter's rotor in its direction, from the speeds `rate` (count,) of the masses."""
+        """Return the rotor speeds of each group from the speeds `rate` (count,) of the masses, see `Averaged.rotor_speeds`."""
         return self.averaged.rotor_speeds(jnp.full_like(rate[0], LATE), rate)
 
     def dynamic_stiffness(self, omega: Array) -> Array:
@@ -137,7 +138,7 @@ def balance_of(model: LinearModel) -> TorqueBalance:
         rows = mount.load_rows(count) if count else mount.rows[0][None]
         directions.append(jnp.einsum("jka,k->ja", rows, rotating_direction(mount, exciter.direction)))
     drives = tuple(ConstantSpeed(drive.speed) if drive.ideal else drive for drive in averaged.drives)
-    averaged = eqx.tree_at(lambda field: field.drives, averaged, drives)
+    averaged = dataclasses.replace(averaged, groups=grouped(drives, averaged.counts))
     direction = directions[0] if len(directions) == 1 else jnp.concatenate(directions)
     return TorqueBalance(model, averaged, direction, _motor_torque(averaged))
 
@@ -355,17 +356,19 @@ def balance_of_group(balance: TorqueBalance, masses: tuple[int, ...]) -> TorqueB
     field, kept = balance.averaged, np.asarray(masses)
     owner = owners_of(field.counts)[kept]
     exciters = sorted(set(owner.tolist()))
-    rows = np.flatnonzero(np.isin(field.owners, exciters))
+    rows = kept if field.levers is None else np.flatnonzero(np.isin(field.owners, exciters))
+    drives = field.drives
+    counts = tuple(int(np.sum(owner == k)) if field.counts[k] else 0 for k in exciters)
     averaged = dataclasses.replace(
         field,
         input_matrix=field.input_matrix[rows],
         port=field.port[rows],
-        levers=field.levers[np.ix_(rows, kept)],
+        levers=None if field.levers is None else field.levers[np.ix_(rows, kept)],
         unbalance=field.unbalance[kept],
         inertia=field.inertia[kept],
         drag=field.drag[kept],
-        drives=tuple(field.drives[k] for k in exciters),
-        counts=tuple(int(np.sum(owner == k)) if field.counts[k] else 0 for k in exciters),
+        groups=grouped([drives[k] for k in exciters], counts),
+        counts=counts,
         directions=tuple(field.directions[k] for k in exciters),
         owners=tuple(exciters.index(field.owners[row]) for row in rows),
     )

@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,6 +47,9 @@ _DENSE = (
     (-0.6762803392801253, 6.087714651680015, 16.43084320892478, 24.76722511418386, -6.594389125716872),
 )
 
+Linearization: TypeAlias = tuple[Callable[[Array], Callable[[Array], Array]], Array]
+"""Function that maps a shift to the function r -> (shift - J)^-1 r, with the Jacobian J; and the time derivative df/dt."""
+
 
 class _Interpolation(StepInterpolation):
     """Continuous extension, of order 3, of the method: a cubic in the fraction s of the step with `coefficients` c (2, n).
@@ -71,13 +75,18 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         (1/(gamma h) - J) k_i = f(t + c_i h, y + sum_j a_ij k_j) + sum_j (c_ij / h) k_j + h d_i df/dt,   y_new = y + sum b_i k_i
 
     A step of any length costs one Jacobian J by forward mode, one inverse and 6 evaluations, without a Newton iteration. The
-    state must be one vector of at most a few dozen entries.
+    state must be one vector, of at most a few dozen entries unless `linearize` is given.
+
+    **Attribute** `linearize`: function of the equations, t, y and their arguments for a Jacobian that is not a dense matrix. It
+    returns the function that maps a shift to the function r -> (shift - J)^-1 r, and df/dt. Default: dense matrices
 
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, section IV.7.
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., _Interpolation]] = _Interpolation
+
+    linearize: Callable[[Terms, RealScalarLike, Array, Args], Linearization] | None = eqx.field(static=True, default=None)
 
     def order(self, terms: Terms) -> int:
         """Return 4."""
@@ -109,8 +118,8 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         h = t1 - t0
         # A step that only fills up an array has the length 0; 1/h must not divide by 0.
         per_step = 1.0 / jnp.where(h == 0.0, 1.0, h)
-        jacobian, time_derivative = _jacobian(terms, t0, y0, args)
-        inverse = unrolled_inverse(per_step / _GAMMA * jnp.eye(y0.shape[0], dtype=y0.dtype) - jacobian)
+        shifted_inverse, time_derivative = (self.linearize or _dense_linearization)(terms, t0, y0, args)
+        solve = shifted_inverse(per_step / _GAMMA)
 
         def combine(weights: Array | Sequence[float], stages: Array) -> Array:
             return functools.reduce(operator.add, (weights[i] * stages[i] for i in range(len(_A) - 1)))
@@ -122,12 +131,22 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
                 + weight * h * time_derivative
                 + per_step * combine(c, stages)
             )
-            return lax.dynamic_update_index_in_dim(stages, jnp.sum(inverse * right[None, :], axis=1), i, 0)
+            return lax.dynamic_update_index_in_dim(stages, solve(right), i, 0)
 
         stages = lax.fori_loop(0, len(_A), stage, jnp.zeros((len(_A), *y0.shape), y0.dtype))
         y1 = y0 + combine(_A[-1].tolist(), stages) + stages[-1]
         dense = dict(y0=y0, y1=y1, coefficients=jnp.stack([combine(row, stages) for row in _DENSE]))
         return y1, stages[-1], dense, None, diffrax.RESULTS.successful
+
+
+def _dense_linearization(terms: Terms, t: RealScalarLike, y: Array, args: Args) -> Linearization:
+    jacobian, time_derivative = _jacobian(terms, t, y, args)
+
+    def shifted_inverse(shift: Array) -> Callable[[Array], Array]:
+        inverse = unrolled_inverse(shift * jnp.eye(y.shape[0], dtype=y.dtype) - jacobian)
+        return lambda right: jnp.sum(inverse * right[None, :], axis=1)
+
+    return shifted_inverse, time_derivative
 
 
 def _jacobian(terms: Terms, t: RealScalarLike, y: Array, args: Args) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.equations import dynamics
+from jaxvib.equations import model
 
 SUPPORTS = [jv.support(at=(x, -0.2), stiffness=(4e5, 7e5), damping=(2e3, 3e3)) for x in (-1.0, 1.1)]
 BODY = jv.plane_body(mass=2000.0, inertia=600.0, supports=SUPPORTS)
@@ -88,7 +88,7 @@ def test_groups_have_the_rates_of_single_exciters(name, monkeypatch):
     state = state_of(scene)
     assert max(len(group.members) for group in jv.vector_field(scene).groups) >= 8
     found = jax.jit(lambda y: rate(scene, y))(state)
-    monkeypatch.setattr(dynamics, "_MIN_GROUP_SIZE", 1000)
+    monkeypatch.setattr(model, "_MIN_GROUP_SIZE", 1000)
     assert all(len(group.members) == 1 for group in jv.vector_field(scene).groups)
     close(found, jax.jit(lambda y: rate(scene, y))(state))
 
@@ -108,6 +108,6 @@ def test_groups_have_the_derivatives_of_single_exciters(name, monkeypatch):
         return jax.jvp(rate, (scene, state), ones)[1], back(jax.tree.map(jnp.ones_like, value))
 
     found = slopes(scene, state)
-    monkeypatch.setattr(dynamics, "_MIN_GROUP_SIZE", 1000)
+    monkeypatch.setattr(model, "_MIN_GROUP_SIZE", 1000)
     jax.clear_caches()
     close(found, slopes(scene, state), 1e-12)

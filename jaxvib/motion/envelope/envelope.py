@@ -46,7 +46,7 @@ from jaxvib.motion.start import Start, initial_state, start_state, with_spin_up_
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.ode.control import Decision, WrappedController, step_success
 from jaxvib.ode.replay import solve
-from jaxvib.ode.rodas4 import Rodas4
+from jaxvib.ode.rodas4 import Linearization, Rodas4
 from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
 from jaxvib.ode.types import Args, IntScalarLike, RealScalarLike, Terms
 from jaxvib.results.status import member, status_name
@@ -281,10 +281,10 @@ def _run(
     is_controller = isinstance(control, diffrax.AbstractStepSizeController)
     controller = control if is_controller else diffrax.PIDController(rtol=control, atol=control)
 
-    rates, args = _rates(units.pack(begin), (field, units), nd)
+    rates, args, method = _equations(units.pack(begin), (field, units), nd, solver)
     solution = solve(
         diffrax.ODETerm(rates),
-        Rodas4() if solver is None else solver,
+        method,
         end=end,
         first_step=0.05 / jnp.maximum(speed, jnp.max(frequencies)),
         y0=units.pack(begin),
@@ -343,24 +343,39 @@ def _at_rest(scene: Scene) -> Amplitudes:
     return Amplitudes(rest.displacement + 0.0j, rest.velocity + 0.0j, rate, angle - jnp.mean(angle))
 
 
-def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Callable[..., Array], Args]:
-    """Return the averaged equations as a function of the integrator's vector, and their arguments.
+def _equations(
+    y: Array, args: tuple[Averaged, _Units], nd: int, solver: diffrax.AbstractSolver | None
+) -> tuple[Callable[..., Array], Args, diffrax.AbstractSolver]:
+    """Return the averaged equations as a function of the integrator's vector, their arguments, and the method.
 
-    For small systems the equations are computed on scalars.
+    For small systems the equations are computed on scalars. For several exciters the steps of the default method take the
+    blocks of the exciters one by one, see `Averaged.shifted_inverse`; with one exciter a dense matrix on scalars is faster.
     """
 
     def on_arrays(t: Array, y: Array, args: tuple[Averaged, _Units]) -> Array:
         field, units = args
         return units.pack(field(t, units.unpack(y, nd)))
 
+    def linearize(terms: Terms, t: RealScalarLike, y: Array, args: tuple[Averaged, _Units]) -> Linearization:
+        (field, units), time = args, jnp.asarray(t, y.dtype)
+
+        def shifted_inverse(shift: Array) -> Callable[[Array], Array]:
+            solve = field.shifted_inverse(time, units.unpack(y, nd), shift)
+            return lambda right: units.pack(solve(units.unpack(right, nd)))
+
+        return shifted_inverse, jax.jvp(lambda t: terms.vf(t, y, args), (time,), (jnp.ones_like(time),))[1]
+
+    if solver is None and len(args[0].counts) > 1:
+        return on_arrays, args, Rodas4(linearize)
+    solver = Rodas4() if solver is None else solver
     program = scalarized_program(on_arrays, jnp.zeros((), y.dtype), y, args) if y.size <= MAX_SCALARS else None
     if program is None:
-        return on_arrays, args
+        return on_arrays, args, solver
 
     def on_scalars(t: Array, y: Array, args: list[Array]) -> Array:
         return jnp.stack(jaxpr_as_fun(program)(jnp.asarray(t, y.dtype), *(y[i] for i in range(y.shape[0])), *args))
 
-    return on_scalars, scalars_of(args)
+    return on_scalars, scalars_of(args), solver
 
 
 def _at(model: Model, field: Averaged, t: Array, state: Amplitudes) -> Envelopes:
@@ -375,7 +390,7 @@ def _at(model: Model, field: Averaged, t: Array, state: Amplitudes) -> Envelopes
         phase=state.phase,
         rotor_speeds=tuple(
             n if exciter.direction == 1 else -n
-            for exciter, n in zip(model.scene.exciters, field.rotor_speeds(t, state.rate), strict=True)
+            for exciter, n in zip(model.scene.exciters, field.by_exciter(field.rotor_speeds(t, state.rate)), strict=True)
         ),
         ripple=field.ripple(state),
     )

@@ -417,7 +417,7 @@ def _power(balance: TorqueBalance, omega: Array, driving: Array) -> Array:
     averaged, rate = balance.averaged, jnp.full_like(driving, omega)
     each = owners_of(averaged.counts)
     torque = jnp.zeros(len(averaged.counts), driving.dtype).at[each].add(driving)
-    return torque * jnp.stack(balance.rotor_speeds(rate))
+    return torque * jnp.stack(averaged.by_exciter(balance.rotor_speeds(rate)))
 
 
 def _has_one_speed(balance: TorqueBalance) -> Array:

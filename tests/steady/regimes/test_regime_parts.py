@@ -214,7 +214,7 @@ def test_balance_holds_within_rounding(two):
     assert not bool(holds(balance, x + jnp.array([0.0, 1e-6])))
     assert not bool(holds(balance, x + jnp.array([1e-4, 0.0])))
     fast = eqx.tree_at(lambda b: b.averaged.unbalance, balance, jnp.full(2, 1e-12))
-    equal = eqx.tree_at(lambda b: [d.speed for d in b.averaged.drives], fast, [jnp.asarray(100.0)] * 2)
+    equal = eqx.tree_at(lambda b: [g.part.speed for g in b.averaged.groups], fast, [jnp.asarray(100.0)] * 2)
     at = {share: bool(holds(equal, jnp.array([share, 0.3]))) for share in (1.0, 0.9999, -1.0)}
     assert at == {1.0: True, 0.9999: False, -1.0: False}
     w, angles = motion_of(balance, x)
