@@ -17,6 +17,8 @@ from jaxvib.identification.torque import MISFIT
 CHANCE = 1e-5
 """Share of records with pure noise about the fit that get the status `patterned`."""
 
+_TURNING = ("the rotor's angle", "the angle of the jammed loads")
+
 _WINDOWS, _ORDERS = 16, 3
 """Number of stretches of a record, and number of orders of the rotor's speed, at which residuals are compared with noise."""
 
@@ -105,10 +107,12 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
                     f"{fitted.outliers[k][c]:.1%} of the readings of channel {channel.name!r} in run {k + 1} are outliers, "
                     "which have little influence"
                 )
-            one = residual_chance(left[:, c], np.asarray(samples.taps)[:, c], fitted.problem.angles[k][:, 0], unknowns)
-            if one < CHANCE:
-                notes.append(f"the residuals of channel {channel.name!r} in run {k + 1} repeat with the rotor's angle")
-            chance = min(chance, one)
+            angles = fitted.problem.angles[k].T
+            for angle, whose in zip(angles if fitted.problem.has_loads else angles[:1], _TURNING, strict=False):
+                one = residual_chance(left[:, c], np.asarray(samples.taps)[:, c], angle, unknowns)
+                if one < CHANCE:
+                    notes.append(f"the residuals of channel {channel.name!r} in run {k + 1} repeat with {whose}")
+                chance = min(chance, one)
     if not has_fit and not foreign:
         return FitStatus.not_converged, chance, notes
     if contradicted or not has_fit:
@@ -152,6 +156,9 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
                 f"{found.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is {found.place}, "
                 "but an unbalance turns with the rotor: use the tachometer of the vibrating shaft, or leave out the part of "
                 "the record in which loads are jammed or another machine runs"
+                if not problem.has_loads
+                else f"{found.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is "
+                f"{found.place}: the motion of the loads is not that of the scene, or the minimum is a wrong one"
             )
 
 

@@ -259,8 +259,8 @@ def _sentences(found: Information, axes: np.ndarray, errors: np.ndarray, effect:
 
 
 def _in_common_factor(name: str) -> bool:
-    """Return True for numbers in units of mass or force: masses, inertias, stiffnesses, dampings, unbalances, torques."""
-    return any(word in name for word in ("mass", "inertia", "stiffness", "damping", "unbalance", "torque"))
+    """Return True for numbers whose unit contains kg once, in products such as N s/m or kg m."""
+    return any(word in name for word in ("mass", "inertia", "stiffness", "damping", "drag", "unbalance", "torque"))
 
 
 def _kinds(names: tuple[str, ...]) -> str:
@@ -269,6 +269,7 @@ def _kinds(names: tuple[str, ...]) -> str:
         "inertia": "inertias",
         "stiffness": "stiffnesses",
         "damping": "dampings",
+        "drag": "drags",
         "unbalance": "unbalances",
         "torque": "torques",
     }

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.identification.problem import Problem, with_angle_errors, with_noise
-from jaxvib.identification.response import linear_equations, model_readings, normal_equations
+from jaxvib.identification.jammed.motion import closed_motion, motion_cost, motion_equations
+from jaxvib.identification.problem import Problem, channel_sizes, with_angle_errors, with_noise
+from jaxvib.identification.response import linear_equations, model_readings, normal_equations, state_count
 from jaxvib.numerics.noise import Noise, noise_of
 
 _MAX_ITERATIONS = 40
@@ -100,7 +101,7 @@ def linear_places(problem: Problem) -> list[np.ndarray]:
     places, after = [], 2 * exciters
     for samples in problem.runs:
         offsets = len(samples.channels)
-        states = 2 * len(problem.scene.machine.structure().coordinates) + sum(c.high_pass > 0.0 for c in samples.channels)
+        states = state_count(problem.scene, samples.channels)
         own = np.arange(after, after + states + offsets)
         places.append(np.concatenate([own[:states], np.arange(2 * exciters), own[states:]]))
         after += states + offsets
@@ -141,21 +142,36 @@ def unbalance_prior(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, n
 
 
 def project(problem: Problem, x: np.ndarray) -> _Trial:
-    """Return the best linear unknowns at `x`, and their cost."""
+    """Return the best linear unknowns at `x`, and their cost; with loads those of the problem."""
+    if problem.linear is not None:
+        return _with_loads(problem, x, problem.linear)
     total = _linear_equations(problem, x)
     matrix, right, square = total[:-1, :-1], total[:-1, -1], total[-1, -1]
     if not np.all(np.isfinite(total)):
         return _Trial(x, np.zeros(len(right)), np.inf)
     linear = solved(matrix, right)
-    prior_cost = 0.0
     if any(problem.unbalances):
         for _ in range(8):  # the right side of each step depends on the directions of the last unbalances, not on their sizes
-            information, gradient, prior_cost = unbalance_prior(problem, linear)
+            information, gradient, _ = unbalance_prior(problem, linear)
             linear = linear + solved(matrix + information, right - matrix @ linear + gradient)
-        prior_cost = unbalance_prior(problem, linear)[2]
     data = square - 2.0 * linear @ right + linear @ matrix @ linear
-    away = float(np.sum(problem.precisions * (x - problem.means) ** 2))
-    return _Trial(x, linear, max(float(data), 0.0) + away + prior_cost)
+    return _Trial(x, linear, max(float(data), 0.0) + known_cost(problem, x, linear))
+
+
+def _with_loads(problem: Problem, x: np.ndarray, linear: np.ndarray) -> _Trial:
+    """Return the unknowns of a motion with loads, and their cost."""
+    cost = known_cost(problem, x, linear)
+    for samples, place in zip(problem.runs, linear_places(problem), strict=True):
+        own = linear[place]
+        readings, _ = closed_motion(problem.unknowns, samples, problem.scene, x, own)
+        cost += motion_cost(samples, readings, own[-len(samples.channels) :])
+    return _Trial(x, linear, cost if np.isfinite(cost) else np.inf)
+
+
+def known_cost(problem: Problem, x: np.ndarray, linear: np.ndarray) -> float:
+    """Return the cost of the known values."""
+    loads = 0.0 if problem.apart is None else float(linear @ problem.apart @ linear)
+    return float(np.sum(problem.precisions * (x - problem.means) ** 2)) + unbalance_prior(problem, linear)[2] + loads
 
 
 def _linear_equations(problem: Problem, x: np.ndarray) -> np.ndarray:
@@ -180,11 +196,13 @@ def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[n
     """Return the normal equations (p + L + 1, p + L + 1) of each run: of all unknowns and the residuals."""
     p, size, found = x.size, x.size + linear.size, []
     for samples, place in zip(problem.runs, linear_places(problem), strict=True):
-        own = jnp.asarray(linear[place])
+        parts = problem.unknowns, samples, problem.scene
+        if problem.has_loads:
+            equations = motion_equations(*parts, x, linear[place])
+        else:
+            equations = np.asarray(normal_equations(*parts, jnp.asarray(x), jnp.asarray(linear[place])))
         where, total = np.concatenate([np.arange(p), p + place, [size]]), np.zeros((size + 1, size + 1))
-        total[np.ix_(where, where)] = np.asarray(
-            normal_equations(problem.unknowns, samples, problem.scene, jnp.asarray(x), own)
-        )
+        total[np.ix_(where, where)] = equations
         found.append(total)
     return found
 
@@ -196,6 +214,9 @@ def prior_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> tupl
     prior[np.arange(p), np.arange(p)] = problem.precisions
     gradient[:p] = -problem.precisions * (x - problem.means)
     prior[p:, p:], gradient[p:], _ = unbalance_prior(problem, linear)
+    if problem.apart is not None:
+        prior[p:, p:] += problem.apart
+        gradient[p:] -= problem.apart @ linear
     return prior, gradient
 
 
@@ -213,9 +234,14 @@ def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.nd
         return joint_equations(problem, trial.x, trial.linear)
 
     def moved(trial: _Trial, step: np.ndarray) -> _Trial:
-        return project(problem, trial.x + limited_step(problem, step)[: x.size])
+        step = limited_step(problem, step)
+        if problem.has_loads:
+            return _with_loads(problem, trial.x + step[: x.size], trial.linear + step[x.size :])
+        return project(problem, trial.x + step[: x.size])
 
-    best, (information, prior, _), converged = descend(project(problem, x), equations, moved, x.size, positive_places(problem))
+    start = project(problem, x)
+    damped = x.size + start.linear.size * problem.has_loads
+    best, (information, prior, _), converged = descend(start, equations, moved, damped, positive_places(problem))
     return best, information, prior, converged
 
 
@@ -303,12 +329,13 @@ def differences_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[
     """Return readings minus model (n, C) of each run."""
     found = []
     for samples, place, raw in zip(problem.runs, linear_places(problem), problem.raw, strict=True):
-        model = model_readings(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear[place]))
+        parts = problem.unknowns, samples, problem.scene
+        if problem.has_loads:
+            model = closed_motion(*parts, x, linear[place])[0]
+        else:
+            model = np.asarray(model_readings(*parts, jnp.asarray(x), jnp.asarray(linear[place])))
         shown = np.stack(
-            [
-                _delayed(np.asarray(model)[:, k], channel.delay / float(samples.step))
-                for k, channel in enumerate(samples.channels)
-            ],
+            [_delayed(model[:, k], channel.delay / float(samples.step)) for k, channel in enumerate(samples.channels)],
             axis=1,
         )
         found.append(raw - shown[: len(raw)])
@@ -330,27 +357,23 @@ def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
 
     The first pass weighs each channel by its own size, the next by their residuals, the last with filters to white noise.
     """
-    sizes = [
-        [np.std(raw[mask[:, k], k]) if np.any(mask[:, k]) else 0.0 for k in range(raw.shape[1])]
-        for raw, mask in zip(problem.raw, problem.masks, strict=True)
-    ]
-    noise = [[Noise(np.ones(1), float(size) or 1.0) for size in of_run] for of_run in sizes]
+    noise = [[Noise(np.ones(1), size) for size in of_run] for of_run in channel_sizes(problem)]
     found = _pass(problem, noise, None, starts)
     if _largest_change(noise, [[Noise(np.ones(1), each) for each in of_run] for of_run in found.noise]) < 0.3:
         return found._replace(converged=False)  # the model does not resemble the records, and their noise is unknown
     noise = [[Noise(np.ones(1), float(each)) for each in of_run] for of_run in found.noise]
-    found = _pass(problem, noise, None, [found.x])
+    found = _pass(found.problem, noise, None, [found.x])
     is_final = not any(np.any(each) for each in problem.bounds)
     matters = [bool(np.any(each > _ANGLE_MATTERS)) for each in angle_shares(found)]
     if any(matters):
-        problem, is_final = with_angle_errors(problem, matters), False
-        found = found._replace(x=np.concatenate([found.x, np.zeros(problem.unknowns.errors)]))
+        problem, is_final = with_angle_errors(found.problem, matters), False
+        found = found._replace(x=np.concatenate([found.x, np.zeros(problem.unknowns.errors)]), problem=problem)
     for _ in range(_MAX_PASSES):  # goes on after a pass that has not converged, since its weights were not final
         new = [[noise_of(each[:, k]) for k in range(each.shape[1])] for each in found.residuals]
         if is_final and _largest_change(noise, new) < _STEADY_NOISE:
             break
         before, noise = found.x, new
-        found = _pass(problem, noise, found.differences, [before])
+        found = _pass(found.problem, noise, found.differences, [before])
         matrix = found.information + found.prior
         change = np.concatenate([found.x - before, np.zeros(found.linear.size)])
         is_final = bool(change @ matrix @ change < _STEADY_VALUES**2) or not _has_scores(problem, noise)
@@ -389,6 +412,7 @@ def _pass(
     problem = with_noise(problem, noise, differences)
     minima = [minimize(problem, x) for x in starts]
     trial, information, prior, converged = min(minima, key=lambda each: each[0].cost)
+    problem = problem._replace(linear=trial.linear) if problem.has_loads else problem
     left = differences_of(problem, trial.x, trial.linear)
     pairs = zip(left, problem.masks, noise, strict=True)
     found = [

@@ -24,6 +24,7 @@ from jaxvib.identification.directions import (
     information_of,
 )
 from jaxvib.identification.fit import Fitted, unknown_count
+from jaxvib.identification.jammed.start import with_first_motion
 from jaxvib.identification.likelihood import QUANTILE, profile_intervals
 from jaxvib.identification.problem import Problem, build_problem, natural
 from jaxvib.identification.run import MeasuredRun
@@ -173,7 +174,8 @@ def identify(
       motion at the first sample are free
     - The noise of each channel may be coloured: residuals are filtered to white noise by an autoregressive model, and the
       intervals are those of the Fisher information with the noise found
-    - The supports must be linear, and the exciters carry unbalances only
+    - The supports must be linear. The loads of a scene with one exciter (balls, rollers, pendulums) must be jammed throughout
+      the runs; their motion is that of `vector_field`, and their first angles and speeds are free
     - Numbers of a motor, such as "drive.inertia" and "drive.stall_torque", can be unknown if a channel gives the angle or the
       speed of its rotor: the torque balance with the torque of the vibration is fitted to it together with the readings
 
@@ -227,7 +229,12 @@ def identify(
     free, readings = unknown_count(problem), sum(int(np.count_nonzero(mask)) for mask in problem.masks)
     if free >= readings:
         raise InputError("unknown", f"has {free} unknowns with those of the runs, for {readings} readings; record longer runs")
-    fitted = fit_with_torques(problem, [np.zeros(problem.unknowns.count), track_orders(problem)])
+    if problem.has_loads:
+        problem, first = with_first_motion(problem)
+        starts = [first]
+    else:
+        starts = [np.zeros(problem.unknowns.count), track_orders(problem)]
+    fitted = fit_with_torques(problem, starts)
     fitted = _near_first_values(scene, problem, fitted)
     found = _interpret(scene, fitted)
     if throw and not resembles(fitted):
@@ -271,7 +278,8 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
     estimates = [
         each._replace(low=max(each.low, 0.0)) if own else each for each, own in zip(estimates, known.vanished, strict=True)
     ]
-    ends = profile_intervals(fitted, known) if resembles(fitted) and not fitted.misfits else {}
+    has_profiles = resembles(fitted) and not fitted.misfits and not problem.has_loads
+    ends = profile_intervals(fitted, known) if has_profiles else {}
     for name, (low, high) in ends.items():
         i = known.names.index(name)
         estimates[i] = _with_ends(estimates[i], known.scale[i], bool(known.logarithmic[i]), low, high)

@@ -24,6 +24,8 @@ from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import GravityField
 from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
 from jaxvib.machine.scene import Scene
+from jaxvib.motion.integrate import frequency_bounds
+from jaxvib.motion.stiffness import equal_step_length, fastest_decay
 from jaxvib.numerics.noise import Noise, bounded, limited
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Bounds, Number
@@ -46,6 +48,13 @@ _FILTER_LENGTHS = (1, 9, 49, 129, 513)
 _MARGIN, _TIMES = 1.5, 64
 """Factor on the highest natural frequency, and number of times at which the speed of a drive is evaluated, for the choice of a
 sampling rate."""
+
+_STRETCH_ANGLE, _MAX_STRETCHES = 25.0, 64
+"""Length of a stretch of a motion with loads, rad of the slowest vibration, and largest number of stretches: the first values
+of the numbers must describe a stretch to less than a radian."""
+
+_STEPS_PER_RADIAN = 1.0
+"""Number of steps of order 8 per radian of the fastest motion, with errors of about 3e-9 in a turn."""
 
 _DELAY_MARGIN = 2
 """Number of steps by which both readings and model are delayed, so that the interpolation has samples on both sides."""
@@ -79,6 +88,8 @@ class Problem(NamedTuple):
     - `unbalances`: for each exciter its known value, None if it is free
     - `angle_errors`, rad: standard error of the rotor's angle in each run, without the errors that are unknowns
     - `notes`: sentences for the reader
+    - `linear` (L,): first values of the unknowns in which the readings are linear without loads; None without loads
+    - `apart` (L, L): information that the loads of a run are near one another at the first sample, about these first values
     """
 
     scene: Scene
@@ -96,6 +107,13 @@ class Problem(NamedTuple):
     unbalances: tuple[Known | None, ...]
     angle_errors: tuple[float, ...]
     notes: tuple[str, ...]
+    linear: np.ndarray | None = None
+    apart: np.ndarray | None = None
+
+    @property
+    def has_loads(self) -> bool:
+        """True for loads that move on the rotor."""
+        return has_loads(self.scene)
 
 
 def read_known(text: Number, number: NamedNumber, field: str) -> Known:
@@ -126,8 +144,8 @@ def _unbounded(number: NamedNumber) -> NamedNumber:
 def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[str], known: Mapping[str, Number]) -> Problem:
     """Return the least-squares problem of an identification.
 
-    **Raises** `InputError` for unknowns that the scene does not have, for scenes with loads, motors without a tachometer or
-    supports that are not linear, and for runs without a usable channel.
+    **Raises** `InputError` for unknowns that the scene does not have, for loads, effects and motors that are not included, and
+    for runs without a usable channel.
     """
     _require_linear(scene)
     if isinstance(unknown, str) or not unknown:
@@ -211,15 +229,15 @@ def is_of_drive(number: NamedNumber) -> bool:
 def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs: Sequence[MeasuredRun]) -> None:
     """Raise if numbers of a drive are unknown that no record determines."""
     drive, measured = scene.exciters[0].drive, all(run.of_kind(*ROTOR_KINDS) for run in runs)
-    if len(scene.exciters) == 1 and not drive.ideal and not drive.state_units() and measured:
+    if len(scene.exciters) == 1 and not drive.ideal and not drive.state_units() and measured and not has_loads(scene):
         return
     for name, number in free.items():
         if is_of_drive(number):
             raise InputError(
                 f"unknown.{name}",
                 "is a number of the drive, which the recorded angle does not determine; leave it out. Only the numbers of the "
-                "motor of a scene with one exciter can be unknown, if the motor has no currents as states and each run has a "
-                "channel of pulses, angle or speed",
+                "motor of a scene with one exciter without loads can be unknown, if the motor has no currents as states and "
+                "each run has a channel of pulses, angle or speed",
             )
 
 
@@ -241,18 +259,30 @@ def _with_own_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
     return decimated(run, max(fastest, _MARGIN * float(np.max(natural(scene)[0], initial=0.0)), 1e-300))
 
 
+def has_loads(scene: Scene) -> bool:
+    """Return True if an exciter has loads that move on its rotor."""
+    return any(exciter.loads is not None for exciter in scene.exciters)
+
+
+def require_unbalances_only(scene: Scene, function: str) -> None:
+    """Raise for a scene with loads in a `function` that does not include them."""
+    if has_loads(scene):
+        raise InputError("fit.scene", f"has loads that move on the rotor; {function} needs exciters with an unbalance only")
+
+
 def _require_linear(scene: Scene) -> None:
-    for k, exciter in enumerate(scene.exciters):
-        if exciter.loads is not None or exciter.unbalance is None:
-            raise InputError(
-                f"scene.exciters[{k}]",
-                "has loads that move on the rotor; identify needs exciters with an unbalance only, "
-                "Exciter(drive=..., unbalance=...)",
-            )
+    if has_loads(scene) and len(scene.exciters) > 1:
+        problem = f"has {len(scene.exciters)} exciters, one of them with loads; identify needs loads to be on the only exciter"
+        raise InputError("scene", problem)
+    for exciter in scene.exciters:
+        if exciter.loads is not None and not exciter.loads.circular:
+            problem = f"is of kind {exciter.loads.kind!r}; identify needs loads on a circle: balls, rollers or pendulums"
+            raise InputError("scene.loads", problem)
     for effect in scene.all_effects:
         if not has_term([effect], GravityField):
             raise InputError(
-                f"effects.{effect.kind}", "makes the machine nonlinear; identify needs linear supports, remove the effect"
+                f"effects.{effect.kind}",
+                "is not included in identify, which needs linear supports and viscous drag of loads; remove the effect",
             )
     if any(scene.machine.mounting(exciter.place).gyroscopic is not None for exciter in scene.exciters):
         raise InputError(
@@ -273,6 +303,8 @@ def _singles(scene: Scene, names: Sequence[str], field: str = "unknown") -> list
 def _known_unbalance(
     scene: Scene, k: int, free: Mapping[str, NamedNumber], found: Mapping[str, tuple[NamedNumber, Known]]
 ) -> Known | None:
+    if scene.exciters[k].unbalance is None:
+        return Known(1.0, EXACT)  # the components of an unbalance that acts on nothing
     number = find_number(scene, f"exciters[{k}].unbalance", "unknown")
     if number.name in found and found[number.name][1].error > 0.0:
         return found[number.name][1]
@@ -371,8 +403,25 @@ def _samples(
         changed=tuple(numbers),
         actions=tuple(actions),
         turn=turn,
+        stretches=_stretches(_changed(scene, run), count, step) if has_loads(scene) else (0, 0, 0),
     )
     return samples, mask, raw, bounds, time, np.stack([angle.at(time) for angle in angles], axis=1)
+
+
+def _stretches(scene: Scene, count: int, step: float) -> tuple[int, int, int]:
+    """Return the number of the stretches of a motion with loads, the samples of each, and the steps per sample.
+
+    **Arguments**: `count` of the samples, and their `step`, s.
+    """
+    fastest, slowest = (float(each) for each in frequency_bounds(scene))
+    longest, is_stiff = equal_step_length(fastest, float(fastest_decay(scene)), _STEPS_PER_RADIAN)
+    if is_stiff:
+        raise InputError(
+            "scene",
+            "has loads whose drag makes their speeds decay much faster than the motion; reduce loads.drag or loads.radius",
+        )
+    number = max(1, min(_MAX_STRETCHES, round(count * step * slowest / _STRETCH_ANGLE)))
+    return number, -(-count // number), max(1, math.ceil(step / longest))
 
 
 def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: Sequence[np.ndarray] | None = None) -> Problem:
@@ -422,6 +471,14 @@ def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: 
             )
         )
     return problem._replace(runs=tuple(runs))
+
+
+def channel_sizes(problem: Problem) -> list[list[float]]:
+    """Return the standard deviation of the readings of each run's channels, 1 for a channel without a change."""
+    return [
+        [float(np.std(raw[mask[:, k], k])) or 1.0 if np.any(mask[:, k]) else 1.0 for k in range(raw.shape[1])]
+        for raw, mask in zip(problem.raw, problem.masks, strict=True)
+    ]
 
 
 def _delay_taps(delay: float) -> tuple[np.ndarray, np.ndarray]:

@@ -29,6 +29,7 @@ from jax import Array
 from jaxvib.equations.model import assemble
 from jaxvib.identification.angle import RecordedDrive
 from jaxvib.identification.records.channel import Channel
+from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.numbers.named import NamedNumber, put_numbers
 from jaxvib.machine.scene import Scene
@@ -101,6 +102,8 @@ class Samples(eqx.Module):
     - `amounts` by which the `actions` change the numbers `changed` of the scene in this run
     - `channels` that are compared, `changed` and `actions`, `turn`: index of the run's unknown zero of the angle, or None
     - `errors`: place of the first error of the rotor's angle among the unknowns, and their number
+    - `stretches` in which the motion of loads is integrated: their number, samples of each, steps per sample; (0, 0, 0) without
+      loads
     """
 
     drives: tuple[Drive, ...]
@@ -116,6 +119,7 @@ class Samples(eqx.Module):
     actions: tuple[str, ...] = eqx.field(static=True)
     turn: int | None = eqx.field(static=True)
     errors: tuple[int, int] = eqx.field(static=True, default=(0, 0))
+    stretches: tuple[int, int, int] = eqx.field(static=True, default=(0, 0, 0))
 
     def scene(self, scene: Scene) -> Scene:
         """Return the scene as it was in this run."""
@@ -128,18 +132,21 @@ class Samples(eqx.Module):
 
 class _Steps(NamedTuple):
     """Matrices of the steps: `power` exp(A h) (ns, ns), `inputs` (3, ns, E, 2, 2) for the components (a, b) of each unbalance
-    and the two entries of F, `outputs` (C, ns) and `through` (C, E, 2, 2): readings from the state and from F."""
+    and the two entries of F, `outputs` (C, ns) and `through` (C, E, 2, 2): readings from the state and from F; `scale` s of the
+    state."""
 
     power: Array
     inputs: Array
     outputs: Array
     through: Array
+    scale: Array
 
 
 def state_count(scene: Scene, channels: tuple[Channel, ...]) -> int:
-    """Return the number of states: coordinates, their rates, and one for each channel with a high-pass filter."""
-    nd = len(scene.machine.structure().coordinates)
-    return 2 * nd + sum(channel.high_pass > 0.0 for channel in channels)
+    """Return the number of states: coordinates, angles of loads, their rates, and one for each channel with a high-pass
+    filter."""
+    count = len(scene.machine.structure().coordinates) + sum(e.loads.count for e in scene.exciters if e.loads is not None)
+    return 2 * count + sum(channel.high_pass > 0.0 for channel in channels)
 
 
 def rows_of_channel(scene: Scene, channel: Channel) -> Array:
@@ -148,6 +155,22 @@ def rows_of_channel(scene: Scene, channel: Channel) -> Array:
     place = jnp.asarray(place) if isinstance(place, tuple) else place
     axes, rows = scene.machine.mounting().axes, scene.machine.rows_at(place, f"channel {channel.name!r}: at")
     return sum((channel.direction[axis] * rows[k] for k, axis in enumerate(axes)), jnp.zeros(rows.shape[1]))
+
+
+def sensor_rows(scene: Scene, carrier: Carrier, channels: tuple[Channel, ...]) -> Array:
+    """Return the rows (C, 3, nd) by which readings follow from displacements, velocities and accelerations."""
+    found = []
+    for channel in channels:
+        if channel.kind == "force":
+            directions = carrier.foundation_directions
+            weights = jnp.asarray([channel.direction[0 if each == "across" else 1] for each in directions])
+            stiffness, damping = weights @ carrier.foundation_stiffness, weights @ carrier.foundation_damping
+            found.append(jnp.stack([stiffness, damping, jnp.zeros_like(stiffness)]))
+        else:
+            order = ("displacement", "velocity", "acceleration").index(channel.kind)
+            row = rows_of_channel(scene, channel)
+            found.append(jnp.zeros((3, row.shape[0])).at[order].set(row))
+    return jnp.stack(found)
 
 
 def _steps(scene: Scene, channels: tuple[Channel, ...], step: Array, turn: Array | float) -> _Steps:
@@ -170,26 +193,10 @@ def _steps(scene: Scene, channels: tuple[Channel, ...], step: Array, turn: Array
     flow = jnp.block([[zero, scale * jnp.eye(nd)], [-elastic, -viscous]])
     entry = jnp.concatenate([jnp.zeros_like(pushed), pushed])
 
-    outputs, through, corners = [], [], []
-    for channel in channels:
-        direct = jnp.zeros(pushed.shape[1:])
-        if channel.kind == "force":
-            directions = model.carrier.foundation_directions
-            weights = jnp.asarray([channel.direction[0 if each == "across" else 1] for each in directions])
-            row = jnp.concatenate(
-                [weights @ model.carrier.foundation_stiffness / scale, weights @ model.carrier.foundation_damping]
-            )
-        else:
-            moves = rows_of_channel(scene, channel)
-            still = jnp.zeros(nd)
-            if channel.kind == "acceleration":
-                row, direct = moves @ flow[nd:], jnp.tensordot(moves, pushed, axes=1)
-            else:
-                row = jnp.concatenate([moves / scale, still] if channel.kind == "displacement" else [still, moves])
-        outputs.append(row)
-        through.append(direct)
-        corners.append(2.0 * np.pi * channel.high_pass)
-    row, direct = jnp.stack(outputs), jnp.stack(through)
+    weights = sensor_rows(scene, model.carrier, channels)
+    row = jnp.concatenate([weights[:, 0] / scale, weights[:, 1]], axis=1) + weights[:, 2] @ flow[nd:]
+    direct = jnp.tensordot(weights[:, 2], pushed, axes=1)
+    corners = [2.0 * np.pi * channel.high_pass for channel in channels]
     slow = [k for k, corner in enumerate(corners) if corner > 0.0]
     if slow:  # the state z' = corner (reading - z) of a high-pass filter is taken away from the reading
         corner, n = np.array([corners[k] for k in slow]), len(slow)
@@ -203,7 +210,7 @@ def _steps(scene: Scene, channels: tuple[Channel, ...], step: Array, turn: Array
     times = jnp.asarray([1.0, *(1.0 - GAUSS_POINTS)]) * step
     powers = jax.vmap(lambda t: jax.scipy.linalg.expm(flow * t, max_squarings=32))(times)
     inputs = jnp.einsum("j,jnm,mebf->jnebf", jnp.asarray(_GAUSS_WEIGHTS) * step, powers[1:], entry)
-    return _Steps(powers[0], inputs, row, direct)
+    return _Steps(powers[0], inputs, row, direct, scale)
 
 
 def _march(power: Array, forcing: Array, start: Array) -> tuple[Array, Array]:
@@ -388,14 +395,28 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
 def model_readings(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, linear: Array) -> Array:
     """Return the readings (N n, C) of the model with its offsets, without the filter."""
     steps = _built(unknowns, samples, scene, x)
-    state, unbalance, offsets = _split(steps, linear)
+    return _all_readings(steps, samples, scene, x, linear) + _split(steps, linear)[2][None]
+
+
+@cached
+def model_states(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, linear: Array) -> Array:
+    """Return the displacements and velocities (N n, 2 nd) of the coordinates."""
+    steps, nd = _built(unknowns, samples, scene, x), len(scene.machine.structure().coordinates)
+    outputs = jnp.eye(2 * nd, steps.power.shape[0]) / jnp.where(jnp.arange(2 * nd) < nd, steps.scale, 1.0)[:, None]
+    through = jnp.zeros((2 * nd, *steps.through.shape[1:]))
+    return _all_readings(steps._replace(outputs=outputs, through=through), samples, scene, x, linear)
+
+
+def _all_readings(steps: _Steps, samples: Samples, scene: Scene, x: Array, linear: Array) -> Array:
+    """Return the readings (N n, C) of the model without offsets."""
+    state, unbalance, _ = _split(steps, linear)
 
     def stretch(state: Array, k: Array) -> tuple[Array, Array]:
         readings, state = _response(steps, _forces(samples, scene, x, k)[0], state, unbalance)
         return state, readings
 
     _, found = jax.lax.scan(stretch, state, jnp.arange(samples.readings.shape[0]))
-    return found.reshape(-1, found.shape[2]) + offsets[None]
+    return found.reshape(-1, found.shape[2])
 
 
 def _split(steps: _Steps, linear: Array) -> tuple[Array, Array, Array]:

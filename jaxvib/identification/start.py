@@ -17,7 +17,7 @@ from jax import Array
 
 from jaxvib.equations.linear import linear_model, rotating_direction
 from jaxvib.identification.problem import Problem
-from jaxvib.identification.response import Samples, Unknowns, rows_of_channel
+from jaxvib.identification.response import Samples, Unknowns, sensor_rows
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 
@@ -73,18 +73,11 @@ def _steady(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, speeds
     model = linear_model(own)
     mount, exciter = model.mounts[0], own.exciters[0]
     direction = mount.rotor_rows().T @ rotating_direction(mount, exciter.direction)
-    rows = []
-    for channel in samples.channels:
-        if channel.kind == "force":
-            directions = model.carrier.foundation_directions
-            weights = jnp.asarray([channel.direction[0 if each == "across" else 1] for each in directions])
-            rows.append(weights @ model.carrier.foundation_stiffness)
-        else:
-            rows.append(rows_of_channel(own, channel))
-    powers = np.array([{"acceleration": 2.0, "velocity": 1.0}.get(channel.kind, 0.0) for channel in samples.channels])
+    rows = sensor_rows(own, model.carrier, samples.channels)
 
     def at(w: Array) -> Array:
-        return jnp.abs(jnp.stack(rows) @ jnp.linalg.solve(model.dynamic_stiffness(w), w**2 * direction)) * jnp.power(w, powers)
+        moved = jnp.linalg.solve(model.dynamic_stiffness(w), w**2 * direction)
+        return jnp.abs((rows[:, 0] + 1j * w * rows[:, 1] - w**2 * rows[:, 2]) @ moved)
 
     return jax.vmap(at)(speeds)
 

@@ -34,12 +34,12 @@ from jaxvib.identification.fit import (
     descend,
     differences_of,
     fit_from,
+    known_cost,
     limited_step,
     linear_places,
     positive_places,
     prior_equations,
     run_equations,
-    unbalance_prior,
     unknown_count,
 )
 from jaxvib.identification.problem import Problem, is_of_drive
@@ -296,7 +296,7 @@ def _trial(problem: Problem, runs: list[_Run], y: np.ndarray, free: np.ndarray) 
     total[np.ix_(places, places)] = np.sum(run_equations(problem, x, linear), axis=0)
     gradient = np.zeros(y.size)
     prior[:size, :size], gradient[:size] = prior_equations(problem, x, linear)
-    cost = float(problem.precisions @ (x - problem.means) ** 2) + unbalance_prior(problem, linear)[2]
+    cost = known_cost(problem, x, linear)
     for run in runs:
         found, slopes = _deviations_of(problem, run, y)
         taps, places = run.noise.taps, np.append(run.places, y.size)

@@ -14,7 +14,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.identification.directions import covariance_of, eliminate, in_polar_unbalances
 from jaxvib.identification.fit import Fitted, information_at
 from jaxvib.identification.identify import MachineFit
-from jaxvib.identification.problem import MOTIONS, Problem, build_problem, with_noise
+from jaxvib.identification.problem import MOTIONS, Problem, build_problem, require_unbalances_only, with_noise
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive
@@ -101,8 +101,9 @@ class Expected(NamedTuple):
 def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     """Return a planned run at the numbers of a fit.
 
-    **Raises** `InputError` for a channel whose noise is unknown, and for a scene with several exciters.
+    **Raises** `InputError` for a channel whose noise is unknown, and for a scene with several exciters or with loads.
     """
+    require_unbalances_only(fit.scene, "plan_runs")
     # The spectral density of the noise is the same at all sampling rates. Deviations are stored per square root of the rate.
     deviations: dict[str, float] = {}
     for names, noise, time in reversed(list(zip(fit.channels, fit.noise, fit.time, strict=True))):

@@ -15,7 +15,7 @@ from jaxvib.identification.directions import eliminate, elimination, polar_unbal
 from jaxvib.identification.fit import differences_of, linear_at, run_equations
 from jaxvib.identification.further_runs.planned import own_precisions, shared_places, vibrating
 from jaxvib.identification.identify import MachineFit
-from jaxvib.identification.problem import EXACT, Known, Problem, build_problem, with_noise
+from jaxvib.identification.problem import EXACT, Known, Problem, build_problem, require_unbalances_only, with_noise
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.numerics.noise import Noise, noise_of
 from jaxvib.results.fields import in_unit
@@ -93,7 +93,7 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
 
     **Arguments**: `fit` from `identify`; `run`: a `MeasuredRun`, with its own `change` of numbers.
 
-    **Returns** `RunPrediction`. **Raises** `InputError` for a run that cannot be used.
+    **Returns** `RunPrediction`. **Raises** `InputError` for a run that cannot be used, and for a fit with loads.
 
     >>> import numpy as np, jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
@@ -156,6 +156,7 @@ class _Predicted(NamedTuple):
 
 
 def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
+    require_unbalances_only(fit.scene, "predict_run")
     problem = build_problem(fit.scene, [run], vibrating(fit), {})
     sizes = np.array([float(np.asarray(exciter.unbalance, float)) for exciter in fit.scene.exciters])
     problem = problem._replace(unbalances=tuple(Known(size, EXACT * size) for size in sizes))

@@ -11,9 +11,11 @@ import numpy as np
 from run_ups_by_scipy import TRUTH, accelerations, bound, motor_run_up, ramp, record, scene_of
 
 import jaxvib as jv
+from repeated_records import jammed
 
 TIMES = 0.016 * np.arange(1000)
-NOISE = 0.05
+NOISE, JAMMED_NOISE = 0.05, 0.2
+"""Standard deviation of the noise of the accelerometers, m/s^2; the balls excite readings up to 40 m/s^2."""
 NAMES = ("machine.stiffness", "machine.damping", "machine.link_stiffness", "machine.link_damping", "exciters[0].unbalance")
 SINGLE = tuple(name for name in TRUTH if "mass" not in name)
 
@@ -25,8 +27,10 @@ CASES = {
     "motor that dips at the resonances": {"motor": True},
     "one pulse per turn, times rounded to 1 ms": {"pulses": 1, "resolution": 1e-3},
     "readings clipped at 60 % of the largest": {"full_scale": 0.6},
+    "two jammed balls and an unbalance": {"balls": True},
 }
-"""Options of `record` by the name of a case; `motor`: run-up of a motor in place of the prescribed speed."""
+"""Options of `record` by the name of a case; `motor`: run-up of a motor in place of the prescribed speed; `balls`: records of
+`repeated_records.jammed`."""
 
 
 @dataclasses.dataclass
@@ -75,27 +79,40 @@ def run_up(motor):
     return motor_run_up(TIMES, TRUTH) if motor else (accelerations(TIMES, [TRUTH])[0], ramp)
 
 
-def repeated(count, seed=0, motor=False, **options):
-    """Return the fits of `count` records from stiffnesses 10 % off and dampings 50 % off, in random directions."""
-    clean, turning = run_up(motor)
+def repeated(count, seed=0, motor=False, balls=False, **options):
+    """Return the fits of `count` records from stiffnesses 10 % off and dampings 50 % off, in random directions.
+
+    In records of jammed balls, the mass and the drag of the balls are 10 % and 20 % off, the dampings 30 %, and the stiffnesses
+    5 %.
+    """
+    clean, turning = (None, None) if balls else run_up(motor)
     if "full_scale" in options:
         options = options | {"full_scale": options["full_scale"] * np.max(np.abs(clean))}
-    away, relative, statuses = [], [], []
+    truth, scene = (jammed.TRUTH, jammed.scene_of) if balls else (TRUTH, scene_of)
+    names = (*NAMES, "loads.mass", "loads.drag") if balls else NAMES
+    factor = (
+        {"stiffness": 1.05, "damping": 1.3, "loads.mass": 1.1, "drag": 1.2} if balls else {"stiffness": 1.1, "damping": 1.5}
+    )
+    away, relative, statuses, order = [], [], [], ()
     for k in range(count):
         rng = np.random.default_rng([seed, k])
-        run = record(TIMES, clean, NOISE, rng, turning=turning, **options)
-        factor = {"stiffness": 1.1, "damping": 1.5}
+        if balls:
+            run = jammed.jammed_record(JAMMED_NOISE, rng, **options)
+        else:
+            run = record(TIMES, clean, NOISE, rng, turning=turning, **options)
         first = {
             name: value * next((f for word, f in factor.items() if word in name), 1.0) ** rng.choice([-1.0, 1.0])
-            for name, value in TRUTH.items()
+            for name, value in truth.items()
         }
-        fit = jv.identify(scene_of(first), run, unknown=NAMES, throw=False)
+        fit = jv.identify(scene(first), run, unknown=names, throw=False)
         found = np.array([[each.value, each.error] for each in fit.estimates]).T
-        truth = np.array([TRUTH[name] for name in fit.names])
-        away.append((found[0] - truth) / found[1])
-        relative.append(found[0] / truth - 1.0)
+        true = np.array([truth[name] for name in fit.names])
+        away.append((found[0] - true) / found[1])
+        relative.append(found[0] / true - 1.0)
         statuses.append(fit.status_name)
-    return Repeated(np.array(away), np.array(relative), _bound(turning, **options), np.array(statuses))
+        order = fit.names
+    least = jammed.bound(order, JAMMED_NOISE) if balls else _bound(turning, **options)
+    return Repeated(np.array(away), np.array(relative), least, np.array(statuses))
 
 
 def _bound(turning, color=0.0, gain_error=0.0, outliers=0.0, resolution=0.0, **_):

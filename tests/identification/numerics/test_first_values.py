@@ -96,7 +96,7 @@ def test_steady_amplitudes_against_complex_stiffness():
     ends = [point(-0.5, -0.2), point(0.6, -0.1)]
     springs, dampers = [np.diag([6e4, 9e4]), np.diag([8e4, 7e4])], [np.diag([300.0, 200.0]), np.diag([100.0, 400.0])]
     k, c = (sum(end.T @ each @ end for end, each in zip(ends, kind, strict=True)) for kind in (springs, dampers))
-    force = sum(each @ end for end, each in zip(ends, springs, strict=True))
+    force, drag = (sum(each @ end for end, each in zip(ends, kind, strict=True)) for kind in (springs, dampers))
     for w, row in zip(speeds, np.asarray(found), strict=True):
         # clockwise: (cos, -sin) = real part of (1, -i) exp(i angle), with its sign of time reversed
         q = np.linalg.solve(k - w**2 * mass + 1j * w * c, w**2 * point(0.15, 0.25).T @ np.array([1.0, 1j]))
@@ -104,7 +104,7 @@ def test_steady_amplitudes_against_complex_stiffness():
             w**2 * np.array([0.6, 0.8]) @ point(0.3, -0.1) @ q,
             w * point(-0.2, 0.1)[0] @ q,
             point(0.15, 0.25)[1] @ q,
-            np.array([0.8, 0.6]) @ force @ q,
+            np.array([0.8, 0.6]) @ (force + 1j * w * drag) @ q,
         ]
         np.testing.assert_allclose(row, np.abs(expected), rtol=1e-9)
 

@@ -90,7 +90,7 @@ def problem_with(unbalance=None, means=(0.0, 0.0), precisions=(0.0, 0.0)):
     )
     machine = SimpleNamespace(structure=lambda: SimpleNamespace(coordinates=("y",)))
     return Problem(*[None] * len(Problem._fields))._replace(
-        scene=SimpleNamespace(machine=machine), runs=runs, raw=raw, masks=(np.ones((N, CHANNELS), bool),) * 2,
+        scene=SimpleNamespace(machine=machine, exciters=()), runs=runs, raw=raw, masks=(np.ones((N, CHANNELS), bool),) * 2,
         bounds=(np.zeros((N, CHANNELS)),) * 2, means=np.array(means),
         unknowns=SimpleNamespace(count=2, errors=0, positive=np.zeros(2, bool)), precisions=np.array(precisions),
         unbalances=(unbalance,), angle_errors=(0.0, 0.0),

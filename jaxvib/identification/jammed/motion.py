@@ -1,0 +1,241 @@
+"""Motion of a machine with loads on a rotor of known angle, at the samples of a record, and its normal equations.
+
+The state is y = (q, q', angles of the loads, their rates, states of high-pass filters). The exact equations of the scene are
+integrated by equal steps of order 8, over J stretches of a record at once, each with its forward derivatives G by its first
+state and H by all other unknowns z. A change of z and of the state at the first sample then changes the states at the starts
+of the stretches by
+
+    D_1 = d(first state),      D_{j+1} = G_j D_j + H_j dz + (end_j - start_{j+1})
+
+The last term closes the gaps between the stretches. Without gaps this is the derivative of the whole motion. The motion of
+loads that are jammed is stable, so that the products of G do not grow.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.dynamics import Dynamics, dynamics_of
+from jaxvib.equations.model import assemble
+from jaxvib.equations.state import State
+from jaxvib.identification.angle import RecordedDrive
+from jaxvib.identification.response import Samples, Unknowns, sensor_rows
+from jaxvib.machine.drives.drive import Drive, IdealDrive
+from jaxvib.machine.scene import Scene
+from jaxvib.ode.dopri8_loop import LoopDopri8
+from jaxvib.runtime.programs import cached
+
+
+class _Turned(IdealDrive):
+    """Prescribed `drive` whose angle is larger by `phase`, rad; from the time `end` on the rotor stands still."""
+
+    drive: Drive
+    phase: Array
+    end: Array
+    speed: Array
+    kind: str = eqx.field(static=True, default="turned", kw_only=True)
+
+    def angle_at(self, t: Array) -> Array:
+        """Return the angle, rad."""
+        return self.drive.rotor_angle(jnp.minimum(t, self.end), None) + self.phase
+
+    def speed_at(self, t: Array) -> Array:
+        """Return the speed, rad/s."""
+        return self.drive.rotor_speed(jnp.minimum(t, self.end), None)
+
+    def acceleration_at(self, t: Array) -> Array:
+        """Return the acceleration, rad/s^2."""
+        acceleration: Any = self.drive.rotor_acceleration(jnp.minimum(t, self.end))
+        return acceleration
+
+
+class _Equations(NamedTuple):
+    """Equations of a run: the `dynamics` of the scene; `rows` (C, 3, nd) and `gains` (C,) of the readings; `corners` (k,),
+    rad/s, of the high-pass filters."""
+
+    dynamics: Dynamics
+    rows: Array
+    gains: Array
+    corners: Array
+
+
+def _equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pair: Array) -> _Equations:
+    own = samples.scene(unknowns.scene(scene, x))
+    exciter, drive = own.exciters[0], samples.drives[0]
+    first, count = samples.errors
+    if count and isinstance(drive, RecordedDrive):
+        drive = drive.with_errors(x[first : first + count])
+    phase = jnp.zeros(())
+    if exciter.unbalance is not None:
+        turn = 0.0 if samples.turn is None else x[unknowns.first.shape[0] + len(unknowns.gains) + samples.turn]
+        phase = exciter.direction * (jnp.arctan2(pair[1], pair[0]) + turn)
+        own = eqx.tree_at(lambda scene: scene.exciters[0].unbalance, own, jnp.hypot(pair[0], pair[1]))
+    turned = _Turned(drive=drive, phase=phase, end=samples.end, speed=drive.speed)
+    own: Any = eqx.tree_at(lambda scene: scene.exciters[0].drive, own, turned)
+    model = assemble(own)
+    gains = jnp.stack([jnp.asarray(unknowns.gain(x, channel.name)) for channel in samples.channels])
+    corners = jnp.asarray([2.0 * np.pi * channel.high_pass for channel in samples.channels if channel.high_pass > 0.0])
+    return _Equations(dynamics_of(model), sensor_rows(own, model.carrier, samples.channels), gains, corners)
+
+
+def _rates(samples: Samples, t: Array, y: Array, equations: _Equations) -> tuple[Array, Array]:
+    """Return the rates of the state `y`, and the readings (C,) without their gains."""
+    nd, filters = equations.rows.shape[2], equations.corners.shape[0]
+    loads = (y.shape[0] - 2 * nd - filters) // 2
+    q, v, angle, rate, slow = jnp.split(y, np.cumsum([nd, nd, loads, loads]))
+    found = equations.dynamics(t, State(q, v, (angle,), (rate,)))
+    readings = equations.rows[:, 0] @ q + equations.rows[:, 1] @ v + equations.rows[:, 2] @ found.velocity
+    filtered = np.flatnonzero([channel.high_pass > 0.0 for channel in samples.channels])
+    follows = equations.corners * (readings[filtered] - slow)
+    rates = jnp.concatenate([found.displacement, found.velocity, *found.angle, *found.rate, follows])
+    return rates, readings.at[filtered].add(-slow)
+
+
+def _stretch(
+    unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pair: Array, start: Array, begin: Array, length: int
+) -> tuple[Array, Array, Array]:
+    """Return the readings (length, C) and the states (length, ns) from the sample `begin` on, and the state at the end."""
+    equations = _equations(unknowns, samples, scene, x, pair)
+    term = diffrax.ODETerm(lambda t, y, args: _rates(samples, jnp.asarray(t), y, args)[0])
+    per_sample, solver = samples.stretches[2], LoopDopri8(tangents=True)
+
+    def sample(y: Array, k: Array) -> tuple[Array, tuple[Array, Array]]:
+        t, h = samples.begin + samples.step * (begin + k), samples.step / per_sample
+        readings = equations.gains * _rates(samples, t, y, equations)[1]
+
+        def step(i: Array, y: Array) -> Array:
+            return solver.step(term, t + i * h, t + (i + 1) * h, y, equations, None, False)[0]
+
+        return jax.lax.fori_loop(0, per_sample, step, y), (readings, y)
+
+    end, (readings, states) = jax.lax.scan(sample, start, jnp.arange(length))
+    return readings, states, end
+
+
+@cached
+def stretches(
+    unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pair: Array, starts: Array, length: int
+) -> tuple[Array, Array, Array]:
+    """Return the readings (J, length, C), the states (J, length, ns) and the last states (J, ns) of J stretches.
+
+    **Arguments**: `x`; `pair`: components of the unbalance; `starts` (J, ns): first states.
+    """
+    begins = length * jnp.arange(starts.shape[0])
+    return jax.vmap(lambda start, begin: _stretch(unknowns, samples, scene, x, pair, start, begin, length))(starts, begins)
+
+
+@cached
+def _slopes(
+    unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pair: Array, starts: Array
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Return readings and last states as `stretches`, and their derivatives (..., p + 2 + ns) by (x, pair, first state)."""
+    length, p = samples.stretches[1], x.shape[0]
+
+    def motion(free: Array, begin: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        readings, _, end = _stretch(unknowns, samples, scene, free[:p], free[p : p + 2], free[p + 2 :], begin, length)
+        return (readings, end), (readings, end)
+
+    def of_stretch(start: Array, begin: Array) -> tuple[Any, Any]:
+        return jax.jacfwd(motion, has_aux=True)(jnp.concatenate([x, pair, start]), begin)
+
+    slopes, found = jax.vmap(of_stretch)(starts, length * jnp.arange(starts.shape[0]))
+    return found, slopes
+
+
+class Linearized(NamedTuple):
+    """Motion of a run about its unknowns (x, states at the first sample, pair, offsets), and the closing of its gaps.
+
+    **Attributes** (f = p + ns + 2 + C unknowns, and one more, 1 for closed gaps): `model` (n, C), filtered readings; `columns`
+    (n, C, f + 1) of them; `moves` (J, ns, f + 1) of the starts of the stretches; `gaps` (J - 1, ns).
+    """
+
+    model: np.ndarray
+    columns: np.ndarray
+    moves: np.ndarray
+    gaps: np.ndarray
+
+
+def linearized(
+    unknowns: Unknowns, samples: Samples, scene: Scene, x: np.ndarray, own: np.ndarray, starts: np.ndarray
+) -> Linearized:
+    """Return the motion of a run about its unknowns. `own`: first state, pair, offsets; `starts` (J, ns) of the stretches."""
+    p, count = x.size, starts.shape[1]
+    found, slopes = _slopes(unknowns, samples, scene, jnp.asarray(x), jnp.asarray(own[count : count + 2]), jnp.asarray(starts))
+    (readings, ends), (by_readings, by_ends) = jax.tree.map(np.asarray, (found, slopes))
+    gaps, width = ends[:-1] - starts[1:], p + count + 2 + len(samples.channels) + 1
+    direct = np.concatenate([np.arange(p), p + count + np.arange(2)])  # places of x and pair
+    moved, moves, columns = np.zeros((count, width)), [], []
+    moved[:, p : p + count] = np.eye(count)
+    for j in range(len(starts)):
+        moves.append(moved)
+        part = by_readings[j][:, :, p + 2 :] @ moved
+        part[:, :, direct] += by_readings[j][:, :, : p + 2]
+        columns.append(part)
+        moved = by_ends[j][:, p + 2 :] @ moved
+        moved[:, direct] += by_ends[j][:, : p + 2]
+        if j < len(gaps):
+            moved[:, -1] += gaps[j]
+    n = samples.readings.shape[0] * samples.readings.shape[1]
+    model, slopes = (np.concatenate(each)[:n] for each in (readings, columns))
+    model, slopes = _filtered(samples, model), _filtered(samples, slopes)
+    level = np.sum(np.asarray(samples.taps), axis=0)  # an offset that has always been there
+    offsets = np.arange(len(level))
+    slopes[:, offsets, p + count + 2 + offsets] = level
+    return Linearized(model + level * own[count + 2 :], slopes, np.stack(moves), gaps)
+
+
+def _filtered(samples: Samples, values: np.ndarray) -> np.ndarray:
+    """Return readings (n, C, ...) after the filter of the model."""
+    from scipy.signal import lfilter  # slow to import
+
+    taps = np.asarray(samples.taps)
+    found = np.stack([lfilter(taps[:, c], 1.0, values[:, c], axis=0) for c in range(taps.shape[1])], axis=1)
+    return np.asarray(found)
+
+
+def weighted(samples: Samples, model: np.ndarray) -> np.ndarray:
+    """Return readings minus model (n, C), by the weights of the readings."""
+    count = model.shape[1]
+    data, weights = (np.asarray(each).reshape(-1, count)[: len(model)] for each in (samples.readings, samples.weights))
+    return weights * (data - model)
+
+
+def closed_motion(
+    unknowns: Unknowns, samples: Samples, scene: Scene, x: np.ndarray, own: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the readings (n, C) of a run with their offsets, without the filter, and the starts (J, ns) of its stretches.
+
+    **Arguments**: `own`: state at the first sample, pair, offsets.
+    """
+    count, (number, length, _) = own.size - 2 - len(samples.channels), samples.stretches
+    pair, start = jnp.asarray(own[count : count + 2]), jnp.asarray(own[None, :count])
+    found = stretches(unknowns, samples, scene, jnp.asarray(x), pair, start, number * length)
+    readings, states = np.asarray(found[0]), np.asarray(found[1])
+    return readings[0] + own[count + 2 :], states[0, ::length]
+
+
+def motion_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Return Z^T Z of Z = (derivatives by x and the own unknowns, readings minus model), as `normal_equations`."""
+    at = linearized(unknowns, samples, scene, x, own, closed_motion(unknowns, samples, scene, x, own)[1])
+    return products(samples, at, at.columns[:, :, :-1])
+
+
+def products(samples: Samples, at: Linearized, columns: np.ndarray) -> np.ndarray:
+    """Return Z^T Z of some weighted columns and the weighted readings minus model."""
+    weights = np.asarray(samples.weights).reshape(-1, at.model.shape[1])[: len(at.model)]
+    z = np.concatenate([columns * weights[:, :, None], weighted(samples, at.model)[:, :, None]], axis=2)
+    z = z.reshape(-1, z.shape[2])
+    return z.T @ z
+
+
+def motion_cost(samples: Samples, readings: np.ndarray, offsets: np.ndarray) -> float:
+    """Return the cost of the readings (n, C) of a model without the filter, with their `offsets`."""
+    level = np.sum(np.asarray(samples.taps), axis=0)
+    return float(np.sum(weighted(samples, _filtered(samples, readings - offsets) + level * offsets) ** 2))

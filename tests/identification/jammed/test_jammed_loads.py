@@ -1,0 +1,147 @@
+"""Machines with jammed balls: fits to records by SciPy, and scenes and records that are refused."""
+
+import dataclasses
+
+import equinox as eqx
+import numpy as np
+import pytest
+from repeated_records.fits import repeated
+from repeated_records.jammed import RADIUS, TIMES, TRUTH, clean, first_state, jammed_record, scene_of
+
+import jaxvib as jv
+from jaxvib.identification.jammed.motion import closed_motion, linearized
+from jaxvib.identification.jammed.start import with_first_motion
+from jaxvib.identification.problem import build_problem, with_noise
+from jaxvib.numerics.noise import Noise
+
+UNKNOWN = ["machine.stiffness", "exciters[0].unbalance", "loads.mass", "loads.drag"]
+
+
+def jammed_problem(unknown=UNKNOWN):
+    return build_problem(scene_of(TRUTH), [jammed_record(1e-9, np.random.default_rng(0))], unknown, {})
+
+
+def true_own(offset=0.1):
+    """Return the first state of the record by SciPy, the components of the unbalance, and the offsets."""
+    own = first_state()
+    return np.concatenate([own[:4], [own[4]] * 2, [own[5]] * 2, 0.05 * np.array([np.cos(0.4), np.sin(0.4)]), [offset] * 2])
+
+
+def test_motion_is_that_of_scipy():
+    problem = jammed_problem()
+    samples = problem.runs[0]
+    shifted = dataclasses.replace(samples, begin=0.0 * samples.begin)  # the record begins at the first pulse
+    readings, _ = closed_motion(problem.unknowns, shifted, problem.scene, np.zeros(problem.unknowns.count), true_own())
+    np.testing.assert_allclose(readings[: TIMES.size - 2] - 0.1, clean()[: TIMES.size - 2], atol=2e-5)
+
+
+def body():
+    """Return a body in a plane with two unequal pendulums and an unbalance on a clockwise rotor."""
+    supports = [jv.support(at=(x, -0.2), stiffness=(6e4, 9e4), damping=(600.0, 700.0)) for x in (-0.5, 0.6)]
+    machine = jv.plane_body(mass=80.0, inertia=12.0, supports=supports)
+    loads = jv.pendulums(count=2, mass=[0.5, 0.6], radius=0.1, drag=[1.0, 1.2], inertia=0.001)
+    exciter = jv.Exciter(loads, jv.RunUp(90.0, acceleration=20.0), unbalance=0.03, at=(0.1, 0.2), direction=-1)
+    return jv.Scene(machine, exciters=[exciter], effects=jv.Gravity())
+
+
+CHANNELS = [
+    jv.Channel("a", "acceleration", at=(0.3, -0.1), direction=(0.6, 0.8), high_pass=2.0),
+    jv.Channel("v", "velocity", at=(-0.2, 0.1), direction="across", gain_error=0.01),
+    jv.Channel("f", "force", direction="up"),
+]
+
+
+def body_problem():
+    time = 0.01 * np.arange(120)
+    readings = {channel.name: np.sin(20.0 * time) for channel in CHANNELS}
+    run = jv.MeasuredRun.from_arrays(CHANNELS, time, readings, change={"machine.mass": "+5 kg"})
+    unknown = ["machine.inertia", "loads.mass", "loads.drag", "exciters[0].unbalance"]
+    problem = build_problem(body(), [run], unknown, {})
+    samples = dataclasses.replace(problem.runs[0], stretches=(3, 40, 2))
+    return with_noise(problem._replace(runs=(samples,)), [[Noise(np.array([1.0, -0.5]), 1.0)] * 3])
+
+
+def test_derivatives_against_differences_and_gaps_close():
+    problem = body_problem()
+    (samples,), rng, p = problem.runs, np.random.default_rng(0), problem.unknowns.count
+    states = 2 * (3 + 2) + 1
+    own = np.concatenate([1e-3 * rng.normal(size=3), 0.05 * rng.normal(size=3), [0.2, 0.5, -20.0, -21.0], [0.1]])
+    own, x = np.concatenate([own, [0.02, 0.01], [0.1, 0.2, 0.3]]), 0.01 * rng.normal(size=p)
+
+    def motion(x, own):
+        _, starts = closed_motion(problem.unknowns, samples, problem.scene, x, own)
+        return linearized(problem.unknowns, samples, problem.scene, x, own, starts)
+
+    at = motion(x, own)
+    assert np.max(np.abs(at.gaps)) < 1e-9 and at.columns.shape[2] == p + states + 2 + 3 + 1
+    for k in range(p + own.size):
+        step = 1e-6 * np.eye(p + own.size)[k]
+        high, low = (motion(x + s * step[:p], own + s * step[p:]).model for s in (1.0, -1.0))
+        slope = (high - low) / 2e-6
+        np.testing.assert_allclose(at.columns[:, :, k], slope, atol=1e-6 * max(1.0, np.max(np.abs(slope))))
+
+    open_starts = closed_motion(problem.unknowns, samples, problem.scene, x, own)[1] + 1e-5 * rng.normal(size=(3, states))
+    open_starts[0] = own[:states]
+    gaps = linearized(problem.unknowns, samples, problem.scene, x, own, open_starts)
+    closed = open_starts + gaps.moves[:, :, -1]
+    assert np.max(np.abs(linearized(problem.unknowns, samples, problem.scene, x, own, closed).gaps)) < 1e-3 * np.max(
+        np.abs(gaps.gaps)
+    )
+
+
+def test_motion_of_pendulums_is_that_of_simulate():
+    problem = body_problem()
+    (samples,), scene = problem.runs, body()
+    heavier = eqx.tree_at(lambda scene: scene.machine.mass, scene, scene.machine.mass + 5.0)
+    start = jv.State(np.zeros(3), np.zeros(3), (np.array([-1.6, -1.5]),), (np.zeros(2),))
+    run = jv.simulate(heavier, "1.19 s", start=start, samples=120, estimate=False).trajectory.state
+    own = np.concatenate([np.zeros(6), [-1.6, -1.5], np.zeros(3), [0.03, 0.0], np.zeros(3)])
+    readings, _ = closed_motion(problem.unknowns, samples, problem.scene, np.zeros(problem.unknowns.count), own)
+    across = np.asarray(run.velocity) @ np.array([1.0, 0.0, -0.1])
+    np.testing.assert_allclose(readings[:, 1], across, atol=1e-6 * np.max(np.abs(across)))
+
+
+def test_first_values_are_those_of_a_record_without_noise():
+    _, x = with_first_motion(jammed_problem())
+    np.testing.assert_allclose(x, 0.0, atol=1e-4)
+
+
+def test_jammed_balls_and_unbalance_are_found():
+    found = repeated(1, balls=True)
+    assert found.statuses.tolist() == ["found"]
+    assert np.max(np.abs(found.away)) < 3.5
+    np.testing.assert_allclose(np.abs(found.relative / found.away / found.bound), 1.0, atol=0.15)
+
+
+def test_scene_without_a_jam_in_the_record_is_refused():
+    run, rng = jammed_record(0.2, np.random.default_rng(0)), np.random.default_rng(0)
+    noise = {name: rng.normal(size=TIMES.size) for name in ("a1", "a2")}
+    slow = {"a1": TIMES, "a2": TIMES, "tacho": np.arange(0.0, 16.0, 0.5)}
+    channels = (*run.channels[:2], jv.Channel("tacho", "pulses"))
+    with pytest.raises(
+        jv.InputError, match=r"records\[0\] has no vibration of jammed loads below the smallest speed of the rotor"
+    ):
+        jv.identify(scene_of(TRUTH), jv.MeasuredRun.from_arrays(channels, slow, noise), unknown=UNKNOWN)
+
+
+def refused(scene, words, unknown=("machine.mass",)):
+    with pytest.raises(jv.InputError, match=words):
+        jv.identify(scene, jammed_record(0.2, np.random.default_rng(0)), unknown=unknown)
+
+
+def test_loads_that_are_not_included_are_refused():
+    scene = scene_of(TRUTH)
+    exciter = scene.exciters[0]
+    hung = jv.pendulums(count=2, mass=0.8, radius=RADIUS, drag=1.5)
+    several = [exciter, jv.Exciter(drive=jv.ConstantSpeed(50.0), unbalance=0.1)]
+    refused(jv.Scene(scene.machine, exciters=several), "has 2 exciters, one of them with loads; identify needs loads")
+    refused(
+        scene.replace(loads=hung, effects=jv.DryFriction(coefficient=0.01, diameter=0.02)),
+        "dry_friction is not included in identify",
+    )
+    torus = jv.torus_balls(count=1, mass=0.1, radius=RADIUS, tube=0.02, ball_radius=0.01, drag=1.0)
+    refused(
+        jv.Scene(scene.machine, torus, exciter.drive), "scene.loads is of kind 'torus_ball'; identify needs loads on a circle"
+    )
+    refused(scene, "without loads can be unknown", unknown=["drive.inertia"])
+    refused(scene.replace(loads=jv.balls(count=1, mass=0.8, radius=RADIUS, drag=1e7)), "decay much faster than the motion")
