@@ -5,9 +5,10 @@ speeds, with the amplitude
 
     T_ik = (S_i S_k / 2) w_k^4 |H_ik(w_k)|
 
-and changes the speed of mass i, whose inertia is I_i and whose driving torque has the slope L_i', by T_ik/|i d I_i - L_i'| at
-the difference d = w_k - w_i. The groups are independent if this change is small compared with d. The ratios are added over the
-masses k of all other groups. The `interaction` of a motion is the largest of these sums.
+and changes the speed of mass i, whose inertia is I_i and whose driving torque has the slope L_i' = dL_i/dw_i, with the
+amplitude T_ik/sqrt((d I_i)^2 + L_i'^2) at the difference d = w_k - w_i. The groups are independent if this change is small
+compared with d. The ratios are added over the masses k of all other groups. The `interaction` of a motion is the largest of
+these sums.
 """
 
 from __future__ import annotations

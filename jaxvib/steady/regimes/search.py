@@ -21,7 +21,7 @@ from jaxvib.steady.regimes.symmetry import Exchange, distinct_regimes, exchanges
 _EVEN_SPEEDS, _NEAR_SPEEDS = 200, 40
 """Numbers of speeds at equal distances, and on each side of a resonance or of a drive's working speed."""
 
-_PHASES_PER_UNKNOWN, _MOST_REGULAR = 24, 64
+_PHASES_PER_UNKNOWN, _MAX_REGULAR_SETS = 24, 64
 """Random sets of phases for each squared number of unknown phases, and largest number of regular sets."""
 
 _STARTS_PER_PROGRAM = 256
@@ -117,10 +117,10 @@ def _speeds(balance: TorqueBalance) -> np.ndarray:
 
 
 def sets_of_phases(prescribed: np.ndarray, dtype: np.dtype, per_unknown: int = _PHASES_PER_UNKNOWN) -> np.ndarray:
-    """Return regular sets of phases (n, count), and random ones, whose number is `per_unknown` times the square of that of the
-    unknown phases.
+    """Return regular and random sets of phases (n, count).
 
-    The phases of masses with prescribed speed are 0.
+    The number of random sets is `per_unknown` times the square of the number of unknown phases. The phases of masses with
+    prescribed speed are 0.
     """
     free = np.flatnonzero(~prescribed) if prescribed.any() else np.arange(1, prescribed.size)
     n = free.size
@@ -134,9 +134,9 @@ def sets_of_phases(prescribed: np.ndarray, dtype: np.dtype, per_unknown: int = _
 
 def _regular_sets(n: int) -> np.ndarray:
     """Return sets (sets, n) of phases that are multiples of half a turn, or spread evenly."""
-    halves = np.pi * (np.arange(min(2**n, _MOST_REGULAR))[:, None] >> np.arange(n) & 1)
-    splayed = 2.0 * np.pi / (n + 1) * np.arange(1, n + 1)[:, None] * np.arange(1, n + 1)
-    return np.concatenate([halves, splayed])
+    halves = np.pi * (np.arange(min(2**n, _MAX_REGULAR_SETS))[:, None] >> np.arange(n) & 1)
+    evenly_spread = 2.0 * np.pi / (n + 1) * np.arange(1, n + 1)[:, None] * np.arange(1, n + 1)
+    return np.concatenate([halves, evenly_spread])
 
 
 def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
