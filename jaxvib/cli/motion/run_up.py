@@ -29,8 +29,8 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
     output.picture("run_up.png", found.plot)
     output.csv(csv, found.run, "trajectory_time")
     names = ("resonances", "speed", "caught_at", "peak_amplitude", "peak_force")
-    rest = {"least_torque": found.least_torque} if least else {}
-    document = {"status": found.status_name, "message": found.message, **fields_of(found, *names), **rest}
+    optional_fields = {"least_torque": found.least_torque} if least else {}
+    document = {"status": found.status_name, "message": found.message, **fields_of(found, *names), **optional_fields}
     output.done(document, found.summary, "run_up", found)
 
 
@@ -48,11 +48,11 @@ def run_up_map(scene: Path, drags: tuple[str, ...], tolerance: float | None, out
     """Compute run-ups of SCENE from rest for each drag and each set of initial angles, and report the final regimes."""
     from jaxvib.units import number
 
-    each = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None
+    drag_values = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None
     loaded = loaded_scene(scene)
     if all(exciter.loads is None for exciter in loaded.exciters):
         raise InputError("scene", "has no loads (balls, pendulums); for motors with unbalances use `jaxvib run-up`")
-    found = jv.run_up_map(loaded, drag=each, stepsize_controller=chosen_steps(tolerance), **options)
+    found = jv.run_up_map(loaded, drag=drag_values, stepsize_controller=chosen_steps(tolerance), **options)
     output.picture("run_up_map.png", found.plot)
     output.save_result("run_up_map.npz", found)
     kinds = sorted(set(found.kind.ravel().tolist()))

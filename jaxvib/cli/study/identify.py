@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Command = TypeVar("Command", bound=Callable)
 
-_NAMED = (
+_NUMBER_OPTIONS = (
     ("mass", "pendulum", "Mass of the pendulum, such as '300 g'."),
     ("length", "pendulum", "Distance of the centre of mass from the axis of the bearing, such as '25 cm'."),
     ("inertia", "pendulum", "Moment of inertia about the centre of mass, kg m^2 [0, a point mass]."),
@@ -33,7 +33,7 @@ _NAMED = (
 
 
 def _with_number_options(command: Command) -> Command:
-    for name, section, text in reversed(_NAMED):
+    for name, section, text in reversed(_NUMBER_OPTIONS):
         command = click.option(f"--{name}", f"{section}__{name.replace('-', '_')}", help=text)(command)
     return command
 
@@ -64,8 +64,8 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
 
     RECORD is an identification file (TOML) that names a scene file, recorded runs and their channels; --out adds the fitted
     scene (found.toml), the picture and the fit (fit.npz). For a bearing, it is a CSV file of time and angle of a pendulum whose
-    swing on the bearing decays, or a measurement file (TOML) that names one; options replace the values in the file, and --out
-    adds the picture and the fit (fit.csv)."""
+    swing on the bearing decays, or a measurement file (TOML) that names such a file; options replace the values in the
+    measurement file, and --out adds the picture and the fit (fit.csv)."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.machine.files import read_toml
@@ -84,14 +84,14 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     if data is not None:
         columns = np.stack([swing.time, swing.angle, found.fitted], axis=1)
         np.savetxt(data, columns, fmt="%.9g", delimiter=",", header="time (s),angle (rad),fit (rad)", comments="")
-    ten = found.decrement
+    decrement = found.decrement
     document = {
         "status": found.status_name,
         "message": found.message,
         **fields_of(found, "notes", "viscous", "dry", "air", "torque", "correlation"),
         "decrement": None
-        if ten is None
-        else {**fields_of(ten, "viscous", "scatter", "drift", "period", "periods"), "pairs": len(ten.estimates)},
+        if decrement is None
+        else {**fields_of(decrement, "viscous", "scatter", "drift", "period", "periods"), "pairs": len(decrement.estimates)},
         **fields_of(found, "frequency", "offset"),
         "inertia": pendulum.total_inertia,
         "inertia_by_frequency": found.inertia,
@@ -102,14 +102,14 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
 
     def text() -> str:
         rows = [_row("mu1, N m s", found.viscous)]
-        more = {"mu2": found.dry, "drag of the air, N m s^2": found.air, "torque, N m": found.torque}
-        rows += [_row(name, each) for name, each in more.items() if each is not None]
-        if ten is not None:
-            rows.append(_row(f"mu1 by the formula of {ten.periods} periods, N m s", ten.viscous))
+        further_numbers = {"mu2": found.dry, "drag of the air, N m s^2": found.air, "torque, N m": found.torque}
+        rows += [_row(name, each) for name, each in further_numbers.items() if each is not None]
+        if decrement is not None:
+            rows.append(_row(f"mu1 by the formula of {decrement.periods} periods, N m s", decrement.viscous))
         rows.append(_row("frequency of small swings, rad/s", found.frequency))
         rows.append(_row("recorded angle at the hanging position, rad", found.offset))
-        holds = found.status_name in ("found", "undetermined")
-        meaning = "intervals are for a confidence of 95 %" if holds else "intervals do not include the error of the law"
+        is_valid = found.status_name in ("found", "undetermined")
+        meaning = "intervals are for a confidence of 95 %" if is_valid else "intervals do not include the error of the law"
         lines = [
             f"{swing.name}: {swing.samples} samples, noise {found.noise:.3g} rad",
             f"{found.status_name}: {found.message}",

@@ -37,7 +37,7 @@ _FAILED = "failed"
 """Name of the outcome of a run that did not reach its end and has no regime."""
 
 _TOLERANCE = Tolerance(1e-7)
-"""Tolerance of a step in double precision, which is small enough to determine the regime."""
+"""Default tolerance of a step in double precision. It is small enough to determine the regime."""
 
 _MIN_ALLOWED_STEPS = 2**20
 """Smallest default of `max_steps`. It is so large that run-ups of any usual length share one program."""
@@ -52,7 +52,7 @@ class RunUpMap(Result):
     - `angle` (ns, count): initial angles of the loads, rad
     - `regime`: a `Regime` whose arrays have the leading axes (nd, ns)
     - `kind` (nd, ns): short name of the regime, or "failed" if the run did not reach its end
-    - `omega` (nd, ns): mean speed of the loads, rad/s, NaN if it failed
+    - `omega` (nd, ns): mean speed of the loads, rad/s, NaN for a failed run
     - `finished` (nd, ns): True if the run reached its end
     """
 
@@ -66,7 +66,8 @@ class RunUpMap(Result):
     finished: np.ndarray = eqx.field(metadata=in_unit("", "drag", "start"))
 
     def fraction(self, kind: str) -> np.ndarray:
-        """Return the share of the starts (nd,) that end in a `kind` of motion, or whose runs "failed".
+        """Return the share of the starts (nd,), between 0 and 1, whose runs end in a `kind` of motion; "failed" for failed
+        runs.
 
         **Raises** `InputError` for an unknown kind.
         """
@@ -77,18 +78,20 @@ class RunUpMap(Result):
         """Return a line of text for each drag: shares of the regimes at the end with intervals of 95 %, speeds of jams, and
         failed runs. A single start has no shares."""
         n = len(self.angle)
-        single = "one start at each drag; a small change of the start may change the outcome: give more starts for shares"
-        lines = [single if n == 1 else f"of {n} starts at each drag (in brackets: 95 % intervals)"]
+        note_on_one_start = (
+            "one start at each drag; a small change of the start may change the outcome: give more starts for shares"
+        )
+        lines = [note_on_one_start if n == 1 else f"of {n} starts at each drag (in brackets: 95 % intervals)"]
         for k, drag in enumerate(self.drag):
             portions = []
             for kind in (kind for kind in (*REGIMES, _FAILED) if np.any(self.kind[k] == kind)):
                 speeds = self.omega[k][self.kind[k] == kind]
-                at = f" at {_span(speeds)}" if kind == "jammed" else ""
+                speed_text_of_kind = f" at {_span(speeds)}" if kind == "jammed" else ""
                 if n == 1:
-                    portions.append(f"{kind}{at}")
+                    portions.append(f"{kind}{speed_text_of_kind}")
                     continue
                 low, high = (100.0 * float(end) for end in wilson(np.asarray(speeds.size), np.asarray(n)))
-                portions.append(f"{100.0 * speeds.size / n:.3g} % ({low:.3g} to {high:.3g} %) {kind}{at}")
+                portions.append(f"{100.0 * speeds.size / n:.3g} % ({low:.3g} to {high:.3g} %) {kind}{speed_text_of_kind}")
             lines.append(f"drag {drag:.4g} N s/m: {', '.join(portions)}")
         return "\n".join(lines)
 
@@ -128,7 +131,7 @@ def run_up_map(
 
     **Arguments**
 
-    - `scene`; a run-up needs a drive that starts from rest
+    - `scene` with loads on a circle; a run-up needs a drive that starts from rest
     - `until`: end time, s or text; the regime is that of the last turns of the run (see `simulate`); typical: 5 to 20
     - `drag`: values of the drag b_W of all loads, N s/m; default: the value of the scene; typical: 5 to 20 values from 0.05 to
       5
@@ -137,7 +140,7 @@ def run_up_map(
     - `seed` of the random angles
     - `angles` (sets, count), rad: sets of angles in place of random ones. Without `starts` and `angles` there is one set, at
       the bottom of the track with the `separation` of `simulate`
-    - `separation`: angle between neighbouring loads of this one set, rad; typical: 0.02
+    - `separation`: angle between neighbouring loads in this single set, rad; typical: 0.02
     - `stepsize_controller`: as for `simulate`, except `Accuracy`; default: `Tolerance(1e-7)`, in single precision 1e-5
     - `batch`: number of runs that advance together on each core; typical: 16 (the default)
     - `max_steps`: a run fails after this number of steps; default: as for `simulate`, but at least 2^20
@@ -168,10 +171,10 @@ def run_up_map(
             f"is {quoted(scene.loads.kind)}; run_up_map varies the drag of loads on a circle; for balls in a torus use capture",
         )
     loads = cast(CircularLoads, scene.loads)
-    given = loads.drag if drag is None else numbers(drag, "N s/m", "drag", None, low=0.0)
-    if drag is None and given.ndim:
+    drag_values = loads.drag if drag is None else numbers(drag, "N s/m", "drag", None, low=0.0)
+    if drag is None and drag_values.ndim:
         raise InputError("loads.drag", "differs from load to load; give the values of `drag` for the run-ups")
-    drags = jnp.atleast_1d(given)
+    drags = jnp.atleast_1d(drag_values)
     sets = _sets_of_angles(scene, starts, seed, angles, separation)
     count(batch, "batch")
     require_start(scene, State(jnp.zeros(0), jnp.zeros(0), (jnp.asarray(sets),)))
@@ -192,23 +195,24 @@ def run_up_map(
     (code,) = jax.tree.leaves(regime.name)
     kind = np.where(finished, np.asarray(REGIMES)[code], _FAILED)
 
-    def folded(leaf: np.ndarray) -> np.ndarray:
+    def reshape_cases(leaf: np.ndarray) -> np.ndarray:
         return leaf.reshape(shape + leaf.shape[1:])
 
     return RunUpMap(
         drag=np.asarray(drags),
         angle=sets,
-        regime=jax.tree.map(lambda leaf: jnp.asarray(folded(leaf)), regime),
+        regime=jax.tree.map(lambda leaf: jnp.asarray(reshape_cases(leaf)), regime),
         kind=kind.reshape(shape),
-        omega=folded(omega),
-        finished=folded(finished),
+        omega=reshape_cases(omega),
+        finished=reshape_cases(finished),
     )
 
 
 def _sets_of_angles(
     scene: Scene, starts: int | None, seed: int, angles: Sequence[Sequence[float]] | None, separation: Number | None
 ) -> np.ndarray:
-    """Return the sets (sets, count) of initial angles: the given ones, `starts` random ones, or that of `initial_state`."""
+    """Return sets (sets, count) of initial angles: the argument `angles`, `starts` random sets, or the set of
+    `initial_state`."""
     n = scene.loads.count
     if starts is not None and angles is not None:
         raise InputError("starts", "cannot be combined with angles; give a number of random starts or the angles")
@@ -230,13 +234,16 @@ def _sets_of_angles(
 def _run_batch(
     scene: Scene, until: Array, drags: Array, angles: Array, chosen: StepChoice | None, max_steps: int
 ) -> tuple[Regime, Array, Array]:
-    """Return the regime of each run-up of a batch, the mean speed of its loads, and True if it reached its end."""
+    """Return the regime of each run-up of a batch, the mean speed of its loads (NaN for a failed run), and True if the run
+    reached its end."""
 
-    def one(drag: Array, angle: Array) -> tuple[Regime, Array, Array]:
-        this = eqx.tree_at(lambda s: s.loads.drag, scene, drag)
-        start = eqx.tree_at(lambda s: s.angle, initial_state(this), (angle,))
-        run = simulate(this, until, start=start, save="window", stepsize_controller=chosen, max_steps=max_steps, throw=False)
-        finished = run.finished
-        return run.regime, jnp.where(finished, run.omega, jnp.nan), finished
+    def run_up(drag: Array, angle: Array) -> tuple[Regime, Array, Array]:
+        changed_scene = eqx.tree_at(lambda s: s.loads.drag, scene, drag)
+        start = eqx.tree_at(lambda s: s.angle, initial_state(changed_scene), (angle,))
+        run = simulate(
+            changed_scene, until, start=start, save="window", stepsize_controller=chosen, max_steps=max_steps, throw=False
+        )
+        has_ended = run.finished
+        return run.regime, jnp.where(has_ended, run.omega, jnp.nan), has_ended
 
-    return jax.vmap(one)(drags, angles)
+    return jax.vmap(run_up)(drags, angles)
