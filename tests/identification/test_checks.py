@@ -174,7 +174,9 @@ def outcome(monkeypatch, **changes):
     two = np.array([[1.0, 2.0]])
     runs = [SimpleNamespace(channels=(channel("a"), channel("b")), taps=two)]
     unknowns = SimpleNamespace(count=5, errors=2)
-    problem = SimpleNamespace(unknowns=unknowns, rotors=rotors, runs=runs, angles=[np.array([[7.0, 8.0]])], angle_errors=[0.05])
+    problem = SimpleNamespace(
+        unknowns=unknowns, rotors=rotors, runs=runs, angles=[np.array([[7.0, 8.0]])], angle_errors=[0.05], has_loads=False
+    )
     fitted = SimpleNamespace(
         problem=problem, residuals=[two], outliers=[np.array(given["outliers"])], x=np.zeros(5), misfits=given["misfits"]
     )
@@ -235,7 +237,7 @@ def test_foreign_vibration_in_words(monkeypatch, fits, share, order, size, words
     monkeypatch.setattr(checks, "foreign_vibration", foreign)
     samples = SimpleNamespace(channels=(channel("a"),), step=0.5)
     angles = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
-    problem = SimpleNamespace(unbalances=(None,), runs=[samples], raw=[raw], masks=[mask], angles=[angles])
+    problem = SimpleNamespace(unbalances=(None,), runs=[samples], raw=[raw], masks=[mask], angles=[angles], has_loads=False)
     fitted = SimpleNamespace(problem=problem, residuals=[left])
     found = list(checks._foreign_vibrations(fitted, fits))
     assert (found == []) == (words == "") and all(words in each for each in found)

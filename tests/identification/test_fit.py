@@ -267,9 +267,9 @@ def test_wrong_arguments_end_in_one_sentence(arguments, words):
         jv.identify(start(), run_of(), **arguments)
 
 
-def test_loads_on_the_rotor_are_refused():
+def test_loads_that_are_not_jammed_are_refused():
     scene = jv.Scene(start().machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
-    with pytest.raises(jv.InputError, match="has loads that move on the rotor"):
+    with pytest.raises(jv.InputError, match="has no vibration of jammed loads"):
         jv.identify(scene, run_of(), unknown=["machine.stiffness"])
 
 
