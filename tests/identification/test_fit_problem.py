@@ -48,7 +48,7 @@ def test_known_values_with_their_errors(text, value, error):
 
 
 @pytest.mark.parametrize("text", ["95 kg +- 1 % +- 2 %", "95 kg +- much %", "95 kg +- 1 N"])
-def test_wrong_known_values_end_in_one_sentence(text):
+def test_wrong_known_values_raise_clear_errors(text):
     number = find_number(scene_of(), "machine.mass", "known").single(scene_of())[0]
     with pytest.raises(jv.InputError, match=r"^known"):
         read_known(text, number, "known")
@@ -74,7 +74,7 @@ def run_with(values, times=None, channels=None, clipped=None, change=None, notes
     return jv.MeasuredRun(channels, times, values, none | (clipped or {}), parsed, notes, source)
 
 
-def test_samples_of_channels_with_own_times_are_on_one_grid():
+def test_samples_of_channels_with_different_times_are_on_one_grid():
     """The second channel begins three steps and ends five steps earlier; it has a gap, and one reading is missing."""
     rng = np.random.default_rng(0)
     early = np.delete(0.01 * np.arange(-3, 395) + 1e-5, [100, 101])

@@ -35,7 +35,7 @@ def by_sdypy():
 
 
 @pytest.mark.slow
-def test_modes_of_the_beam_are_those_of_sdypy():
+def test_modes_of_the_beam_agree_with_sdypy():
     """The ratios of the modes 1, 5 and 6 are less certain: the band ends at 1000 Hz, and the decay lasts one second only."""
     frequency, response = accelerances()
     decays = 2.0 * frequency[-1] * np.fft.irfft(response)

@@ -70,7 +70,7 @@ def test_a_speed_gives_the_angle_without_its_zero():
     assert not found.marked
 
 
-def test_a_falling_angle_is_read_as_a_rising_one_and_delayed():
+def test_a_falling_angle_counts_as_rising_and_has_its_delay():
     t = np.linspace(0.0, 5.0, 500)
     found = measured("angle", t, -angle_at(t), delay=0.1)
     np.testing.assert_allclose(found.at(t - 0.1), angle_at(t), rtol=1e-8, atol=1e-8)

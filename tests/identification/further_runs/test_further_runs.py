@@ -141,12 +141,12 @@ def test_gradient_of_the_errors_by_the_speed_is_the_difference():
         ({**LIMITS, "acceleration": 1.0}, "limits.acceleration is 1 rad/s"),
     ],
 )
-def test_wrong_limits_end_in_one_sentence(limits, words):
+def test_wrong_limits_raise_clear_errors(limits, words):
     with pytest.raises(jv.InputError, match=words):
         jv.plan_runs(fitted(), [planned(run_of(0))], limits=limits)
 
 
-def test_held_out_run_of_the_same_machine_is_predicted():
+def test_further_run_of_the_same_machine_is_predicted():
     chances = []
     for seed in range(5, 13):
         found = jv.predict_run(fitted(), run_of(seed))
@@ -156,14 +156,14 @@ def test_held_out_run_of_the_same_machine_is_predicted():
     assert 0.2 < np.mean(chances) < 0.8
 
 
-def test_held_out_run_of_another_machine_is_contradicted():
+def test_run_of_another_machine_contradicts_the_fit():
     found = jv.predict_run(fitted(), run_of(5, **{"machine__stiffness[0]": 5.1e4}))
     assert found.status_name == "contradicted"
     assert any("a change of machine.stiffness[0] by +0.0" in note for note in found.notes), found.notes
     assert "contradicts the fit" in found.summary() and len(found.plot().axes) == 2
 
 
-def test_held_out_run_with_its_stated_change_is_predicted():
+def test_further_run_with_a_stated_change_is_predicted():
     heavier = run_of(5, change={"machine.mass[0]": "+10 kg"}, **{"machine__mass[0]": 130.0})
     assert jv.predict_run(fitted(), heavier).status_name == "predicted"
     assert jv.predict_run(fitted(), run_of(5, **{"machine__mass[0]": 130.0})).status_name == "contradicted"

@@ -68,7 +68,7 @@ def test_noise_of_another_rate_and_of_new_channels(noise, deviation):
         expected_run(fit(), ramp(channels=(jv.Channel("new", "velocity", at=1),)))
 
 
-def test_new_gains_keep_what_is_known_about_them():
+def test_new_gains_keep_their_known_errors():
     unknowns = SimpleNamespace(numbers=(1, 2), gains=("frame", "new"), count=4)
     problem = SimpleNamespace(unknowns=unknowns, precisions=np.array([0.0, 3.0, 25.0, 16.0]))
     assert own_precisions(fit(), problem).tolist() == [0.0, 3.0, 0.0, 16.0] and problem.precisions[2] == 25.0
@@ -114,7 +114,7 @@ def test_information_is_that_of_the_slopes_of_the_readings():
     assert not np.any(found[[3, 5]]) and not np.any(found[:, [3, 5]])
 
 
-def test_expected_errors_are_those_without_the_other_unknowns():
+def test_expected_errors_eliminate_the_other_unknowns():
     slopes = np.random.default_rng(0).normal(size=(30, 4))
     matrix = 400.0 * slopes.T @ slopes
     np.testing.assert_allclose(expected_errors(matrix, 2), np.sqrt(np.diagonal(np.linalg.inv(matrix))[:2]), rtol=1e-9)
@@ -241,7 +241,7 @@ def test_empty_plan_and_chart():
         (dict(noise={"frame": 0.0}), r"noise\['frame'\]"),
     ],
 )
-def test_wrong_planned_runs_end_in_one_sentence(change, says):
+def test_wrong_planned_runs_raise_clear_errors(change, says):
     values = dict(name="x", drive=jv.ConstantSpeed(30.0), duration=10.0, channels=[FRAME], rate=100.0) | change
     with pytest.raises(jv.InputError, match=f"^{says}"):
         PlannedRun(**values)

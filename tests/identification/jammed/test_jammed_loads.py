@@ -101,7 +101,7 @@ def test_motion_of_pendulums_is_that_of_simulate():
     np.testing.assert_allclose(readings[:, 1], across, atol=1e-6 * np.max(np.abs(across)))
 
 
-def test_first_values_are_those_of_a_record_without_noise():
+def test_first_values_agree_with_a_record_without_noise():
     _, x = with_first_motion(jammed_problem())
     np.testing.assert_allclose(x, 0.0, atol=1e-4)
 

@@ -111,7 +111,7 @@ def test_recorded_drive_follows_its_spline():
     np.testing.assert_allclose(moved.columns_at(1.1, 0)[1:], drive.columns_at(1.1, 0)[1:])
 
 
-def test_errors_are_taken_in_groups():
+def test_errors_are_added_in_groups():
     for errors, columns in ((0, 1), (1, 9), (8, 9), (9, 17), (70, 65)):
         assert drive_of(errors)[1].table.shape[2] == columns
     angle = RotorAngle(drive_of(3)[1], drive_of(3)[0], (0.0, 1.0), True, 0.0, 0.0, ())

@@ -14,7 +14,7 @@ from jaxvib.identification.start import _steady, amplitudes, track_orders
 from jaxvib.machine.numbers.named import find_number
 
 
-def test_amplitudes_are_those_of_each_turn():
+def test_amplitudes_follow_from_each_turn():
     """300 turns in groups of 3; the second channel has noise, the third one no readings in the first group."""
     step, n = 1e-3, 30001
     angle = -2.0 * np.pi * 300.0 * np.linspace(0.0, 1.0, n) ** 2
@@ -109,7 +109,7 @@ def test_steady_amplitudes_against_complex_stiffness():
         np.testing.assert_allclose(row, np.abs(expected), rtol=1e-9)
 
 
-def test_tracked_orders_are_those_of_the_steady_machine():
+def test_tracked_orders_agree_with_the_steady_machine():
     """The readings have the steady amplitudes of another stiffness and damping, at speeds up to 60 rad/s."""
     t = np.linspace(0.0, 60.0, 12001)
     steady = t**3 * 0.05 / np.abs(4e4 - 50.0 * t**2 + 200j * t)

@@ -142,7 +142,7 @@ def test_minimum_is_that_of_scipy(known):
 
 
 @pytest.mark.parametrize("known", KNOWN)
-def test_gradient_and_information_are_those_of_the_residuals(known):
+def test_gradient_and_information_follow_from_the_residuals(known):
     problem, y = problem_with(**known), np.concatenate([TRUTH + 0.03, LINEAR * 1.05])
     step, p = 1e-6, 2
     rows = np.stack(
@@ -234,7 +234,7 @@ def test_filters_are_computed_until_the_noise_is_steady(monkeypatch):
     assert passes == [False, False, True, True]
 
 
-def test_best_of_several_minima_is_kept(monkeypatch):
+def test_best_of_several_minima_is_returned(monkeypatch):
     costs = {0.0: 3.0, 1.0: 1.0, 2.0: 2.0}
 
     def minimize(problem, x):

@@ -124,7 +124,7 @@ def test_intervals_of_numbers_with_a_cubic_cost(monkeypatch, skew, names):
 
 
 @pytest.mark.parametrize(("rises", "is_quadratic"), [((4.3, 3.7), True), ((4.5, 4.0), False), ((4.0, 3.5), False)])
-def test_one_side_that_is_not_quadratic_suffices(monkeypatch, rises, is_quadratic):
+def test_a_cost_not_quadratic_on_one_side_has_a_profile(monkeypatch, rises, is_quadratic):
     """A cost that rises by 10 % more or less than 4 at two standard errors."""
     information = np.diag([0.0, 4.0])
     monkeypatch.setattr(likelihood, "in_polar_unbalances", lambda _: (information, np.diag([4.0, 0.0]), np.zeros(0)))

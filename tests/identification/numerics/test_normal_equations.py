@@ -225,7 +225,7 @@ def test_normal_equations_against_differences():
     close(found[np.ix_(others, others)], z[:, others], 1e-7)
 
 
-def test_errors_of_another_runs_angle_change_nothing():
+def test_errors_of_the_angle_of_another_run_have_no_effect():
     unknowns, samples = problem()
     alone = dataclasses.replace(samples, errors=(0, 0))
     found = np.asarray(normal_equations(unknowns, alone, scene(), jnp.asarray(X), jnp.asarray(LINEAR)))

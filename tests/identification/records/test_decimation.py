@@ -56,7 +56,7 @@ def test_readings_near_a_gap_are_missing():
     np.testing.assert_allclose(found[~missing], SIGNAL[KEPT][~missing], atol=2e-5)
 
 
-def test_long_run_is_filtered_and_the_note_says_so():
+def test_long_run_is_filtered_with_a_note():
     found = decimated(run_of(SIGNAL), HIGHEST)
     assert found.notes == (
         "run: the readings were filtered to the band of the machine, and their rate was lowered from 1000 to 50 Hz",

@@ -109,7 +109,7 @@ def test_narrow_pulses_and_falling_edges_are_found():
         (np.delete(np.arange(60.0), np.arange(5, 55, 4)), "misses 13 and doubles 0 of 47 pulses; check the trigger level"),
     ],
 )
-def test_unusable_pulses_are_refused_in_one_sentence(times, says):
+def test_unusable_pulses_raise_clear_errors(times, says):
     with pytest.raises(jv.InputError) as error:
         tacho(times)
     assert says in str(error.value) and "channel 'tacho'" in str(error.value)

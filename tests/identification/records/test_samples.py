@@ -50,7 +50,7 @@ def test_readings_are_converted_to_si(unit, factor):
         (T.reshape(2, -1), SIGNAL, r"has an array of shape (2, 2000); one list of numbers is needed"),
     ],
 )
-def test_unusable_samples_are_refused_in_one_sentence(times, values, says):
+def test_unusable_samples_raise_clear_errors(times, values, says):
     with pytest.raises(jv.InputError) as error:
         run(values, times)
     assert says in str(error.value) and "channel 'frame'" in str(error.value)
@@ -114,7 +114,7 @@ def test_readings_at_the_stated_range_are_clipped():
     assert jv.Channel("x", "acceleration", unit="g", range=50).range == pytest.approx(490.3325)
 
 
-def test_slower_channel_has_its_own_rate():
+def test_slower_channel_has_a_lower_rate():
     slow = np.where(np.arange(T.size) % 4 == 0, SIGNAL, np.nan)
     found = run(slow)
     assert found.notes == ("run: channel 'frame' has a reading at one of 4 times only: its rate is 250 Hz",)
@@ -122,7 +122,7 @@ def test_slower_channel_has_its_own_rate():
     np.testing.assert_array_equal(found.values["frame"], SIGNAL[::4])
 
 
-def test_channels_have_their_own_times():
+def test_channels_may_have_different_times():
     channels = [jv.Channel("a", "acceleration", at=1), jv.Channel("b", "force")]
     found = jv.MeasuredRun.from_arrays(channels, {"a": T, "b": T[::2] + 0.01}, {"a": SIGNAL, "b": SIGNAL[::2]})
     assert (found.rate("a"), found.rate("b")) == (pytest.approx(1000.0), pytest.approx(500.0))
@@ -136,7 +136,7 @@ def test_uneven_times_are_interpolated_with_a_note():
     np.testing.assert_allclose(found.values["frame"], np.sin(40.0 * found.times["frame"]), atol=3e-4)
 
 
-def test_times_rounded_by_the_file_are_made_even():
+def test_times_rounded_by_the_file_become_even():
     true = np.arange(4000) / 1024.0
     found = run(SIGNAL, np.round(true, 4))
     assert found.notes == ()
@@ -165,7 +165,7 @@ def test_times_rounded_by_the_file_are_made_even():
         ({"kind": "acceleration", "range": "-5 g"}, "channel 'a': range is -49"),
     ],
 )
-def test_wrong_channels_are_refused_in_one_sentence(arguments, says):
+def test_wrong_channels_raise_clear_errors(arguments, says):
     with pytest.raises(jv.InputError) as error:
         jv.Channel("a", **arguments)
     assert says in str(error.value)

@@ -99,7 +99,7 @@ def test_digits_of_times(time, found):
     assert _resolution(np.array(time)) == pytest.approx(found)
 
 
-def test_slow_channel_begins_at_its_own_first_reading():
+def test_slow_channel_begins_at_its_first_reading():
     value = np.where(np.arange(N) % 4 == 3, WAVE, np.nan)
     time, found, notes = even_samples(T, value, "a:")
     np.testing.assert_allclose(time, T[3::4], atol=1e-12)
