@@ -74,7 +74,7 @@ def run_with(values, times=None, channels=None, clipped=None, change=None, notes
     return jv.MeasuredRun(channels, times, values, none | (clipped or {}), parsed, notes, source)
 
 
-def test_samples_of_channels_with_different_times_are_on_one_grid():
+def test_channels_with_different_times_are_on_one_grid():
     """The second channel begins three steps and ends five steps earlier; it has a gap, and one reading is missing."""
     rng = np.random.default_rng(0)
     early = np.delete(0.01 * np.arange(-3, 395) + 1e-5, [100, 101])

@@ -68,7 +68,7 @@ def test_agreeing_channels_have_no_notes():
     ("stated", "real", "factor"),
     [(None, "rpm", 30.0 / np.pi), ("rpm", "rad/s", 1.0), ("rpm", "Hz", 0.5 / np.pi), ("Hz", "rpm", 30.0 / np.pi)],
 )
-def test_error_of_a_wrong_unit_of_a_speed_names_the_fitting_unit(stated, real, factor):
+def test_error_of_a_wrong_unit_of_a_speed_names_a_fitting_unit(stated, real, factor):
     with pytest.raises(jv.InputError) as error:
         run(TACHO, (speed(stated), SPEED * factor))
     assert "channel 'n' is " in str(error.value) and f"the unit '{real}' would fit" in str(error.value)
@@ -124,7 +124,7 @@ def test_reversed_sign_is_named(one, other):
         ((0, 1), ("m", None), (1.0, 2.0), "correct the unit, the place or the gain of one of them"),
     ],
 )
-def test_error_of_a_wrong_unit_of_a_motion_names_the_fitting_unit(kinds, stated, factor, fits):
+def test_error_of_a_wrong_unit_of_a_motion_names_a_fitting_unit(kinds, stated, factor, fits):
     readings = [
         (sensor(KINDS[k], unit=unit, name=name), FIRST[k] * scale)
         for k, unit, scale, name in zip(kinds, stated, factor, ("one", "other"), strict=True)
