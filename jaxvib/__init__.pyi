@@ -66,6 +66,7 @@ from jaxvib.steady.points import Deck, Ellipse, ellipse_of
 
 # Jams of light loads
 from jaxvib.steady.branches import Branches, branches
+from jaxvib.steady.jams.drag_limits import DragLimits, DragStatus, drag_limits
 from jaxvib.steady.jams.jam import Jam, JamModes, JamStatus, jam_modes
 from jaxvib.steady.jams.phases import PhasePattern
 from jaxvib.steady.jams.phase_search import PhaseJams, phase_jams
@@ -268,6 +269,9 @@ __all__ = [
     "JamModes",
     "Jam",
     "JamStatus",
+    "drag_limits",
+    "DragLimits",
+    "DragStatus",
     "branches",
     "Branches",
     "phase_jams",

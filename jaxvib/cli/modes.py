@@ -79,6 +79,8 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
     import jax  # slow imports, which --help does not need
     import numpy as np
 
+    from jaxvib.machine.effects.base import has_term
+    from jaxvib.machine.effects.terms import ContactFriction
     from jaxvib.steady.jams.jam import STABILITY_CRITERION
     from jaxvib.steady.jams.phases import growth_of_free_loads
 
@@ -91,6 +93,8 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
     remaining = [jam for jam in jams if bool(jam.stable) and not growth[int(jam.mode)] > 0.0]
     measures = {int(jam.mode): measures_of(scene, jam) for jam in remaining}
     folds = [k for k, exists in enumerate(np.asarray(modes_found.folds.exists)) if exists]
+    has_friction = has_term(scene.all_effects, ContactFriction)
+    limits = None if has_friction else jax.device_get(jv.drag_limits(scene))
     ranges = ranges_within(scene, [int(jam.mode) for jam in remaining], tolerances)
     document = {
         "rotor_speed": scene.drive.speed,
@@ -100,6 +104,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
         "unresolved": modes_found.unresolved,
         "measures": [{"mode": mode, **entry.document()} for mode, entry in measures.items()],
         "folds": [{"omega": modes_found.folds.omega[k], "rotor_speed": modes_found.folds.rotor_speed[k]} for k in folds],
+        "drag_limits": _drag_document(limits),
         **({"tolerances": [entry._asdict() for entry in ranges]} if tolerances else {}),
     }
 
@@ -127,9 +132,33 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
                 [f"{scale * modes_found.folds.omega[k]:.5g}", f"{scale * modes_found.folds.rotor_speed[k]:.5g}"] for k in folds
             ]
             lines.append(table("folds: two jams merge", [f"loads, {unit}", f"rotor, {unit}"], pairs))
-        return "\n".join([*lines, *_left_out(scene)])
+        return "\n".join([*lines, *_drag_lines(scene, limits), *_left_out(scene)])
 
     output.done(document, text, "modes", modes_found)
+
+
+def _drag_document(limits: jv.DragLimits | None) -> list[dict[str, Any]]:
+    """Return the greatest drag of each resonance that has one; an empty list for loads with dry friction (None)."""
+    import numpy as np  # slow import, which --help does not need
+
+    if limits is None:
+        return []
+    names = ("resonances", "drag", "factor", "omega")
+    return [{name: getattr(limits, name)[k] for name in names} for k in np.flatnonzero(np.isfinite(limits.factor))]
+
+
+def _drag_lines(scene: jv.Scene, limits: jv.DragLimits | None) -> list[str]:
+    """Return a table of the greatest drags, or no line without one."""
+    from jaxvib.display import speed_unit  # slow imports, which --help does not need
+
+    unit, scale = speed_unit()
+    rows = [
+        [f"{scale * row['resonances']:.5g}", f"{row['drag']:.5g}", f"{row['factor']:.4g}", f"{scale * row['omega']:.5g}"]
+        for row in _drag_document(limits)
+    ]
+    of_load = "drag, N s/m" if scene.loads.drag.ndim == 0 else "drag of load 1, N s/m"
+    head = [f"resonance, {unit}", of_load, "times the scene's", f"loads, {unit}"]
+    return [table("greatest drag: with a larger one no jam exists at the resonance", head, rows)] if rows else []
 
 
 def _mode_document(jam: jv.Jam, growth: float) -> dict[str, Any]:
@@ -149,10 +178,12 @@ def _left_out(scene: jv.Scene) -> list[str]:
 
 def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     """Print the jams of light loads at any phases."""
+    import jax  # slow imports, which --help does not need
+
     from jaxvib.results.status import sentence
     from jaxvib.steady.jams.phases import degrees
 
-    result = jv.phase_jams(scene)
+    result, limits = jv.phase_jams(scene), jax.device_get(jv.drag_limits(scene, phases=True))
     output.picture("phases.png", lambda: result.plot())
     jams = [result.select(k) for k in range(result.omega.shape[0])]
     measures = [measures_of(scene, jam) if jam.stable else None for jam in jams]
@@ -168,6 +199,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
             }
             for jam, measures_of_jam in zip(jams, measures, strict=True)
         ],
+        "drag_limits": _drag_document(limits),
     }
 
     def text() -> str:
@@ -188,7 +220,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
         head = [unit, "", "pattern of the loads", "phases, degrees", "foundation force, N"]
         title = f"light-load jams with unequal phases; rotor {rotor}"
         if not rows:
-            return f"no jam at {rotor}"
+            return "\n".join([f"no jam at {rotor}", *_drag_lines(scene, limits)])
         stable_text = ", ".join(f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam in jams if jam.stable)
         conclusion = (
             f"loads can stay jammed at {stable_text}"
@@ -200,7 +232,8 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
             for jam, measures_of_jam in zip(jams, measures, strict=True)
             if measures_of_jam is not None
         ]
-        return "\n".join([conclusion, table(title, head, rows), *measure_texts, *_left_out(scene)])
+        drags = _drag_lines(scene, limits)
+        return "\n".join([conclusion, table(title, head, rows), *measure_texts, *drags, *_left_out(scene)])
 
     output.done(document, text, "modes", result)
 

@@ -380,3 +380,25 @@ def drag_diagram(
     axis.set(ylim=(0.0, 1.05 * scale * rotor_speed), xlabel=label, ylabel="speed of loads, " + unit)
     legend_above(axis, 3)
     return figure if ax is None else ax
+
+
+def drag_limits_chart(
+    omega: np.ndarray, drag: np.ndarray, resonances: np.ndarray, *, unit: SpeedUnit | None = None, ax: Axes | None = None
+) -> Drawn:
+    """Draw the greatest drag (n,), N s/m, of each resonance over the load speed `omega` (n,), rad/s, on a logarithmic axis.
+
+    NaN entries are left out; `resonances`, rad/s, are dotted lines.
+
+    >>> chart = drag_limits_chart(np.array([9.0]), np.array([0.5]), np.array([9.1]))
+    >>> [axis.get_ylabel() for axis in chart.axes]
+    ['greatest drag, N s/m']
+    """
+    figure, axes = panels(1, size=(6.4, 3.0), ax=ax)
+    unit, scale = speed_unit(unit)
+    axis, there = axes[0], np.isfinite(drag)
+    for k, w in enumerate(resonances):
+        axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "natural frequency")
+    axis.plot(scale * omega[there], drag[there], "o", color=COLORS[0], label="no jam above")
+    axis.set(xlabel=f"speed of the loads, {unit}", ylabel="greatest drag, N s/m", yscale="log" if there.any() else "linear")
+    legend_above(axis)
+    return figure if ax is None else ax

@@ -47,6 +47,16 @@ class Folds(eqx.Module):
     exists: Array = eqx.field(metadata=in_unit("", "fold"))
 
 
+class DraggedModel(JammedModel):
+    """Model of a scene with jammed loads at the rotor's working speed, whose branch is the factor of the drag over the load
+    speed: the loads jam at a load speed if their drag is multiplied by this factor."""
+
+    @property
+    def highest_speed(self) -> Array:
+        """Rotor speed, up to a small distance: the factor has no bound there."""
+        return self.scene.drive.speed * (1.0 - float(jnp.finfo(self.mass.dtype).eps) ** 0.5)
+
+
 def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
     """Return the rotor speed n (rad/s) of a jam of light, coincident loads with load speed `omega` (scalar, rad/s).
 
@@ -78,7 +88,8 @@ def rotor_speed_at(model: ExcitedModel, omega: Array, speed: Array | None = None
     """Return `jam_rotor_speed` for an assembled scene.
 
     For a model with unbalances instead of loads (`UnbalancedModel`) the value returned is not a speed but the torque of the
-    vibration divided by that of the motors. At its folds, too, two motions merge.
+    vibration divided by that of the motors; for a `DraggedModel` it is the factor of the drag. At their folds, too, two motions
+    merge.
     """
     return _balance(model, omega, speed)[0]
 
@@ -115,6 +126,8 @@ def _speed_for(model: ExcitedModel, omega: Array, acceleration: Array) -> Array:
     if isinstance(model, UnbalancedModel):
         return torque / model.motor_torque(omega)
     assert isinstance(model, JammedModel)
+    if isinstance(model, DraggedModel):
+        return torque / (model.drag * (model.scene.drive.speed - omega))
     free = omega + torque / model.drag
     effects = model.scene.all_effects
     if not has_term(effects, ContactFriction):

@@ -138,13 +138,10 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
     the interval is narrowed down. Points whose multiple is near 1 are starts too, and so are the mirror images of all starts:
     of two patterns that are nearly mirror images of each other, Newton's method often misses the one with steeper slopes.
     """
-    speeds, phases = load_speeds(balance), np.concatenate([phases, _regular_phases(balance)])
-    at_speeds = _data_at_speeds(balance, speeds)
-    row = np.repeat(np.arange(speeds.size), len(phases))
-    factor, angles, good = _solve_phases(balance, at_speeds, row, np.tile(phases, (speeds.size, 1)))
-    if not good.any():
+    speeds, at_speeds, row, factor, angles = solved_phases(balance, phases)
+    if not row.size:
         return speeds[:1], phases[:1]
-    row, size, angles = row[good], np.log(factor[good]), angles[good]
+    size = np.log(factor)
     # The angles are in the interval from -1 to 2 pi - 1 rad, because many phases are at 0 and pi, far from its ends.
     inside = angles[:, 1:] - 2.0 * np.pi * np.floor((angles[:, 1:] + 1.0) / (2.0 * np.pi))
     once = distinct_rows(np.concatenate([row[:, None], np.rint(1e4 * size[:, None]), np.rint(1e3 * inside)], axis=1))[0]
@@ -170,6 +167,19 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
         low, high, at = ends[lane, cut], ends[lane, cut + 1], turned[lane, cut]
     every = np.concatenate([angles[near], at])
     return np.tile(np.concatenate([speeds[row[near]], low]), 2), np.concatenate([every, -every])
+
+
+def solved_phases(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, AtSpeed, np.ndarray, np.ndarray, np.ndarray]:
+    """Solve for the phases of jams at all load speeds, from `phases` (sets, count) and regular sets.
+
+    **Returns** the load speeds, their data, and for each solution the index of its speed, the multiple of the drag, and the
+    phases.
+    """
+    speeds, phases = load_speeds(balance), np.concatenate([phases, _regular_phases(balance)])
+    at_speeds = _data_at_speeds(balance, speeds)
+    row = np.repeat(np.arange(speeds.size), len(phases))
+    factor, angles, good = _solve_phases(balance, at_speeds, row, np.tile(phases, (speeds.size, 1)))
+    return speeds, at_speeds, row[good], factor[good], angles[good]
 
 
 def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
