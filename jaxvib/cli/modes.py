@@ -150,13 +150,15 @@ def _drag_document(limits: jv.DragLimits | None) -> list[dict[str, Any]]:
 def _drag_lines(scene: jv.Scene, limits: jv.DragLimits | None) -> list[str]:
     """Return a table of the greatest drags, or no line without one."""
     from jaxvib.display import speed_unit  # slow imports, which --help does not need
+    from jaxvib.machine.loads import CircularLoads
 
     unit, scale = speed_unit()
     rows = [
         [f"{scale * row['resonances']:.5g}", f"{row['drag']:.5g}", f"{row['factor']:.4g}", f"{scale * row['omega']:.5g}"]
         for row in _drag_document(limits)
     ]
-    of_load = "drag, N s/m" if scene.loads.drag.ndim == 0 else "drag of load 1, N s/m"
+    equal = isinstance(scene.loads, CircularLoads) and scene.loads.drag.ndim == 0
+    of_load = "drag, N s/m" if equal else "drag of load 1, N s/m"
     head = [f"resonance, {unit}", of_load, "times the scene's", f"loads, {unit}"]
     return [table("greatest drag: with a larger one no jam exists at the resonance", head, rows)] if rows else []
 

@@ -32,7 +32,9 @@ def test_modes_json_has_the_promised_keys(typed):
     code, out, err = typed("modes", "machine.toml", "--json")
     document = json.loads(out)
     assert code == 0 and err == ""
-    assert set(document) == {"rotor_speed", "resonances", "judged", "modes", "unresolved", "measures", "folds"}
+    tables = {"modes", "measures", "folds", "drag_limits"}
+    assert set(document) == {"rotor_speed", "resonances", "judged", "unresolved", *tables}
+    assert set(document["drag_limits"][0]) == {"resonances", "drag", "factor", "omega"}
     keys = {"mode", "omega", "stable", "growth_of_free_loads", "status", "amplitude", "foundation_force"}
     assert set(document["modes"][0]) == keys and document["judged"] == "by slope, for light loads that stay together"
     assert set(document["folds"][0]) == {"omega", "rotor_speed"}
@@ -66,7 +68,7 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     jv.save_scene(rotor, tmp_path / "rotor.toml")
     code, out, err = typed("modes", "rotor.toml", "--out", "o", "--json")
     document = json.loads(out)
-    assert code == 0 and err == "" and set(document) == {"rotor_speed", "judged", "phase_jams"}
+    assert code == 0 and err == "" and set(document) == {"rotor_speed", "judged", "phase_jams", "drag_limits"}
     np.testing.assert_allclose([jam["omega"] for jam in document["phase_jams"]], [412.8, 199.4, 164.6], atol=0.05)
     assert [jam["pattern"] for jam in document["phase_jams"] if jam["stable"]] == ["together"]
     assert (tmp_path / "o" / "phases.png").stat().st_size > 10_000

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.linear import estimated_frequencies, jammed_model, require_drag, turning_loads
 from jaxvib.equations.torque_balance import TorqueBalance, assemble_for_search
+from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit
@@ -133,7 +136,7 @@ def _limits_together(scene: Scene) -> DragLimits:
 
 
 def _limits(scene: Scene, factor: Array, omega: Array, resonances: Array) -> DragLimits:
-    drag = factor * jnp.ravel(scene.loads.drag)[0]
+    drag = factor * jnp.ravel(cast(CircularLoads, scene.loads).drag)[0]
     return DragLimits(status=DragStatus.done, factor=factor, drag=drag, omega=omega, resonances=resonances)
 
 
