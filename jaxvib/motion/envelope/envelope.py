@@ -220,7 +220,7 @@ def envelope(
     run = outcome(
         run, given_scene, end, throw=throw, failures=(*_HINTS, "not_finite", "no_start"), hint=partial(_hint, max_steps)
     )
-    judged = when_known(lambda *_: _with_separation_status(run), run.steps, run.status)
+    judged = when_known(lambda *_: _with_separation_status(run), run.steps, run.status, run.drift)
     return run if judged is None else judged
 
 

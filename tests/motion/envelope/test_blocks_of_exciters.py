@@ -1,6 +1,7 @@
 """Steps of averaged runs that take the blocks of the exciters one by one, against dense matrices, and their cost."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,6 +90,19 @@ def test_steps_by_blocks_are_those_of_dense_matrices(name):
     np.testing.assert_allclose(
         found.window.displacement, dense.window.displacement, atol=1e-11 * float(jnp.max(dense.amplitude))
     )
+
+
+def test_reverse_derivatives_outside_jit_equal_differences():
+    scene = jv.Scene(BODY, exciters=motors(2))
+
+    def speed(torque):
+        changed = eqx.tree_at(lambda s: s.exciters[1].drive.stall_torque, scene, torque)
+        run = jv.envelope(changed, 0.5, save="window", stepsize_controller=jv.Tolerance(1e-8), throw=False)
+        return run.load_speed[1]
+
+    torque, step = jnp.asarray(61.0), 0.01
+    difference = (speed(torque + step) - speed(torque - step)) / (2.0 * step)
+    np.testing.assert_allclose(jax.grad(speed)(torque), difference, rtol=1e-5)
 
 
 def test_cost_of_a_step_is_linear_in_the_exciters():
