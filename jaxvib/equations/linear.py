@@ -24,6 +24,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import (
     MAX_EIGENVALUE_ERROR,
+    complex_product,
     hermitian_error,
     hermitian_modes,
     magnitude,
@@ -182,7 +183,7 @@ class ExcitedModel(LinearModel):
         def product(y: Array) -> Array:
             """Return D(w) y from the matrices, so that derivatives follow from the matrices and not from eigenvectors."""
             carrier = self.carrier
-            elastic, inertia, viscous = (_real_times(a, y) for a in (carrier.stiffness, self.mass, carrier.damping))
+            elastic, inertia, viscous = (complex_product(a, y) for a in (carrier.stiffness, self.mass, carrier.damping))
             return elastic - omega**2 * inertia + 1j * omega * viscous
 
         def solve(product: Callable[[Array], Array], right: Array) -> Array:
@@ -197,7 +198,7 @@ class ExcitedModel(LinearModel):
         """
         if self.modal is None:
             return omega**2 * jnp.sum(jnp.conj(self.force_direction) * self.displacement(omega))
-        return self.modal.receptance(omega, self.unbalance * omega**4)
+        return self.unbalance * omega**4 * self.modal.receptance(omega)
 
 
 class JammedModel(ExcitedModel):
@@ -224,11 +225,6 @@ class JammedModel(ExcitedModel):
             problem = "jam modes are defined for platforms; use phase_jams, or jam_orbit near a load speed"
             raise InputError("machine.kind", f"is {quoted(self.scene.machine.kind)}; {problem}")
         return super().displacement(omega, speed)
-
-
-def _real_times(matrix: Array, vector: Array) -> Array:
-    """Return the product of a real matrix and a complex vector, at half the cost of a complex matrix."""
-    return jax.lax.complex(matrix @ vector.real, matrix @ vector.imag)
 
 
 def jammed_model(scene: Scene) -> JammedModel:

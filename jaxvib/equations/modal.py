@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.numerics.linalg import eigenvectors_in_turn, solve_in_turn
+from jaxvib.numerics.linalg import complex_product, eigenvectors_in_turn, solve_in_turn
 
 
 class ModalResponse(eqx.Module):
@@ -35,27 +35,47 @@ class ModalResponse(eqx.Module):
     norms: Array
     is_rough: Array
 
-    def receptance(self, omega: Array, factor: Array) -> Array:
-        """Return `factor` (scalar) times the receptance e^H B D^-1 B^T e, m/N, the displacement of the mount per force that
-        turns with it; or times the receptances e_i^H B_i D^-1 B_k^T e_k (count, count) between masses.
+    def receptance(self, omega: Array) -> Array:
+        """Return the receptance e^H B D^-1 B^T e, m/N, at the frequency `omega` (scalar, rad/s): the displacement of the mount
+        per force that turns with it; or the receptances e_i^H B_i D^-1 B_k^T e_k (count, count) between masses.
 
-        The factor is inside the sum because the derivative with respect to `omega` (scalar, rad/s) is then one sum, which is
-        13 times as fast. The sum uses real numbers because the imaginary part of an undamped carrier is then exactly 0.
+        The sum is a loop over the poles. In a batch each of its steps is then computed for many frequencies by vector
+        instructions, which for 200 platforms takes a fifth of the time of sums over arrays. The sum uses real numbers because
+        the imaginary part of an undamped carrier is then exactly 0.
         """
-        poles = jnp.broadcast_to(self.poles, self.residues.shape)
-        decay, detuning = -poles.real, omega - poles.imag
-        weight = factor / (decay**2 + detuning**2)
-        real, imag = self.residues.real, self.residues.imag
-        parts = (real * decay + imag * detuning) * weight, (imag * decay - real * detuning) * weight
-        return jax.lax.complex(*(jnp.sum(part, axis=-1) for part in parts))
+        residues = jnp.moveaxis(self.residues, -1, 0)
+
+        def add(total: tuple[Array, Array], term: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:
+            decay, centre, real, imag = term
+            detuning = omega - centre
+            weight = _reciprocal(decay**2 + detuning**2)
+            parts = (real * decay + imag * detuning) * weight, (imag * decay - real * detuning) * weight
+            return (total[0] + parts[0], total[1] + parts[1]), None
+
+        zero = jnp.zeros(residues.shape[1:], residues.real.dtype)
+        terms = -self.poles.real, self.poles.imag, residues.real, residues.imag
+        return jax.lax.complex(*jax.lax.scan(add, (zero, zero), terms)[0])
 
     def solve(self, omega: Array, force: Array) -> Array:
         """Return D^-1 f (nd,), m, for amplitudes `force` f (nd,), N."""
-        return self.outputs @ ((self.inputs @ force) / jax.lax.complex(-self.poles.real, omega - self.poles.imag))
+        amplitudes = complex_product(self.inputs, force) / jax.lax.complex(-self.poles.real, omega - self.poles.imag)
+        return complex_product(self.outputs, amplitudes)
 
     def norm(self, omega: Array) -> Array:
         """Return an upper bound of the row sums of |D(w)|, N/m."""
         return self.norms @ jnp.stack([jnp.ones_like(omega), omega, omega**2])
+
+
+@jax.custom_jvp
+def _reciprocal(x: Array) -> Array:
+    """Return 1/x. Its derivative is computed without another division, which takes half of the time of a sum over poles."""
+    return 1.0 / x
+
+
+@_reciprocal.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    value = _reciprocal(*primals)
+    return value, -(value**2) * tangents[0]
 
 
 def modal_response(
@@ -89,7 +109,7 @@ def modal_response(
     poles, vectors = eigenvectors_in_turn(blocks.reshape(2 * n, 2 * n))
     unit = np.eye(2 * n, dtype=coupling.dtype)[:, 1::2]
     inverse = solve_in_turn(vectors, unit.astype(vectors.dtype))
-    outputs, inputs = (shapes / stiff[None, :]) @ vectors[0::2], inverse @ shapes.T
+    outputs, inputs = complex_product(shapes / stiff[None, :], vectors[0::2]), complex_product(shapes, inverse.T).T
     condition = jnp.linalg.norm(vectors) * jnp.linalg.norm(inverse)
     left, right = direction.conj() @ outputs, direction @ inputs.T
     return ModalResponse(

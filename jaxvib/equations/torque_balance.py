@@ -397,7 +397,7 @@ def _motor_torque(averaged: Averaged) -> Array:
 def influence_of(balance: TorqueBalance, omega: Array) -> Array:
     """Return the influence coefficients H_jk (count, count), complex, m/N: response at mass j per force of mass k."""
     if balance.model.modal is not None:
-        return balance.model.modal.receptance(omega, jnp.ones_like(omega))
+        return balance.model.modal.receptance(omega)
     return balance.direction.conj() @ response_of(balance, omega)
 
 

@@ -302,6 +302,19 @@ def _svd_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tuple[tuple
     return jax.lax.map(svd_in_turn, matrix), (True, True, True)
 
 
+def complex_product(matrix: Array, other: Array) -> Array:
+    """Return matrix @ other for a real or complex matrix and a complex vector or matrix, from products of real matrices, which
+    take less than half of the time.
+
+    >>> complex_product(jnp.asarray([[1.0, 1.0j]]), jnp.asarray([2.0, 1.0j]))
+    Array([1.+0.j], dtype=complex128)
+    """
+    if not jnp.iscomplexobj(matrix):
+        return jax.lax.complex(matrix @ other.real, matrix @ other.imag)
+    a, b, c, d = matrix.real, matrix.imag, other.real, other.imag
+    return jax.lax.complex(a @ c - b @ d, a @ d + b @ c)
+
+
 def refine_solution(product: Callable[[Array], Array], inverse: Callable[[Array], Array], b: Array, norm: Array) -> Array:
     """Return x of A x = b, with A x = `product(x)`, an approximate solution `inverse(b)` and the row-sum `norm` of A.
 

@@ -266,7 +266,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     def fast_functional(w: Array) -> Array:
         if modal is None:
             return functional(frozen, w)
-        receptance = modal.receptance(w, jnp.ones_like(w))
+        receptance = modal.receptance(w)
         return (receptance / (1.0 + smoothing * receptance)).real
 
     width = jnp.einsum("ar,ab,br->r", forms.conj(), jax.lax.stop_gradient(carrier.damping), forms).real / 2.0 + tiny_damping
