@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.machine.validation import start_notes
 
 PAGE = (pathlib.Path(__file__).parents[2] / "docs" / "data_sheets.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r"```toml\n# (\w+)\.toml\n(.*?)```", PAGE, flags=re.S))
@@ -38,6 +39,14 @@ def test_the_deck_has_the_stroke_of_the_data_sheet(name, stroke, angle, scenes):
     path = regime.ellipse((0.0, 0.1))
     assert 2e3 * float(path.semi_major) == pytest.approx(stroke, rel=0.12)
     assert np.degrees(float(path.direction)) == pytest.approx(angle, abs=4.0)
+
+
+@pytest.mark.parametrize("name", ["my_screen", "my_feeder"])
+def test_the_motors_lift_their_unbalances(name, scenes):
+    assert start_notes(scenes[name]) == []
+    weak = PAGE.replace("930 rpm", "970 rpm")
+    weak_screen = re.findall(r"```toml\n# my_screen\.toml\n(.*?)```", weak, flags=re.S)[0]
+    assert start_notes(jv.scene_from_toml(weak_screen))[0].endswith("needs 44.7 N m, its starting torque is 22.5 N m")
 
 
 def test_the_table_has_its_amplitude(scenes):

@@ -13,7 +13,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
-from jaxvib.machine.drives.drive import Motor, MotorWrapper
+from jaxvib.machine.drives.drive import Motor, MotorWrapper, SwitchedOff
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import lifting_torques, start_notes, validate_scene
@@ -158,7 +158,8 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     DC motor) longer than the vibration of the machine takes to decay, the motor may pass a resonance that catches it in the
     averaged equations: use `simulate` for such motors.
 
-    **Raises** `InputError` for a scene without a motor and as `envelope`. A run that fails has a status.
+    **Raises** `InputError` for a scene without a motor, for a motor that is switched off before the end, and as `envelope`. A
+    run that fails has a status.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -178,6 +179,7 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
             "has no motor; a run-up needs a drive of limited power, for example InductionMotor(...); for loads use run_up_map",
         )
     end = number(until, "s", "until", low=0.0, open_low=True)
+    _require_switched_on(scene, end)
     resonances = np.sort(np.asarray(natural_frequencies(scene)))
     run, *others = _runs(scene, end)
     speed, caught, status = _judgement(scene, run, resonances)
@@ -194,6 +196,15 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
         run=run,
         scene=scene,
     )
+
+
+def _require_switched_on(scene: Scene, end: Array) -> None:
+    """**Raises** `InputError` for a motor that is switched off before the end of the run: its speed shows no capture."""
+    for k, exciter in enumerate(scene.exciters):
+        if isinstance(off := exciter.drive, SwitchedOff) and float(off.at) < float(end):
+            problem = f"switches the motor off at {float(off.at):g} s, before the end of the run-up at {float(end):g} s"
+            advice = "give the motor itself for a run-up, or use simulate or envelope for a machine that stops"
+            raise InputError(f"{scene.prefix_of(k)}drive", f"{problem}; {advice}")
 
 
 def _runs(scene: Scene, end: Array) -> list[Envelope]:

@@ -137,3 +137,15 @@ def test_run_up_without_a_motor_is_refused():
     scene = jv.Scene(body(), exciters=[jv.Exciter(drive=jv.ConstantSpeed(jnp.asarray(60.0)), unbalance=S)])
     with pytest.raises(jv.InputError, match="has no motor"):
         jv.run_up(scene, 5.0)
+
+
+def test_a_motor_that_is_switched_off_is_refused():
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    motor = jv.DCMotor(100.0, stall_torque=5.0, inertia=0.05)
+
+    def scene(at):
+        return jv.Scene(machine, exciters=[jv.Exciter(drive=jv.SwitchedOff(motor, at=at), unbalance=0.02)])
+
+    with pytest.raises(jv.InputError, match=r"drive switches the motor off at 5 s, before the end of the run-up at 20 s"):
+        jv.run_up(scene("5 s"), "20 s")
+    assert jv.run_up(scene("30 s"), "20 s").status_name == "passed"
