@@ -16,6 +16,7 @@ from jax import Array
 from jaxvib.boundary import call_user
 from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted, within
+from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import Scene, read_unbalance, require_comparable
@@ -100,9 +101,19 @@ def _allowed_value(scene: Scene) -> Array | None:
     return None
 
 
+_MAX_MASS, _MAX_LEVERS = 1e5, 3.0
+"""Largest usual mass of a machine, kg, and largest usual distance of an exciter from the centre of mass, relative to that of
+the farthest support."""
+
 _MAX_SPEED, _MAX_RADIUS, _MAX_SAG, _MIN_MASS = 700.0, 5.0, 1.0, 10.0
 """Largest usual rotor speed, rad/s, largest usual radius of loads, m, largest usual sag of a machine under its own weight, m,
 and smallest mass, kg, of machines whose sag is examined. Machines with dimensionless parameters have masses of about 1."""
+
+
+def _largest_lever(machine: Machine) -> float:
+    """Return the largest distance of a support from the centre of mass, m; 0 for a machine without positions of supports."""
+    places = [np.linalg.norm(each.at) for each in getattr(machine, "supports", ())]
+    return float(max(places, default=0.0))
 
 
 def implausible_numbers(scene: Scene) -> list[str]:
@@ -127,7 +138,20 @@ def implausible_numbers(scene: Scene) -> list[str]:
         radius = 0.0 if loads is None else float(np.max(getattr(loads, "radius", 0.0)))
         if radius > _MAX_RADIUS:
             note(f"{place}loads.radius", f"{radius:g} m", "m", f"{radius:g} mm")
-    mass, stiffness = (float(np.sum(getattr(scene.machine, name, 0.0))) for name in ("mass", "stiffness"))
+        at, lever = exciter.position, _largest_lever(scene.machine)
+        if at is not None and lever and (far := float(np.linalg.norm(at))) > _MAX_LEVERS * lever:
+            value = f"{far:.4g} m from the centre of mass, the supports at most {lever:.4g} m"
+            note(f"{place}at", value, "m", f"{float(np.max(np.abs(at))):g} mm")
+    mass = float(np.sum(getattr(scene.machine, "mass", 0.0)))
+    if mass > _MAX_MASS:
+        note("machine.mass", f"{mass / 1e3:g} t", "kg", f"{mass / 1e3:g} kg")
+    supports = [each.stiffness for each in getattr(scene.machine, "supports", ())]
+    if supports and mass >= _MIN_MASS and 0.0 < np.sum(supports) * _MAX_SAG < 9.80665 * mass:
+        sag = f"{9.80665 * mass / float(np.sum(supports)):.3g} m"
+        note(
+            "machine.supports.stiffness", f"so small that the machine sags by {sag}", "N/m", f"{float(np.max(supports)):g} N/mm"
+        )
+    stiffness = float(np.sum(getattr(scene.machine, "stiffness", 0.0)))
     if mass >= _MIN_MASS and 0.0 < stiffness * _MAX_SAG < 9.80665 * mass:
         sag = f"{9.80665 * mass / stiffness:.3g} m"
         largest = float(np.max(scene.machine.stiffness))  # pyright: ignore[reportAttributeAccessIssue]
