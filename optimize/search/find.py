@@ -212,9 +212,9 @@ def _with_requested_modes(problem: Problem, point: Point) -> Point:
 def choose(problem: Problem, options: Options, report: Progress) -> SearchResult | None:
     """Find the best design with catalogue values, by branch and bound on the continuous search.
 
-    In each bounded problem the parameters vary continuously between two values of their catalogues. If the best design of this
-    problem is not better than the best choice up to now, all choices between these values are skipped. Since each search is
-    local, the global optimum is not guaranteed. An interrupt (KeyboardInterrupt) ends the search with its best choice.
+    In each bounded problem the parameters vary continuously between two values of their catalogues. The problem with the best
+    design is divided next; the first one whose best design has values of the catalogues ends the search. Since each search is
+    local, the global optimum is not guaranteed. An interrupt (KeyboardInterrupt) ends the search with the nearest choice.
 
     **Returns** None if no choice meets all demands.
     """
@@ -226,20 +226,17 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
         return _nearest_choice(problem, root)
     if root.violation[root.best] > 10.0 * FEASIBILITY_TOLERANCE:
         return root
-    best: tuple[float, SearchResult] | None = None
     order = itertools.count()
     queue = [(float(root.point.values[root.best, 0]), next(order), root, problem.space.numbers(_best_distinct(root)))]
-    nodes, interrupted = 0, False
+    nodes = 0
     try:
         while queue and nodes < _MAX_NODES:
-            bound, _, node, initial = heapq.heappop(queue)
-            if best is not None and bound >= best[0] - 1e-9 * abs(best[0]):
-                break
+            _, _, node, initial = heapq.heappop(queue)
             where = problem.space.within(*node.bounds).numbers(node.point.z[node.best])
             off = [_distance_to_catalogue(choice.values, where[choice.start]) for choice in choices]
             if max(off) < 1e-9:
-                best = (bound, node)
-                continue
+                # All other nodes have larger bounds.
+                return node._replace(drawn=root.drawn, existing=root.existing, interrupted=False, nodes=nodes)
             for low, high in _split_bounds(node, choices[int(np.argmax(off))], where):
                 nodes += 1
                 starts = np.concatenate([where[None], initial])[:_STARTS_PER_BOUND]
@@ -247,16 +244,11 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
                 if child is None or child.violation[child.best] > 10.0 * FEASIBILITY_TOLERANCE:
                     continue
                 value = float(child.point.values[child.best, 0])
-                if best is None or value < best[0]:
-                    report("choosing", 0.5 + 0.4 * nodes / (nodes + 20.0))
-                    heapq.heappush(queue, (value, next(order), child, initial))
+                report("choosing", 0.5 + 0.4 * nodes / (nodes + 20.0))
+                heapq.heappush(queue, (value, next(order), child, initial))
     except KeyboardInterrupt:
-        interrupted = True
-        if best is None:
-            return _nearest_choice(problem, root)._replace(nodes=nodes)
-    if best is None:
-        return None
-    return best[1]._replace(drawn=root.drawn, existing=root.existing, interrupted=interrupted, nodes=nodes)
+        return _nearest_choice(problem, root)._replace(nodes=nodes)
+    return None
 
 
 def _split_bounds(node: SearchResult, choice: Choice, where: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
