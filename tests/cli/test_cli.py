@@ -2,8 +2,10 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import equinox as eqx
 import numpy as np
@@ -12,6 +14,7 @@ from scenes import scene
 
 import jaxvib as jv
 from jaxvib.cli.modes import _left_out
+from jaxvib.cli.output import Output
 from jaxvib.machine.files import SCREENS, TEMPLATES
 from jaxvib.machine.validation import implausible_numbers
 
@@ -83,6 +86,20 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     assert code == 2 and "machine.kind is 'rotor'; jam modes are defined for platforms; use phase_jams" in err
     code, _, err = typed("whirl", "stations.toml", "--speed", "-5 rad/s")
     assert code == 2 and "--speed is -5 rad/s; it must be at least 0" in err
+
+
+def test_modes_of_a_rotor_that_has_no_jams_say_so(typed, tmp_path):
+    machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=0.0)
+    rotor = jv.Scene(machine, jv.pendulums(count=1, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed("60 rpm"))
+    jv.save_scene(rotor, tmp_path / "rotor.toml")
+    assert typed("modes", "rotor.toml")[:2] == (0, "no jam at 60 rpm\n")
+
+
+def test_the_line_of_waiting_counts_seconds_from_its_begin(monkeypatch, capsys):
+    clock, rounds = iter([100.0, 101.2, 102.4]), iter([False, False, True])
+    monkeypatch.setattr("jaxvib.cli.output.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    Output._show_elapsed_time(SimpleNamespace(_done=SimpleNamespace(wait=lambda seconds: next(rounds))))
+    assert re.findall(r"computing, (.*?) s ", capsys.readouterr().err) == ["1", "2"]
 
 
 def test_balance_lists_arrangements_and_their_stability(typed, tmp_path, monkeypatch):
@@ -260,7 +277,8 @@ def test_exact_balance_is_searched_from_below_all_resonances(typed, monkeypatch)
     monkeypatch.setattr("jaxvib.steady.balance.states.balanced_intervals", lambda scene, *ends: asked.append(ends) or [])
     document = json.loads(typed("criterion", "machine.toml", "--check", "--json")[1])
     ((begin, end),) = asked
-    assert begin < 0.1 * min(document["resonances"]) and max(document["resonances"]) < end == document["exact_up_to"]
+    least = min(document["resonances"])
+    assert 0.01 * least < begin < 0.1 * least and max(document["resonances"]) < end == document["exact_up_to"]
 
 
 WRONG = [
@@ -364,7 +382,7 @@ def test_failure_with_json_is_one_document(typed):
     error = json.loads(out)["error"]
     assert code == 1 and error["kind"] == "computation" and error["status"] == "max_steps_reached"
     code, out, _ = typed("modes", "machine.toml", "--speed", "0", "--json")
-    assert code == 2 and json.loads(out)["error"]["field"] == "--speed"
+    assert code == 2 and json.loads(out)["error"]["field"] == "--speed" and out.startswith('{\n  "error": {\n    "')
 
 
 def test_new_never_overwrites(typed):

@@ -8,12 +8,14 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from jaxvib.draw.charts import before_after, branch_diagram, regime_chart
+from jaxvib.draw.charts import before_after, branch_diagram, crossings, regime_chart
 from jaxvib.draw.comparison import audit_chart
 from jaxvib.draw.criterion import agreement_maps, criterion_chart
+from jaxvib.draw.machine.parts import ground
 from jaxvib.draw.motion.histories import amplitude_histories, time_histories
+from jaxvib.draw.motion.response import response_chart
 from jaxvib.draw.motion.spectra import path_chart
-from jaxvib.draw.results import growth_chart, phase_circles, shapes_chart
+from jaxvib.draw.results import growth_chart, phase_circles, shapes_chart, speeds_chart
 from jaxvib.draw.sweeps import label_map
 
 
@@ -141,6 +143,7 @@ def test_the_scale_of_the_criterion_has_no_kink():
     slopes = [(axis.transScale.transform((1.0, y + step)) - axis.transScale.transform((1.0, y)))[1] for y in (0.999, 1.001)]
     assert slopes[0] == pytest.approx(slopes[1], rel=0.01)  # at the median, where a symlog scale has a kink
     assert "operating speed" in [text.get_text() for text in axis.get_legend().get_texts()]
+    assert all(text.get_fontsize() < axis.xaxis.label.get_fontsize() for text in axis.texts) and len(axis.texts) == 2
     assert list(axis.lines[-1].get_xdata()) == pytest.approx([2.0 * 30.0 / np.pi] * 2)
 
 
@@ -193,3 +196,39 @@ def test_a_legend_ends_before_the_header_of_the_values():
 def test_points_on_a_circle_begin_with_the_first_number(first):
     texts = [text.get_text() for text in phase_circles([("", np.array([0.5, 2.0]))], first=first).axes[0].texts]
     assert {f"{first}", f"{first + 1}"} <= set(texts)
+
+
+def test_a_branch_crosses_a_speed_between_its_points():
+    rotor_speed = np.array([0.0, np.nan, 1.0, 2.0, 4.0, 2.0, 2.0])
+    stable, modes = np.arange(7) < 4, np.array([0, 0, 1, 1, 1, 2, 2])
+    found = crossings(rotor_speed, stable, modes, 2.5)
+    assert found == [(3, pytest.approx(0.25), "1", True), (4, pytest.approx(0.75), "1", False)]
+
+
+def test_the_ground_has_a_stroke_for_each_step():
+    outline = ground((1.0, 0.0), (3.0, 0.0), step=0.25)
+    strokes = np.split(outline, np.flatnonzero(np.isnan(outline[:, 0])))[1:]
+    np.testing.assert_allclose([stroke[1] for stroke in strokes], [(1.125 + 0.25 * k, 0.0) for k in range(8)])
+    np.testing.assert_allclose([stroke[2] - stroke[1] for stroke in strokes], 8 * [(-0.15, -0.15)])
+
+
+def test_a_response_ends_at_half_the_least_and_twice_the_most():
+    force = np.array([2.0, 30.0, 100.0])
+    curve = {"speed": np.arange(3.0), "amplitude": 1e-3 * np.array([[1e-7], [2.0], [1.0]]), "foundation_force": force}
+    points = {**{name: each[:0] for name, each in curve.items()}, "stable": np.zeros(0, bool)}
+    about = {"names": ["y"], "units": ["m"], "has_motor": False, "show": ["amplitude", "force"]}
+    axes = response_chart(curve, points, {}, np.zeros(0), **about).axes
+    assert axes[1].get_ylim() == pytest.approx((1.0, 200.0))
+    assert axes[0].get_ylim() == pytest.approx((4e-4, 4.0))  # mm, four decades
+
+
+def test_the_resultant_of_phases_is_weighted():
+    titles = [
+        phase_circles([("", np.array([0.0, np.pi]))], weights=w).axes[0].get_title() for w in (None, np.array([3.0, 1.0]))
+    ]
+    assert titles == ["\nresultant 0", "\nresultant 0.5"]
+
+
+def test_labels_of_speeds_that_would_overlap_are_left_out():
+    axis = speeds_chart([("a", np.array([20.0, 10.1, 10.0, 12.0])), ("b", np.array([10.2]))], unit="rad/s").axes[0]
+    assert [text.get_text() for text in axis.texts] == ["10", "12", "20", "10.2"]

@@ -13,7 +13,9 @@ from scenes import TWO_MASS
 
 import jaxvib as jv
 from jaxvib.cli.app import run
+from jaxvib.draw import whirl
 from jaxvib.explore import pictures, serve
+from jaxvib.explore.campbell import _SENSE_STYLES
 from jaxvib.explore.panel import TALL, WIDE, Panel
 from jaxvib.explore.pictures import SceneOrProblem, scene_or_problem
 from jaxvib.explore.sliders import COUNT, scene_at, sliders_of
@@ -214,6 +216,14 @@ def test_the_charts_lines_are_the_branches(kind):
     modes = jv.jam_modes(scene).mode_numbers()
     told = [int(number) for _, _, text, e in spans if e.get("font-weight") == "bold" for number in text.split(", ")]
     assert sorted(told) == sorted(2 * modes)
+    jams = jv.jam_modes(scene)
+    for right, height_of, log in ((False, lambda jam: RPM * jam.omega, False), (True, lambda jam: jam.foundation_force, True)):
+        up = _axes([span for span in spans if (span[0] > middle - 1.0) == right], log)[1]
+        for x, y, text, e in spans:
+            if (x > middle - 1.0) == right and e.get("font-weight") == "bold" and "," not in text:
+                height = float(height_of(jams.select(int(text))))
+                level = np.polyval(up, y - 0.35 * 11.5)
+                assert level == pytest.approx(np.log(height) if log else height, abs=2.0 * abs(up[0]))
 
 
 @pytest.mark.parametrize("kind", ["rotor", "planar_rotor"])
@@ -235,10 +245,28 @@ def test_the_campbell_diagram_is_the_rotors_whirl(kind):
     speeds = [(w, way) for w, way in zip(RPM * found.critical.speed, found.critical.forward, strict=True) if np.isfinite(w)]
     assert all(f"{w:.4g} {'forward' if way else 'backward'}" in said for w, way in speeds) and len(speeds) >= 2
     marks = [outline for outline, _ in _lines(drawn, "#004488", filled=True) + _lines(drawn, "#d55e00", filled=True)]
+    assert {len(outline) for outline, _ in _lines(drawn, "#d55e00", filled=True)} <= {4, 5}  # squares
+    assert min(len(outline) for outline, _ in _lines(drawn, "#004488", filled=True)) > 8
     middles = np.array([(np.min(outline, axis=0) + np.max(outline, axis=0)) / 2.0 for outline in marks])
     places = np.stack([np.polyval(across, middles[:, 0]), np.polyval(up, middles[:, 1])], axis=1)
     marked = np.array([[w, w] for w, _ in speeds if w <= RPM * 1.05 * most])
     np.testing.assert_allclose(places[np.argsort(places[:, 0])], np.sort(marked, axis=0), atol=0.6 * abs(up[0]))
+
+
+def test_both_charts_are_as_wide_as_the_page():
+    """A machine may become a rotor without the page moving."""
+    widths = set()
+    for kind in ("one_mass", "planar_rotor"):
+        scene = jv.scene_from_toml(TEMPLATES[kind])
+        drawn = ElementTree.fromstring(pictures.diagram(scene, 1.4 * float(scene.drive.speed)))
+        widths.add(float(drawn.get("width")))
+    assert len(widths) == 1
+
+
+def test_colours_of_whirls_are_those_of_figures():
+    assert {sense: look["color"] for sense, look in _SENSE_STYLES.items()} == {
+        sense: look[0] for sense, look in whirl._SENSES.items()
+    }
 
 
 def test_the_machine_moves_as_its_jam_says(two_platforms):
@@ -302,6 +330,19 @@ def test_the_next_numbers_of_loads_are_prepared_first(one_mass, monkeypatch):
     drawn.clear()
     pictures.prepare_counts(jv.scene_from_toml(TEMPLATES["rotor"]))
     assert drawn == []  # its loads have stations of their own
+
+
+def test_a_port_that_was_just_released_is_free():
+    """Its last connection waits for a while; the side that closed first keeps it."""
+    with socket.socket() as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        port = listener.getsockname()[1]
+        with socket.create_connection(("127.0.0.1", port)) as other:
+            listener.accept()[0].close()
+            assert other.recv(1) == b""
+    serve.require_free(port)
 
 
 def test_failures_of_the_page_print_one_sentence(one_mass, tmp_path, monkeypatch, capsys):

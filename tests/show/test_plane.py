@@ -97,10 +97,13 @@ def run():
 
 def test_ellipses_of_a_deck_lie_at_their_points(run):
     deck = run.deck([(-1.0, 0.1), (1.0, 0.1)])
-    lines = [line for line in jv.sketch(BALLS, deck=deck).axes[0].lines if len(line.get_xdata()) == 97]
+    figure = jv.sketch(BALLS, deck=deck)
+    lines = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 97]
     scale = view_of(BALLS).scale
     for line, point in zip(lines, np.asarray(deck.points), strict=True):
         np.testing.assert_allclose(np.mean(line.get_xydata()[:-1], axis=0), scale * point, atol=1e-9)
+    marks = [line.get_xydata()[0] for line in figure.axes[0].lines if line.get_marker() == "o" and len(line.get_xdata()) == 1]
+    np.testing.assert_array_equal(marks, [line.get_xydata()[0] for line in lines])  # where the points are at first
     assert "x as large" in deck.plot().axes[0].get_title(loc="left")
 
 

@@ -11,7 +11,9 @@ from PIL import Image
 
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
+from jaxvib.show import moving
 from jaxvib.show.animate import motion_of_orbit, motion_of_run
+from jaxvib.show.sketch import _INCHES_PER_UNIT
 from jaxvib.show.views import Tie, order_of_ties, view_of
 from jaxvib.show.wheel import Pose, RotorPose, at_rest
 
@@ -225,3 +227,31 @@ def test_the_path_of_a_rotors_axis(run):
     across, up = axis.lines[0].get_data()
     np.testing.assert_allclose(np.stack([across, up], axis=1), 1e3 * moved[-across.size :])
     assert axis.get_aspect() == 1.0 and (axis.get_xlabel(), axis.get_ylabel()) == ("horizontal, mm", "vertical, mm")
+
+
+def test_sketches_of_all_machines_have_one_scale():
+    """Inches to a unit of the drawing, from machines of different height with titles of equal length."""
+    heights, spans = [], []
+    for kind in ("one_mass", "three_mass"):
+        figure = jv.sketch(jv.Scene(jv.scene_from_toml(TEMPLATES[kind]).machine, SCENE.loads, SCENE.drive))
+        heights.append(figure.get_size_inches()[1])
+        spans.append(np.ptp(figure.axes[0].get_ylim()))
+    assert heights[1] - heights[0] == pytest.approx(_INCHES_PER_UNIT * (spans[1] - spans[0])) and heights[1] > 1.2 * heights[0]
+
+
+def test_loads_of_a_sketch_are_spread_evenly():
+    loads = jv.balls(count=5, mass=0.1, radius=0.2, drag=1.0)
+    (rotor,) = at_rest(jv.Scene(SCENE.machine, loads, SCENE.drive)).rotors
+    turns = np.exp(1j * rotor.angle[0])
+    np.testing.assert_allclose(turns[1:] / turns[:-1], np.exp(0.4j * np.pi), rtol=1e-12)
+
+
+def test_velocities_of_a_moving_picture_are_those_of_its_motion(monkeypatch):
+    poses = []
+    monkeypatch.setattr(moving, "Pose", lambda *given: poses.append(given) or Pose(*given))
+    jam = jv.jam_modes(SCENE).select(1)
+    moving.moving_svg(SCENE, jam)
+    place, velocity = (np.array([pose[k] for pose in poses]) for k in (0, 1))
+    step = 2.0 * np.pi / (len(poses) * float(jam.omega))
+    slopes = (np.roll(place, -1, axis=0) - np.roll(place, 1, axis=0)) / (2.0 * step)
+    np.testing.assert_allclose(velocity, slopes, atol=0.02 * np.max(np.abs(velocity)))
