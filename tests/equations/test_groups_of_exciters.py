@@ -8,6 +8,8 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.equations import model
+from jaxvib.equations.linear import linear_model
+from jaxvib.equations.torque_balance import resultant_of
 
 SUPPORTS = [jv.support(at=(x, -0.2), stiffness=(4e5, 7e5), damping=(2e3, 3e3)) for x in (-1.0, 1.1)]
 BODY = jv.plane_body(mass=2000.0, inertia=600.0, supports=SUPPORTS)
@@ -111,3 +113,18 @@ def test_groups_have_the_derivatives_of_single_exciters(name, monkeypatch):
     monkeypatch.setattr(model, "_MIN_GROUP_SIZE", 1000)
     jax.clear_caches()
     close(found, slopes(scene, state), 1e-12)
+
+
+def test_the_resultant_of_exciters_is_the_sum_of_their_forces():
+    """Unbalances S_j at the angles theta + alpha_j, one of which turns backward."""
+    springs = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e3, 4e3)) for x in (-1.0, 1.0)]
+    drive, size, phases, turns = jv.ConstantSpeed(60.0), np.array([0.7, 0.4]), np.array([0.3, 1.1]), (1, -1)
+    exciters = [
+        jv.Exciter(drive=drive, unbalance=own, at=(x, 0.3), direction=way)
+        for own, x, way in zip(size, (-0.5, 0.5), turns, strict=True)
+    ]
+    scene = jv.Scene(jv.plane_body(mass=200.0, inertia=60.0, supports=springs), exciters=exciters)
+    found = np.asarray(resultant_of(linear_model(scene), jnp.exp(1j * phases)))
+    theta = np.linspace(0.0, 6.0, 25)[:, None]
+    across, up = size * np.cos(theta + phases), size * turns * np.sin(theta + phases)
+    np.testing.assert_allclose(np.real(np.exp(1j * theta) * found), np.stack([across.sum(1), up.sum(1)], axis=1), atol=1e-12)

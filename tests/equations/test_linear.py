@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.equations.modal import modal_response
 
 
 def two_masses(support, link):
@@ -48,3 +49,16 @@ def test_a_carrier_that_is_free_to_drift_has_frequency_0(double):
     with jax.enable_x64(double):
         found = jv.natural_frequencies(two_masses(0.0, 1e8))
         np.testing.assert_allclose(found, closed(0.0, 1e8), rtol=1e-3)
+
+
+def test_the_modal_form_solves_critically_damped_modes():
+    """Against the dense solution; the damping of one mode is critical, so that its poles share one eigenvector."""
+    w, mass = np.array([10.0, 30.0]), np.array([[2.0, 0.5], [0.5, 1.0]])
+    shapes = np.linalg.inv(np.linalg.cholesky(mass).T) @ np.array([[0.6, -0.8], [0.8, 0.6]])
+    inverse = np.linalg.inv(shapes)
+    damping, stiffness = (inverse.T @ np.diag(own) @ inverse for own in (2.0 * w * np.array([1.0, 0.1]), w**2))
+    direction, force = jnp.asarray([1.0, 0.0]), np.array([3.0, -1.0])
+    modal = modal_response(*map(jnp.asarray, (w, shapes, stiffness, damping, mass)), direction)
+    for omega in (5.0, 10.0, 25.0):
+        dense = np.linalg.solve(stiffness + 1j * omega * damping - omega**2 * mass, force)
+        np.testing.assert_allclose(modal.solve(jnp.asarray(omega), force), dense, rtol=1e-8)

@@ -1,5 +1,6 @@
 """A scene as it is integrated: on single numbers or on arrays, with angles kept within a turn."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -106,3 +107,10 @@ def test_the_fastest_and_the_slowest_of_rotor_and_resonances():
     machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
     two = jv.Scene(machine, balls, jv.ConstantSpeed(30.0))
     np.testing.assert_allclose(frequency_bounds(two), (jv.natural_frequencies(two)[1], jv.natural_frequencies(two)[0]))
+
+
+def test_stages_are_reused_only_without_reverse_derivatives():
+    s = scene("two_mass", "balls")
+    motion = PackedSystem(jv.vector_field(s), some_state(s))
+    adjoints = (None, diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint())
+    assert motion.size > 8 and [motion.method(adjoint).reuse for adjoint in adjoints] == [True, True, False]

@@ -58,3 +58,23 @@ def test_roots_of_a_batch_are_independent():
     a = jnp.asarray([0.5, 8.0, 27.0, 700.0])
     roots = jax.vmap(lambda a: bracketed_root(lambda x: x**3 - a, jnp.asarray(0.0), jnp.asarray(9.0)))(a)
     np.testing.assert_allclose(roots, np.cbrt(a), rtol=1e-15)
+
+
+def test_a_jump_at_zero_ends_the_search():
+    """No interval around 0 is narrow relative to its ends."""
+    calls = []
+
+    def sign(x):
+        calls.append(1)
+        assert len(calls) <= 200
+        return np.where(x < 0.0, -1.0, 1.0)
+
+    @jax.custom_jvp
+    def jump(x):
+        return jax.pure_callback(sign, x, x)
+
+    jump.defjvp(lambda at, move: (jump(*at), 0.0 * move[0]))
+
+    ends = jnp.asarray(-1.0), jnp.asarray(1.0)
+    bracketed_root(jump, jnp.asarray(-1.0), jnp.asarray(2.0), ends).block_until_ready()
+    assert len(calls) > 50

@@ -177,3 +177,15 @@ def test_a_step_evaluates_the_field_in_one_place_of_its_program():
     # diffrax evaluates it once more where it looks up what a step is made of.
     counted = {name: end(method) for name, method in (("loop", LoopDopri8()), ("reuse", LoopDopri8(reuse=True)))}
     assert counted["loop"] == counted["reuse"] < end(UnrolledDopri8()) / 4, counted
+
+
+def test_a_step_uses_the_time_of_each_of_its_stages():
+    """y' = n t^(n - 1) is integrated exactly by a method of order 8."""
+    powers = jnp.arange(1.0, 9.0)
+
+    def field(t, y, args):
+        return powers * t ** (powers - 1.0)
+
+    term, control = diffrax.ODETerm(field), diffrax.ConstantStepSize()
+    found = diffrax.diffeqsolve(term, LoopDopri8(), 0.5, 1.5, 0.5, 0.5**powers, stepsize_controller=control)
+    np.testing.assert_allclose(found.ys[0], 1.5**powers, rtol=1e-13)

@@ -29,10 +29,10 @@ rounded.defvjp(lambda x: (x * (1.0 + 1e-13), None), lambda _, slope: (slope,))
 
 
 def forced(again, jump):
-    """A forced oscillator; from t = 7 on with `jump` more force, in proportion to what it is differentiated by."""
+    """A forced oscillator; from t = 7 to 13 with `jump` more force, in proportion to what it is differentiated by."""
 
     def field(t, y, args):
-        force = args[0] * (jnp.cos(1.7 * t) + jnp.where(t < 7.0, 0.0, jump))
+        force = args[0] * (jnp.cos(1.7 * t) + jnp.where(t < 7.0, 0.0, jump) - jnp.where(t < 13.0, 0.0, jump))
         return y[1], force - 0.05 * y[1] - args[1] * again(y[0])
 
     return diffrax.ODETerm(field)
@@ -43,7 +43,7 @@ def run(args, *, solver=None, again=plain, jump=0.0, adjoint=None, controller=No
     if controller is None:
         controller = PIController(tolerance=jnp.asarray(1e-7), unit=one, relative=one)
         if jump:
-            controller = diffrax.ClipStepSizeController(controller, jump_ts=jnp.asarray([7.0]))
+            controller = diffrax.ClipStepSizeController(controller, jump_ts=jnp.asarray([7.0, 13.0]))
     first_step = None if isinstance(controller, diffrax.StepTo) else jnp.asarray(0.1)
     options = {"first_step": first_step, "max_steps": 2**12, **options}
     solution = solve(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from jaxvib.ode.rodas4 import Rodas4
+from jaxvib.ode.rodas4 import Rodas4, _Interpolation
 
 
 def stiff(t, y, args):
@@ -44,3 +44,11 @@ def test_rodas_has_its_order_and_does_not_mind_stiffness(rate, order):
     assert np.max(coarse[-1]) / np.max(fine[-1]) > 2.0 ** (order - 0.5)
     assert np.max(coarse) / np.max(fine) > 2.0**2.5  # between the steps: the interpolant's order 3
     assert np.max(fine) < 1e-5
+
+
+def test_between_its_ends_a_step_is_a_cubic():
+    """y = (1 - s) y0 + s (y1 + (1 - s) (c0 + s c1)), multiplied out."""
+    step = _Interpolation(2.0, 4.0, jnp.asarray([3.0]), jnp.asarray([5.0]), jnp.asarray([[7.0], [-2.0]]))
+    cubic = np.polynomial.Polynomial([3.0, 9.0, -9.0, 2.0])
+    for share in (0.0, 0.25, 0.8, 1.0):
+        np.testing.assert_allclose(step.evaluate(2.0 + 2.0 * share), [cubic(share)], rtol=1e-14)

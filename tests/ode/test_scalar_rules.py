@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.ode.scalar_rules import NotScalarizable, to_scalars
+from jaxvib.ode.scalar_rules import NotScalarizable, primitive_of, to_scalars
 from jaxvib.ode.scalarize import scalarize, scalarized_program
 
 
@@ -31,6 +31,13 @@ def test_complex_numbers_are_written_in_their_parts():
 def test_an_operation_without_a_rule_is_named():
     with pytest.raises(NotScalarizable, match="cumsum"):
         scalarize(jnp.cumsum, jnp.zeros(3))
+
+
+@pytest.mark.parametrize(("function", "count"), [(lambda x: x, 0), (lambda x: 2.0 * x + 1.0, 2)])
+def test_a_primitive_is_that_of_a_single_operation(function, count):
+    assert primitive_of(jax.lax.neg, 1.0).name == "neg"
+    with pytest.raises(NotScalarizable, match=f"is made of {count} operations"):
+        primitive_of(function, 1.0)
 
 
 def test_a_term_that_is_not_there_is_not_computed():

@@ -1,6 +1,7 @@
 """Starts of the search for jams at unequal phases, and Newton's method for phases at a load speed."""
 
 import itertools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -169,3 +170,12 @@ def test_two_clusters_of_one_size_jam_at_the_resonance(count):
     found = jv.phase_jams(jv.Scene(MACHINE, loads, jv.ConstantSpeed(460.0)), starts=16)
     assert found.omega.size == 3 * (count // 2) + 1
     assert np.min(np.abs(np.asarray(found.omega) / RESONANCE - 1.0)) < 1e-9
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 7])
+def test_regular_phases_are_all_divisions_each_once(count):
+    """At most five loads have a side of their own."""
+    found = _regular_phases(SimpleNamespace(unbalance=np.ones(count)))
+    sides = {tuple(np.round(row / np.pi).astype(int)) for row in found}
+    free = min(count - 1, 5)
+    assert len(found) == len(sides) == 2**free and all(not any(row[free:]) and {*row} <= {0, 1} for row in sides)
