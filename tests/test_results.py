@@ -345,6 +345,11 @@ def test_every_result_class_is_final_and_is_in_this_file():
     assert not [kind for kind in own if set(kind.__mro__[1:]) & own]
 
 
+def test_loads_of_a_single_exciter_have_no_numbered_axis():
+    run = RESULTS["Run"]().to_xarray()
+    assert run.angle.dims == ("time", "load") and run.window_rate.dims == ("window_time", "load")
+
+
 def test_units_of_coordinates_and_labels():
     data = RESULTS["JamModes"]().to_xarray()
     assert data.amplitude.dims == ("mode", "coordinate") and data.amplitude.attrs["units"] == "m or rad"

@@ -9,6 +9,7 @@ import pint
 import pytest
 
 import jaxvib as jv
+from jaxvib.display import shown_unit
 from jaxvib.units import count, in_own_unit, known_number, number, numbers, to_float, unit_ratio
 from jaxvib.units.reading import _FACTORS
 
@@ -232,3 +233,12 @@ def test_equal_parts_of_equal_parts_are_refused():
     assert to_float("2 x 3 kg", "kg", "mass") == 6.0
     with pytest.raises(jv.InputError, match="2 x 3 x 4 kg"):
         to_float("2 x 3 x 4 kg", "kg", "mass")
+
+
+def test_values_are_shown_in_si_on_request():
+    try:
+        jv.display_units(si=True)
+        assert [shown_unit(unit, 0.02) for unit in ("m", "kg", "rad")] == [("m", 1.0), ("kg", 1.0), ("rad", 1.0)]
+    finally:
+        jv.display_units()
+    assert shown_unit("m", 0.02) == ("mm", 1e3)

@@ -138,6 +138,15 @@ def test_first_column_without_a_head_is_the_time(tmp_path):
     assert list(read(path, 10.0)) == ["column 1", "column 2", "column 3"]
 
 
+def test_a_single_column_without_a_head_has_readings(tmp_path):
+    path = tmp_path / "run.txt"
+    path.write_text("# rate: 100 Hz\n" + rows(np.cos(T)))
+    (found,) = read(path).values()
+    assert found.name == "column 1"
+    np.testing.assert_allclose(found.time, T, atol=1e-12)
+    np.testing.assert_allclose(found.values, np.cos(T), rtol=1e-5)
+
+
 def test_units_of_columns(tmp_path):
     """Units in the heads, or in a line below them; times in ms."""
     (tmp_path / "a.csv").write_text("frame (g),Zeit (ms),base\n" + rows(np.sin(T), 1e3 * T, np.cos(T)))

@@ -143,10 +143,14 @@ def test_files_begin_with_header_units_and_geometry(responses, histories):
 def test_spacing_is_even_and_stored_without_abscissa(responses, histories):
     """OpenModal 14: the increment is in the file, and the abscissa follows from it."""
     for path in (responses, histories):
+        abscissas = set()
         for each in (each for each in pyuff.UFF(str(path)).read_sets() if each["type"] == 58):
             assert each["abscissa_spacing"] == 1 and each["abscissa_inc"] > 0.0
             np.testing.assert_allclose(np.diff(each["x"]), each["abscissa_inc"], rtol=1e-6)
-            assert each["abscissa_axis_units_lab"].strip() in ("s", "Hz") and each["ordinate_spec_data_type"] in (8, 9, 11, 12)
+            abscissas.add((each["func_type"] == 1, each["abscissa_axis_lab"].strip(), each["abscissa_axis_units_lab"].strip()))
+            assert each["ordinate_spec_data_type"] in (8, 9, 11, 12)
+        time, frequency = (True, "Time", "s"), (False, "Frequency", "Hz")
+        assert abscissas == ({frequency} if path == responses else {time, frequency})
 
 
 def test_each_node_has_one_response_per_reference(responses):

@@ -100,6 +100,7 @@ def test_dimensionless_forms_refuse_what_cannot_be():
     for changed, sentence in (
         (dict(form="other"), "form is 'other'; it must be 'antiphase' or 'criterion'"),
         (dict(natural=(1.0,) * 4), "natural has 4 values; the machines of these papers have 1, 2 or 3 platforms"),
+        (dict(natural=(0.3, -0.3)), "natural[1] is -0.3; it must be at least 0"),
         (dict(eps=0.0), "eps is 0; it must be greater than 0"),
         (dict(rho=-1.0), "rho is -1; it must be greater than 0"),
         (dict(eps=0.5, count=3), "1 - (mass of all loads)/M2S (from eps, kappa and count) is -0.5; it must be greater than 0"),

@@ -25,3 +25,7 @@ def test_traced_numbers_show_their_shape():
     shown = []
     jax.jit(lambda speed: shown.append(repr(jv.ConstantSpeed(speed))))(60.0)
     assert shown == ["constant_speed(speed=f64[])"]
+
+
+def test_texts_are_shown_as_python_writes_them():
+    assert repr(jv.Gravity(9.8125, along="axis")) == "gravity(g=9.8125 m/s^2, along='axis')"

@@ -11,7 +11,7 @@ import pytest
 from mutations import mutate_result, outcome, result_outcome, seeded, zip_bomb
 
 import jaxvib as jv
-from jaxvib.errors import legible, read_text, written
+from jaxvib.errors import legible, open_regular, read_text, written
 from jaxvib.results import files
 from jaxvib.results.files import _decoded, _digest, _encoded
 
@@ -167,6 +167,16 @@ def test_headers_that_promise_more_than_there_is_are_refused(tmp_path):
             np.lib.format.write_array_header_2_0(entry, {"descr": kind, "fortran_order": False, "shape": shape})
         with pytest.raises(jv.InputError, match=LOST):
             jv.load(path)
+
+
+def test_a_pipe_into_which_something_writes_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    writer = os.open(tmp_path / "pipe", os.O_RDWR)
+    try:
+        with pytest.raises(OSError, match="a folder, a pipe or a device, not a file"):
+            open_regular(tmp_path / "pipe")
+    finally:
+        os.close(writer)
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: os.symlink("/dev/zero", path)])

@@ -140,6 +140,12 @@ def test_runs_go_through_dictionaries_and_back():
     assert alone.rotor_speed() is None
 
 
+@pytest.mark.parametrize(("kind", "times"), [("acceleration", {"frame": T}), ("pulses", T), ("acceleration", T)])
+def test_only_pulses_with_times_of_their_own_need_no_values(kind, times):
+    with pytest.raises(jv.InputError, match="values has no entry 'frame'; it has: none"):
+        MeasuredRun.from_arrays([jv.Channel("frame", kind)], times, {})
+
+
 def test_falling_edges_and_times_of_pulses():
     level = np.where(np.arange(600) % 30 > 20, 5.0, 0.0)
     t = 0.01 * np.arange(600)

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.identification.records.sampling import _clipped_above, _resolution, clipped_at, dropouts, even_samples
+from jaxvib.identification.records.sampling import (
+    _clipped_above,
+    _resolution,
+    clipped_at,
+    dropouts,
+    even_samples,
+    require_ascending,
+)
 
 N = 400
 T = 2.0 + 0.01 * np.arange(N)
@@ -178,3 +185,18 @@ def test_converter_steps_and_single_peaks_are_no_clipping():
     assert _clipped_above(coarse) == np.inf  # a step of the converter is a bin
     peak = np.sin(0.01 * np.arange(4000.0))
     assert _clipped_above(peak) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("places", "value", "says"),
+    [
+        ([3, 7], [np.inf, np.nan], "has the time inf at sample 4; times must be finite numbers"),
+        ([3, 7], [T[2], T[6]], "has the time 2.02 s twice, at samples 3 and 4; leave one of them out"),
+        ([3, 7], [1.0, 1.5], "has the time 1 s at sample 4, and 2.02 s at the sample before it; times must ascend"),
+    ],
+)
+def test_the_first_wrong_time_is_named(places, value, says):
+    time = T.copy()
+    time[places] = value
+    with pytest.raises(jv.InputError, match=says):
+        require_ascending(time, "a")

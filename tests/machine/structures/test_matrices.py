@@ -151,6 +151,11 @@ def test_reduced_model_has_the_lowest_frequencies():
 ONE = np.eye(2)
 
 
+def test_a_body_may_move_without_a_spring():
+    free = jv.from_matrices(ONE, 0.0 * ONE, [[1.0, -1.0], [-1.0, 1.0]], places=[[0]])
+    np.testing.assert_allclose(jv.natural_frequencies(jv.Scene(free, BALLS, DRIVE))[0], 0.0, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("make", "says"),
     [

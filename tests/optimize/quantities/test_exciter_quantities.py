@@ -188,3 +188,15 @@ def test_machines_without_a_regime_count_in_tolerances(screen):
 def test_wrong_arguments_are_refused(make, says):
     with pytest.raises(jv.InputError, match=says):
         make()
+
+
+@pytest.mark.parametrize("ratio", [0.4, 0.9, 1.7])
+def test_pieces_of_the_resonance_distance_have_its_value(ratio):
+    """The nearest natural frequency decides; a lower bound needs each of them, an upper bound the nearest only."""
+    scene = jv.scene_from_toml(SCREENS["linear_screen"])
+    speed = ratio * float(jnp.max(jv.natural_frequencies(scene)))
+    given = SimpleNamespace(scene=scene, regime=SimpleNamespace(speed=speed))
+    distances = np.abs(np.asarray(jv.natural_frequencies(scene)) / speed - 1.0)
+    np.testing.assert_allclose(exciters._distances(given, -1.0, "leading"), -distances, rtol=1e-12)
+    np.testing.assert_allclose(exciters._distances(given, 1.0, "leading"), [np.min(distances)], rtol=1e-12)
+    np.testing.assert_allclose(exciters._distance(given, "leading"), np.min(distances), rtol=1e-12)

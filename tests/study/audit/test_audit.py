@@ -18,7 +18,7 @@ from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.files import DRIVES, EFFECTS, TEMPLATES
 from jaxvib.results.status import member
-from jaxvib.study.audit import compared
+from jaxvib.study.audit import compared, tiers
 from jaxvib.study.audit.audit import _with_computed_advice
 from jaxvib.study.audit.compared import EffectRow, RepeatedComparison, effect_row
 from jaxvib.study.audit.comparisons import JamComparison, MotionValues, RunComparison, without_excluded_effects
@@ -312,6 +312,8 @@ def test_numbers_of_the_audit_follow_the_equations():
     radius = (3.0 / (4.0 * np.pi * 7850.0)) ** (1.0 / 3.0)
     sized = jv.balls(count=5, mass=1.0, radius=0.1, drag=0.5, ball_radius=radius)
     np.testing.assert_allclose(rows["loads side by side"].value, 1.0 - sized.unbalance() / heavy.unbalance(), rtol=1e-9)
+    known = dimensionless_numbers(jv.Scene(SCENE.machine, sized, SCENE.drive), values, 0.01)
+    assert not any(row.name.startswith("loads side by side") for row in known)
     assert rows["loads side by side"].advice == "perhaps needed" and "31.2 mm" in rows["loads side by side"].note
     rolling = jv.RollingFriction(3e-5)
     friction = rolling.friction(sized, (jnp.zeros(5),), (jnp.full(5, 27.0),), jnp.asarray(60.0), {})
@@ -411,3 +413,15 @@ def test_exciters_without_loads_are_refused(drive):
     scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0), exciters=[jv.Exciter(drive=drive, unbalance=0.02)])
     with pytest.raises(jv.InputError, match=r"^scene.exciters\[0\] has an unbalance; this function needs"):
         jv.audit(scene)
+
+
+def test_a_motion_of_which_a_part_is_unknown_does_not_exist(monkeypatch):
+    tier = SimpleNamespace(name="own", purpose="a purpose", refusal=lambda scene: None)
+    reference = MotionValues("jam", 27.0, (2e-3, 1e-3), 600.0, math.nan, 1e-9)
+    for amplitude in ((2e-3, math.nan), (math.nan, math.nan), (2e-3, 1.1e-3)):
+        found = SimpleNamespace(amplitude=amplitude, foundation_force=600.0, omega=27.0)
+        monkeypatch.setattr(tiers, "_call", lambda *_, found=found: lambda: found)
+        row = tiers._row(tier, SCENE, None, reference, 0)
+        assert row.applicable == bool(np.all(np.isfinite(amplitude)))
+        assert row.note == ("a purpose" if row.applicable else "this motion does not exist")
+    np.testing.assert_allclose(row.amplitude, 0.05)

@@ -1,6 +1,7 @@
 """Captures of balls in a torus: success from an initial speed, thresholds, derivatives of the outcome."""
 
 import json
+from types import SimpleNamespace
 
 import diffrax
 import equinox as eqx
@@ -221,3 +222,26 @@ def test_the_command_prints_shares_and_writes_pictures(tmp_path, capsys, monkeyp
     np.testing.assert_allclose(in_the_tube[0], 0.0, atol=1e-12)
     np.testing.assert_allclose(speed[0], document["threshold"] + 2.0 * document["uncertainty"], rtol=1e-9)
     assert command(["capture", str(tmp_path / "torus.toml"), "--from", "0", "--to", "-1"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("border", "status", "most"), [(-0.37, "found", 4), (-2.0, "all_captured", 1), (2.0, "none_captured", 1)]
+)
+def test_a_threshold_is_scanned_to_its_resolution(monkeypatch, border, status, most):
+    """Runs are replaced by their outcome: starts above the border are captured."""
+    scene, asked = published_torus(3.5), []
+
+    def outcome(make, values, end, **options):
+        asked.append(np.asarray(values[1]))
+        assert len(asked) <= 8
+        rotor = float(scene.drive.speed)
+        speed = np.where(asked[-1][:, None] > border, rotor, 0.5 * rotor) * np.ones(scene.loads.count)
+        none = np.zeros(speed.shape, bool)
+        return SimpleNamespace(load_speed=speed, finite=np.ones(len(speed), bool), detached=none)
+
+    monkeypatch.setattr("jaxvib.study.capture.capture.ensemble", outcome)
+    monkeypatch.setattr("jaxvib.study.capture.capture.steps_per_second", lambda scene, equations: 1.0)
+    found = jv.capture(scene, [-1.0, -0.1], turns=5, resolution=1e-3, doublings=0)
+    assert found.status_name == status and len(asked) <= most
+    if status == "found":
+        assert abs(float(found.threshold) - border) <= 1e-3 and float(found.uncertainty) <= 1e-3
