@@ -26,7 +26,7 @@ VARIANTS = {
     "printed": "c2 = k1 L1 - k2 L2, b as printed",
     "uncoupled": "c2 = 0, b as printed",
     "uncoupled, both dampers": "c2 = 0, b3 = 21.56 N m s, the sum of b L^2 over both dampers "
-    "(the printed 10.41 is that of one, with L1 and L2 exchanged)",
+    "(the printed 10.41 is b L^2 of one damper, with L1 and L2 exchanged)",
 }
 """Readings of the printed data under which a part of what the paper reports comes out."""
 

@@ -57,8 +57,9 @@ NUMBERS = (
         quantity="natural frequency, 2000 N/m",
         printed=16.51,
         computed=lambda: _resonance(2000.0),
-        reason="sqrt(2000/7.35) is 16.496; 16.51 and 28.57 do not have the ratio sqrt(3) of one mass on these springs; with 5 "
-        "N s/m the vibrational torque is largest at 16.506 rad/s",
+        reason="sqrt(2000/7.35) is 16.496; the springs of 2000 and 6000 N/m carry the same mass, therefore the frequencies "
+        "must have the ratio sqrt(3), but 28.57/16.51 is 1.7305; with 5 N s/m the vibrational torque is largest at "
+        "16.506 rad/s",
         differs=16.4957,
     ),
     _frame(
@@ -75,7 +76,7 @@ NUMBERS = (
                 quantity=f"jams {where} characteristic speed", printed=float(jams), computed=lambda k=k: float(_counts()[k][0])
             ),
             _ranges(
-                quantity=f"jams below the resonance, of those {where} characteristic speed",
+                quantity=f"jams below the resonance, at rotor speeds {where} characteristic speed",
                 printed=float(below),
                 computed=lambda k=k: float(_counts()[k][1]),
             ),

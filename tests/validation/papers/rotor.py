@@ -186,7 +186,7 @@ NUMBERS = (
         quantity="first jam, data as printed",
         printed=169.6,
         computed=_first_jam_as_printed,
-        reason="with the printed c2 = 13635 N no first jam is stable at 9.2e-4 N m s",
+        reason="with the printed c2 = 13635 N there is no stable first jam at 9.2e-4 N m s",
     ),
     _friction_number(
         "friction at which the first jam has 169.6 rad/s",

@@ -209,7 +209,7 @@ NUMBERS = (
         unit="1/m",
         note="the bound is 2 %, because the rotor responds to the friction too",
         misprint=Misprint(
-            "lever arm R1 (which reproduces the tables of the paper more closely than R1 - r)",
+            "lever arm R1 (the tables of the paper agree better with it than with R1 - r)",
             "lever arm R1 - r",
             "the same equations, with and without rolling friction",
             lambda: _braking(gap_torus),
