@@ -1,4 +1,4 @@
-"""Profile likelihood: intervals of numbers in which the cost of a fit is not quadratic.
+"""Profile likelihood: intervals of the numbers for which the cost of a fit is not a quadratic function.
 
 A number is held at a distance from its fitted value while all other unknowns are fitted again. The rise of the cost is
 compared with the quadratic form, (distance/error)^2. If they differ by more than 10 % at two standard errors, the ends of the
@@ -39,8 +39,8 @@ class _Profile:
 
     **Attributes**: the `fitted` problem; `index` of the number in x, or of the exciter if `is_unbalance`; `center` and standard
     error `spread` of the coordinate of the number (its entry of x, or the logarithm of the unbalance); `slopes` (p,): change of
-    x per change of the coordinate; `floor`: the least cost; `is_vanished`: True if distances are multiples of the standard
-    error of the number itself, not of its logarithm.
+    x per change of the coordinate; `floor`: the least cost; `is_vanished`: True if the number is not
+    distinguishable from 0; distances are then multiples of the standard error of the number itself, not of its logarithm.
     """
 
     fitted: Fitted
@@ -68,7 +68,8 @@ class _Profile:
         return trial.cost + known_cost - self.floor
 
     def _held(self, target: float) -> tuple[Problem, float]:
-        """Return the problem with the number held at `target`, and the cost of its known value at `target`."""
+        """Return the problem with the number held at `target`, and the cost of the difference between
+        `target` and the known value of the number."""
         problem, relative_error = self.fitted.problem, _TIGHT_ERROR * min(self.spread, 1.0)
         if self.is_unbalance:
             known, value = problem.unbalances[self.index], math.exp(target)
@@ -103,8 +104,8 @@ class _Profile:
 
 
 def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[float, float]]:
-    """Return the distances of the ends of the intervals from the fitted values, by the names of the numbers in which the cost
-    is not quadratic. A distance is a change of the number's entry of x, or of the logarithm of an unbalance.
+    """Return the distances of the ends of the intervals from the fitted values, by name, for the numbers of which the cost
+    is not a quadratic function. A distance is a change of the number's entry of x, or of the logarithm of an unbalance.
 
     A number that is not distinguishable from 0 has the lower distance minus infinity. Undetermined numbers are left out.
 

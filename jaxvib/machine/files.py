@@ -79,7 +79,7 @@ DRIVES = {
 SECTIONS: dict[str, Mapping[str, Callable[..., Any]]] = {"machine": _MACHINES, "loads": _LOADS, "drive": DRIVES}
 
 _ENTRIES: Mapping[str, Callable[..., Any]] = {"supports": support, "bodies": body}
-"""Constructors of the entries of arguments that are lists of parts, by the name of the argument."""
+"""Arguments that are lists of parts: for each name the constructor of one entry of the list."""
 
 T = TypeVar("T")
 
@@ -437,8 +437,8 @@ def _fields(part: object, build: Callable[..., object]) -> Tables:
         elif isinstance(value, Drive):
             fields[name] = _part_table("drive", value)
         else:
-            # An array with one value is written as a number for a machine. For loads it stays a list, because a list of one
-            # load's value differs from a value that all loads share.
+            # For a machine, an array with one value is written as a number. For loads it stays a list, because a number is the
+            # value of all loads, and a list contains the value of each load.
             plain = when_known(partial(_plain, unwrap=isinstance(part, Machine)), value)
             fields[name] = value if plain is None else plain  # `rebuild_part` passes traced values to the constructor
     return fields

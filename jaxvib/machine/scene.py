@@ -178,7 +178,8 @@ class Scene(Part):
       `from_matrices`
     - `loads` from `balls`, `rollers`, `pendulums` or `torus_balls`; typical: 0.1 % to 5 % of the machine's mass
     - `drive` such as `ConstantSpeed`; typical: 600 to 3000 rpm
-    - `effects` such as `Gravity`, each at most once, except `CubicSupport` and `Stop`: one for each such support; typical: none
+    - `effects` such as `Gravity`, each kind at most once, except `CubicSupport` and `Stop`, which may occur once for
+      each support; typical: none
     - `exciters`: instead of `loads` and `drive`, a list of `Exciter`
 
     **Attributes**: `machine`; `exciters`; `effects` that act on the whole machine. Effects on a rotor and its loads are in
@@ -243,16 +244,16 @@ class Scene(Part):
 
     @property
     def top_speed(self) -> Array:
-        """Largest working speed of a drive, rad/s."""
+        """Largest of the working speeds of the drives, rad/s."""
         return functools.reduce(jnp.maximum, (exciter.drive.speed for exciter in self.exciters))
 
     @property
     def exciter(self) -> Exciter:
         """Only exciter of the scene. **Raises** `InputError` if the scene has several."""
         if len(self.exciters) != 1:
-            problem = f"has {len(self.exciters)} exciters; this function needs a scene with one"
-            instead = "for several use simulate, settle, envelope, response or synchronous_regimes (command regimes)"
-            raise InputError("scene", f"{problem}, {instead} (their parts are scene.exciters[0].drive and so on)")
+            problem = f"has {len(self.exciters)} exciters; this function needs a scene with one exciter"
+            instead = "for others use simulate, settle, envelope, response or synchronous_regimes (command regimes)"
+            raise InputError("scene", f"{problem}; {instead} (their parts are scene.exciters[0].drive and so on)")
         return self.exciters[0]
 
     @property
@@ -283,7 +284,7 @@ class Scene(Part):
 
     @property
     def mounting(self) -> Mount:
-        """Directions and shapes of the only exciter's mount, without values."""
+        """Directions of the only exciter's mount, and the shapes of its arrays without their values."""
         # A property, because each analysis reads it and a method of an Equinox module costs 30 us a call.
         return shapes_of(self.machine, self.exciter.place)[1]
 
@@ -320,7 +321,9 @@ def _require_stations(machine: Machine, exciter: Exciter) -> None:
     loads = exciter.loads
     for levers in machine.mounting(exciter.place).levers:
         if levers is not None and (loads is None or levers.shape != (loads.count,)):
-            needed = "an unbalance needs a place" if loads is None else f"one for all loads or {loads.count} are needed"
+            needed = (
+                "give the exciter a place, at=..., m" if loads is None else f"one for all loads or {loads.count} are needed"
+            )
             raise InputError("machine.stations", f"has {levers.shape[0]} values; {needed}")
 
 

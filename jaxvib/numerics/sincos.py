@@ -1,10 +1,11 @@
 """Sine and cosine without branches or tables, which a compiler can vectorize.
 
-XLA's CPU backend calls the C library once for each number. Here the angle is reduced by multiples of pi in three parts (Cody
-and Waite), for the cosine by odd multiples of pi/2, and one odd polynomial is evaluated at the remainder, within pi/2. The two
-functions share no value, because a compiler that recomputes values for each use would compute it twice. For angles up to 1e5
-the error is below 1.1 times the distance from 1 to the next floating-point number. For larger angles it is proportional to the
-rounding error of the angle, like the error of any sine of a rounded angle.
+XLA's CPU backend calls the C library once for each number. Here the nearest multiple of pi (for the cosine: the nearest odd
+multiple of pi/2) is subtracted from the angle. The multiple is a sum of three parts, which keeps the remainder accurate (Cody
+and Waite). The sine of the remainder, which is at most pi/2, is an odd polynomial. The sine and the cosine share no
+intermediate result, because the compiler would compute a shared result once for each of the two. For angles up to 1e5 the error
+is below 1.1 times the distance from 1 to the next floating-point number. For larger angles it is proportional to the rounding
+error of the angle, like the error of any sine of a rounded angle.
 """
 
 from __future__ import annotations
@@ -73,7 +74,8 @@ def _polynomial(terms: int) -> tuple[float, ...]:
 
 
 def _summed(z: Array, coefficients: Sequence[float]) -> Array:
-    """Return sum_k coefficients_k z^k, added in pairs (Estrin), with a third of the successive products of Horner's form."""
+    """Return sum_k coefficients_k z^k, added in pairs (Estrin). The longest chain of dependent
+    products is 3 for 7 coefficients and 2 for 4; in Horner's form it is 6 and 3."""
     parts: list[Array | float] = list(coefficients)
     while len(parts) > 1:
         parts = [parts[k] + parts[k + 1] * z if k + 1 < len(parts) else parts[k] for k in range(0, len(parts), 2)]
@@ -92,8 +94,9 @@ def _sine(x: Array, ahead: float) -> Array:
     constant, *others = _polynomial(_TERMS[dtype])
     # The largest term is added last, which keeps the roundings of the others as small as in Horner's form.
     total = constant + z * _summed(z, others)
-    # An odd number of half turns changes the sign. The number is added to a number so large that it has no fraction; its last
-    # bit is then shifted to the position of the sign. Operations on bits take almost no time.
+    # The sine changes its sign if the number `whole` of half turns is odd. The sum of `whole` and a large constant has no
+    # fractional part, and its last bit is 1 if `whole` is odd. This bit is shifted to the position of the sign, because
+    # operations on bits take almost no time.
     bits = np.dtype(f"uint{8 * dtype.itemsize}")
     beside = whole + 1.5 * 2.0 ** np.finfo(dtype).nmant
     sign = jax.lax.bitcast_convert_type(beside, bits) << bits.type(8 * dtype.itemsize - 1)

@@ -81,7 +81,7 @@ arrays in place of scalars."""
 def rewritten(
     program: ClosedJaxpr, equations: Sequence[tuple[JaxprEqn, list[Var | Literal]]], results: list[Var | Literal]
 ) -> ClosedJaxpr:
-    """Return the program with these operations, their inputs and these results.
+    """Return the `program` with its operations replaced by `equations` (each with new inputs) and its results by `results`.
 
     The program is returned unchanged if JAX does not allow the replacement.
     """
@@ -100,7 +100,7 @@ Instead: TypeAlias = "tuple[list[tuple[JaxprEqn, Atoms]], Var]"
 
 
 def operation_like(function: Callable[..., object], *like: Any) -> JaxprEqn:
-    """Return the single operation of a function of arguments like `like`, with new variables."""
+    """Return the only operation of a `function`, with new variables; its arguments have the types of `like`."""
     shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in (x.aval for x in like)]
     # A new lambda, because JAX returns the cached program with the same variables if the function is the same.
     (equation,) = jax.make_jaxpr(lambda *x: function(*x))(*shapes).jaxpr.eqns
@@ -142,8 +142,9 @@ def evaluating() -> contextlib.AbstractContextManager[None]:
 def without_source_locations() -> Iterator[None]:
     """Trace without source locations of operations.
 
-    The list of JAX's own files is also cached, because JAX otherwise searches it again for each run-time check. Both save a
-    tenth of the time until a program is compiled. If a name is missing in JAX, its part has no effect.
+    The answer to whether a file belongs to JAX is also cached, because JAX otherwise searches the list of its files again for
+    each run-time check. Together the two changes save a tenth of the time until a program is compiled. A change whose private
+    name is missing in JAX is omitted.
     """
     limit = getattr(sys.modules.get("jax._src.config"), "traceback_in_locations_limit", None)
     frames = sys.modules.get("jax._src.traceback_util")
@@ -255,7 +256,7 @@ def _unpatched(module: ModuleType | None, name: str) -> Any:
 
 @contextlib.contextmanager
 def no_host_checks() -> Iterator[None]:
-    """Trace Equinox's run-time checks (`equinox.error_if`) as NaN in place of errors.
+    """Trace run-time checks of Equinox (`equinox.error_if`) so that they return NaN and raise no error.
 
     Errors need a callback into Python, and a program with a callback cannot be stored on disk. Equinox's own setting, the
     environment variable EQX_ON_ERROR, is not sufficient: it is read when Equinox is imported, and applies to the whole process.

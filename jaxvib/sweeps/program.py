@@ -89,7 +89,7 @@ def _measure_cases(
 
 @cached
 def _measure_cases_compiled(scene: Scene, values: Array, program: str, *choices: Any) -> tuple[tuple[Array, ...], Array]:
-    """Compute cases by a compiled program; there is one program for each digest `program`.
+    """Compute cases by a compiled program. `program` is the digest of `traced_program`; a new digest compiles a new program.
 
     The digest is an argument for the following reason: a user's function is equal to itself after a change of its global
     variables. Without the digest, the program from before the change would be used again.

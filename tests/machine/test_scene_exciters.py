@@ -75,7 +75,7 @@ def test_leaves_of_one_exciter_keep_their_order():
     ],
 )
 def test_theories_refuse_several_exciters(ask):
-    with pytest.raises(jv.InputError, match=r"has 2 exciters; this function needs a scene with one, for several use"):
+    with pytest.raises(jv.InputError, match=r"has 2 exciters; this function needs a scene with one exciter; for others use"):
         ask(two())
 
 

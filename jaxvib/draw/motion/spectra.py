@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm
 from jaxvib.display import Drawn, SpeedUnit, speed_unit
 from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, length_unit, panels
 
-_DECADES = 1e-4
+_LOWEST_AMPLITUDE = 1e-4
 """Lower end of the amplitude scale, relative to the largest amplitude."""
 
 
@@ -25,10 +25,11 @@ def spectrum_chart(
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw amplitudes (nf,) by name with unit, on a log scale, over nf frequencies, with reference lines.
+    """Draw spectra as lines, with amplitudes on a logarithmic scale.
 
-    Vertical lines are the rotor speeds (1, exciters), the load speeds (1, loads) and the resonances. Frequencies and speeds are
-    in rad/s, drawn in `unit`.
+    `frequency` has nf values. `series` contains the amplitudes (nf,) of each spectrum by its name, which includes the unit.
+    Vertical lines mark the rotor speeds (1, exciters), the load speeds (1, loads) and the resonances. Frequencies and speeds
+    are in rad/s, drawn in `unit`.
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.0), ax=ax)
@@ -44,7 +45,7 @@ def spectrum_chart(
             axis.axvline(scale * float(speed), color="black", lw=0.9, ls=stroke, label=None if k else name)
     axis.set(
         yscale="log",
-        ylim=(_DECADES * top, 2.0 * top),
+        ylim=(_LOWEST_AMPLITUDE * top, 2.0 * top),
         xlim=(0.0, scale * float(frequency[-1])),
         xlabel=f"frequency, {unit}",
         ylabel="amplitude, zero to peak",
@@ -76,8 +77,8 @@ def waterfall_chart(
     shade = axis.pcolormesh(
         time,
         scale * frequency,
-        np.maximum(values, _DECADES * top).T,
-        norm=LogNorm(_DECADES * top, top),
+        np.maximum(values, _LOWEST_AMPLITUDE * top).T,
+        norm=LogNorm(_LOWEST_AMPLITUDE * top, top),
         cmap="Greys",
         shading="nearest",
         rasterized=True,
@@ -96,8 +97,8 @@ def waterfall_chart(
 
 
 def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes | None = None) -> Drawn:
-    """Draw paths of points by name: horizontal and vertical coordinates (nt,), m, drawn in mm or µm, with a marker at each end
-    point.
+    """Draw paths of points by name: horizontal and vertical coordinates (nt,), m, drawn in mm or µm, with a marker at the last
+    point of each path.
 
     >>> import numpy as np
     >>> t = np.linspace(0.0, 6.0, 50)

@@ -1,4 +1,4 @@
-"""Drives by tables and controllers: speed profiles, torque tables, converters, speed control."""
+"""Drives that follow tables or controllers: speed profiles, torque tables, converters, speed control."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class TorqueTable(Motor):
         return jnp.max(jnp.where(is_zero, self.speeds[:-1] + jnp.diff(self.speeds) * share, 0.0))
 
     def torque(self, speed: Array) -> Array:
-        """Return the torque on the line of the two nearest points."""
+        """Return the torque by linear interpolation between the points, and extrapolation beyond them."""
         inner, infinite = self.speeds[1:-1], np.full(1, np.inf, self.speeds.dtype)
         low, high = jnp.concatenate([-infinite, inner]), jnp.concatenate([inner, infinite])
         slopes = jnp.diff(self.torques) / jnp.diff(self.speeds)
@@ -93,7 +93,7 @@ class SpeedProfile(IdealDrive):
     """Drive that prescribes the rotor speed at several times, with constant accelerations between them.
 
     The speed before the first time is the first speed, and the speed after the last time is the last one. The acceleration
-    jumps at the times; `simulate` ends a step at each of them.
+    jumps at each of the `times`; `simulate` therefore ends a step there.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -131,12 +131,12 @@ class SpeedProfile(IdealDrive):
         return jnp.clip(t - self.times[:-1], 0.0, lengths), jnp.diff(self.speeds) / lengths
 
     def speed_at(self, t: Array) -> Array:
-        """Return the speed on the line between the two nearest points."""
+        """Return the speed by linear interpolation between the points."""
         elapsed, acceleration = self._elapsed(t)
         return self.speeds[0] + jnp.sum(acceleration * elapsed)
 
     def angle_at(self, t: Array) -> Array:
-        """Return the sum of v T + a T^2 / 2 over the segments, and the angle before the first and after the last time."""
+        """Return the angle: the sum of v T + a T^2 / 2 over the segments, plus the angles before and after them."""
         elapsed, acceleration = self._elapsed(t)
         within = jnp.sum(elapsed * (self.speeds[:-1] + 0.5 * acceleration * elapsed))
         before, after = jnp.minimum(t, self.times[0]), jnp.maximum(t - self.times[-1], 0.0)
@@ -163,8 +163,8 @@ class Converter(MotorWrapper):
 
         T(t, theta') = T_motor(theta' + n_motor - n(t))
 
-    n_motor is the motor's own no-load speed (`motor.speed`). With the converter, the torque is the same function of
-    theta' - n(t) as it is of theta' - n_motor without it. This is exact for a `DCMotor` whose voltage is changed, and for
+    n_motor is the motor's own no-load speed (`motor.speed`). The converter shifts the torque curve of the motor along the speed
+    axis, so that the torque is 0 at the speed n(t). This is exact for a `DCMotor` whose voltage is changed, and for
     Kloss's formula at constant flux (voltage in proportion to the frequency).
 
     **Arguments**

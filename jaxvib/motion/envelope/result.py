@@ -51,15 +51,16 @@ class EnvelopeStatus(eqx.Enumeration):
 
 
 class Envelopes(eqx.Module):
-    """Averaged motion at some times. All masses that turn count as loads: loads, and rotors with an unbalance but no loads.
+    """Averaged motion at some times; the rotor of an exciter without loads counts as one load.
 
     **Attributes** (nt times, nd coordinates, nb directions of the force)
 
     - `time` (nt,), s
-    - `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s: complex amplitudes at the loads' mean angle. If exciters turn at
-      different speeds, the amplitudes beat
+    - `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s: complex amplitudes Y of q = Re(Y exp(i theta)), with the mean
+      angle theta of the loads. If exciters turn at different speeds, the amplitudes beat
     - `amplitude` (nt, nd), m, and `foundation_force` (nt, nb), N, zero to peak
-    - `omega` (nt,): mean speed of the loads in their directions, and `load_speed` (nt, count), anticlockwise, rad/s
+    - `omega` (nt,): mean speed of the loads, each positive in the direction of its exciter, and `load_speed` (nt, count) of
+      each load, positive anticlockwise, rad/s
     - `phase` (nt, count) of each load relative to the mean angle, rad, in its direction of rotation
     - `rotor_speeds`: an array (nt,) for each exciter, anticlockwise, rad/s; `rotor_speed` is that of the only one
     - `ripple` (nt, count), rad, see `Envelope`
@@ -173,13 +174,13 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot amplitudes, load and rotor speeds, and the amplitude of the foundation force over time.
 
-        **Arguments**: `unit` and `ax` as `Run.plot`.
+        **Arguments**: `unit` and `ax`, as in `Run.plot`.
         """
         return plot_histories(self, unit=unit, ax=ax)
 
 
 def _split(scene: Scene, speeds: Array) -> list[Array]:
-    """Divide the speeds (nt, masses) of all masses that turn into an array for each exciter."""
+    """Return the load speeds (nt, count) of each exciter from those of all exciters in one array."""
     counts = [1 if each.loads is None else each.loads.count for each in scene.exciters]
     return jnp.split(speeds, np.cumsum(counts)[:-1], axis=1)
 

@@ -76,9 +76,9 @@ def work_precision(
 
     - "amplitude" and "foundation_force" of a jam mode, if exact jams of the scene can be computed. The tiers are leading order,
       exact orbit, averaged equations and full equations; the last two are integrated from the leading-order motion. The
-      reference is the exact orbit with 32 points; its error is the difference to 24 points. For other scenes (run-ups,
-      imbalance, loads at different stations), the quantity is measured at the end of a run from rest. The reference is then the
-      full equations with a tolerance of 1e-13; its error is the difference to 1e-11
+      reference is the exact orbit with 32 points; its error is the difference from the orbit with 24 points. For other scenes
+      (run-ups, imbalance, loads at different stations), the quantity is measured at the end of a run from rest. The reference
+      is then the full equations with a tolerance of 1e-13; its error is the difference from a run with a tolerance of 1e-11
     - "final_state": the state of the full equations at `until`, from rest, by every solver, in double and in single precision.
       The reference is a run with a tolerance of 1e-13, with the estimated error of this run
     - "gradient" of the largest amplitude of the jam with respect to the stiffnesses of the machine: implicit derivatives of
@@ -93,9 +93,9 @@ def work_precision(
     - `quantity`: one of `QUANTITIES`, the names above
     - `mode`: a jam mode; default: the second-highest mode that is stable by slope, or the only one (in the highest mode the
       loads turn almost with the rotor)
-    - `until`: end of the runs, s or text; default: 20 times the longest natural period of the carrier. For a jam, the time is
-      added in which deviations of the start decay to the tolerance of the run, according to the largest Floquet multiplier, up
-      to a total of 2000 times this period
+    - `until`: end of the runs, s or text; default: 20 times the longest natural period of the carrier. For a jam, the runs are
+      longer: deviations of the start must decay to the tolerance of the run. The largest Floquet multiplier gives the
+      additional time; the total is at most 2000 times this period
     - `tolerances` of time integration, at least one; typical: 1e-3 to 1e-11 (the default)
     - `solvers`: names of methods from `SOLVERS`
     - `repeats`: number of timings of each method, fewer if a call takes seconds; the shortest time is reported; typical: 3 (the
@@ -124,7 +124,7 @@ def work_precision(
         raise InputError("tolerances", f"are {quoted(tuple(tolerances))}; name one at least, such as 1e-6")
     count(repeats, "repeats")
     if scene.drive.speed.dtype.itemsize < 8:
-        problem = "is in single precision; errors are measured against double: switch JAX to float64 before it is made"
+        problem = "is in single precision; errors need double precision: switch JAX to float64 before you build the scene"
         raise InputError("scene", problem)
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
     request = _Request(scene, tuple(tolerances), tuple(solvers), repeats, progress)
@@ -192,7 +192,7 @@ def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) 
             rows.append(leading(_single(scene), "float32"))
     else:
         start = State(*jam.fine.at(jnp.zeros(())))
-        left_out.append(f"leading order: {light.message}; runs start on the exact motion in place of it")
+        left_out.append(f"leading order: {light.message}; runs start from the exact jam instead")
     for few in _ORBIT_POINTS:
         points = collocation_points(scene, few)
         call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points)), scene)
@@ -220,8 +220,8 @@ def _at_the_end(request: _Request, quantity: str, end: float | None, reason: str
 
     @functools.cache
     def reference(tolerance: float = 1e-13) -> np.ndarray:
-        """Return the reference value. It is computed when it is first used, after the timing of the first row; otherwise the
-        compilation of its program would be missing in the times of that row."""
+        """Return the reference value. It is computed when it is first used, after the timing of the first row. If it were
+        computed earlier, the program of the first row would already be compiled, and its compile time could not be measured."""
         run = simulate(request.scene, end, save="window", stepsize_controller=Tolerance(tolerance), estimate=False)
         return np.ravel(np.asarray(read(run), float))
 
