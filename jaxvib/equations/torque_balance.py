@@ -2,7 +2,8 @@
 
 The angle of rotating mass k in the fixed frame is th_k = sigma_k (Omega t + alpha_k), with sigma_k = +1 anticlockwise, -1
 clockwise, and e_k = (1, -i sigma_k). The displacement of its point is B_k q, S_k is its unbalance, and L_k its driving
-torque: that of the drag on a load, T(Omega) of the motor of an unbalance. With D(w) = K - w^2 M + i w (C + n G),
+torque: that of the drag on a load, T(Omega) of the motor of an unbalance. With D(w) = K - w^2 M + i w (C + n G), where n is the
+rotor speed,
 
     H_ik = e_i^H B_i D(Omega)^-1 B_k^T e_k
     V_i = (Omega^4/2) sum_k S_i S_k Im(exp(i (alpha_k - alpha_i)) H_ik)
@@ -121,7 +122,7 @@ class TorqueBalance(eqx.Module):
 
     @property
     def torque_scale(self) -> Array:
-        """Size of the driving torques, (count,) N m: D n of a load, the `motor_torque` of an unbalance."""
+        """Size of the driving torques, (count,) N m: b_W R^2 n of a load, the `motor_torque` of an unbalance."""
         return self.drag * self.speed + self.motor_torque
 
 
@@ -150,8 +151,8 @@ class UnbalancedModel(ExcitedModel):
 
     **Attributes**, in addition to those of `ExcitedModel`: the `balance` of torques; `turn` (count,), the complex numbers
     exp(i alpha_k); `resultant` (np,) kg m, complex: sum_k S_k exp(i alpha_k) e_k, the force per Omega^2 in each direction;
-    `shaft`: the balance of one mass in place of all masses, which turn as one because their phases are fixed. Here `unbalance`
-    is 1 and `force_direction` is f.
+    `shaft`: the balance of one mass in place of all masses, which turn as one because their phases are fixed. The
+    `unbalance` of this model is 1, and its `force_direction` is f.
     """
 
     balance: TorqueBalance
@@ -171,14 +172,14 @@ class UnbalancedModel(ExcitedModel):
         return float(np.mean(self.balance.averaged.directions))
 
     def peak_matrices(self) -> tuple[Array, Array, Array]:
-        """Return M - i G, C and K, whose poles are those of the response to unbalances."""
+        """Return M - i s G, C and K, whose poles are those of the response to unbalances; s: mean direction of rotation."""
         gyroscopic, carrier = self.mounts[0].gyroscopic, self.carrier
         mass = self.mass if gyroscopic is None else self.mass - 1j * self._sense * gyroscopic
         return mass, carrier.damping, carrier.stiffness
 
     @property
     def highest_speed(self) -> Array | None:
-        """No-load speed, up to a small distance; None if an ideal drive turns an unbalance."""
+        """Speed just below the no-load speed; None if an ideal drive turns an unbalance."""
         if any(self.balance.is_prescribed):
             return None
         return self.shaft.speed * (1.0 - float(jnp.finfo(self.mass.dtype).eps) ** 0.5)
@@ -286,9 +287,9 @@ def _on_one_shaft(balance: TorqueBalance, force: Array) -> TorqueBalance:
 
 
 def _mount_of_force(force: Array, direction: int, mount: Mount) -> Mount:
-    """Return a mount on which an unbalance of 1 kg m causes the `force` (nd,) D per w^2.
+    """Return a mount on which an unbalance of 1 kg m causes the generalized force w^2 f, with f = `force` (nd,).
 
-    Its point moves by P q with P^T e = D: P = (Re D, -Im D) for the direction e = (1, -i).
+    The displacement of its point is B q with B^T e = f: B = (Re f, -Im f) for the direction e = (1, -i).
     """
     rows = jnp.stack([force.real, -direction * force.imag])
     return Mount(rows=(rows,), axes=(0, 1), gyroscopic=mount.gyroscopic, turn=mount.turn)
@@ -303,7 +304,7 @@ def _imbalances(exciter: Exciter, *, about_tilts: bool) -> list[Array]:
 def with_imbalances(model: LinearModel) -> LinearModel:
     """Return the model with one equivalent unbalance in place of the unbalance and the imbalances of each rotor.
 
-    The force per w^2 on the coordinates is D = S B^T e + those of the imbalances.
+    The force per w^2 on the coordinates is S B^T e + those of the imbalances.
     """
     if not has_term(model.scene.all_effects, RotorImbalance):
         return model
@@ -324,7 +325,8 @@ def with_imbalances(model: LinearModel) -> LinearModel:
 def resultant_of(model: LinearModel, turn: Array) -> Array:
     """Return the resultant of the centrifugal forces per w^2, (np,) kg m complex: sum_j S_j exp(i alpha_j) e_j.
 
-    `turn` (mass,): exp(i alpha) of the unbalance, with the static imbalance of the rotor, or of the loads of each exciter. The
+    `turn` (count,): exp(i alpha) of each load, or of the unbalance of an exciter without loads, which includes the static
+    imbalance of its rotor. The
     result is NaN for loads that do not move on a circle.
     """
     found, first = jnp.zeros((), turn.dtype), 0
@@ -376,7 +378,7 @@ def balance_of_group(balance: TorqueBalance, masses: tuple[int, ...]) -> TorqueB
 
 
 def owners_of(counts: Sequence[int]) -> np.ndarray:
-    """Return the exciter of each rotating mass from the numbers of loads of the exciters, 0 for an unbalance."""
+    """Return the exciter of each rotating mass from `counts`: number of loads of each exciter, 0 for one with an unbalance."""
     return np.repeat(np.arange(len(counts)), [max(count, 1) for count in counts])
 
 
@@ -402,7 +404,7 @@ def influence_of(balance: TorqueBalance, omega: Array) -> Array:
 
 
 def response_of(balance: TorqueBalance, omega: Array) -> Array:
-    """Return the response of the carrier per force of each mass, D^-1 P^T (nd, count), complex, m/N."""
+    """Return the response of the carrier per force of each mass, D^-1 B_k^T e_k (nd, count), complex, m/N."""
     dynamic = balance.dynamic_stiffness(omega)
     return small_solve(dynamic, balance.direction.T.astype(dynamic.dtype))
 

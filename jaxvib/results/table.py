@@ -1,4 +1,4 @@
-"""Tables of numbers in text files: CSV, or columns between semicolons, tabs or blanks."""
+"""Tables of numbers in text files: CSV, or columns separated by semicolons, tabs or blanks."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class TextTable(NamedTuple):
         return np.array([self._row(k, text, places, names, missing) for k, text in self._rows()])
 
     def line(self, row: int) -> int:
-        """Return the number of the line in the file of a row of numbers, from 0."""
+        """Return the line number in the file, counted from 1, of the row of numbers with the index `row`, counted from 0."""
         return next(itertools.islice(self._rows(), row, None))[0]
 
     def _rows(self) -> Iterator[tuple[int, str]]:
@@ -98,9 +98,9 @@ class TextTable(NamedTuple):
 def read_table(path: str | Path, needs: str) -> TextTable:
     """Read the head of a table of text.
 
-    - Lines that begin with # and empty lines are skipped, and so are lines above the line of names if it is directly above the
-      numbers
-    - Between semicolons, tabs or blanks numbers may have a decimal comma
+    - Lines that begin with # and empty lines are skipped
+    - Lines above the line of names are skipped if only a line of units, or no line, is between the names and the numbers
+    - Numbers may have a decimal comma if columns are separated by semicolons, tabs or blanks
 
     **Arguments**: `path` of the file; `needs`: the expected columns, for messages.
 
@@ -181,7 +181,7 @@ def _content(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _lines(path: Path, most: int | None = None) -> Iterator[tuple[int, str]]:
-    """Yield the number, from 1, and the text of each line without surrounding blanks, at most `most`."""
+    """Yield the number, from 1, and the text of each line without surrounding blanks, for at most `most` lines."""
     try:
         with open_regular(path) as file:
             if file.seek(0, io.SEEK_END) > _MAX_BYTES:

@@ -154,7 +154,8 @@ def sweep(
     - Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask
     - A finished chunk is written at once and is not lost if the process is terminated; a chunk with damaged files is computed
       again
-    - The results of a case do not depend on other cases, on their order, on the number of workers, or on restarts
+    - The results of a case do not depend on the order of the cases, on the number of workers, or on restarts. The steps of runs
+      are planned for all cases of the study together
 
     **Arguments**
 

@@ -21,20 +21,29 @@ if TYPE_CHECKING:
 
 @app.command("capture")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--from", "low", type=float, default=-1.0, show_default=True, help="Lowest initial speed, relative to the rotor.")
-@click.option("--to", "high", type=float, default=0.0, show_default=True, help="Highest initial speed, relative to the rotor.")
+@click.option(
+    "--from",
+    "low",
+    type=float,
+    default=-1.0,
+    show_default=True,
+    help="Lowest initial speed relative to the rotor, divided by the rotor speed.",
+)
+@click.option("--to", "high", type=float, default=0.0, show_default=True, help="Highest initial speed, like --from.")
 @click.option("--speeds", type=click.IntRange(min=2), default=32, show_default=True, help="Number of initial speeds.")
 @click.option(
     "--starts",
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
-    help="Number of perturbed initial states at each speed.",
+    help="Number of initial states at each speed; all but the first are perturbed.",
 )
 @click.option(
     "--turns", type=click.IntRange(min=1), default=2000, show_default=True, help="Duration of each run, in turns of the rotor."
 )
-@click.option("--resolution", type=float, help="Resolution of the threshold, relative to the rotor [spacing of the speeds].")
+@click.option(
+    "--resolution", type=float, help="Resolution of the threshold, divided by the rotor speed [spacing of the speeds]."
+)
 @click.option(
     "--rotation",
     type=click.Choice(["rolling", "none"]),

@@ -37,7 +37,7 @@ class Trajectory(eqx.Module):
     - `time` (nt,), s
     - `state`: a `State` whose arrays have a leading axis over the times
     - `foundation_force` (nt, nb), N: force of the supports on the foundation in its nb directions
-    - `rotor_angles`, rad, without whole turns, and `rotor_speeds`, rad/s: an array (nt,) for each exciter. If there is only one
+    - `rotor_angles`, rad, continuous over whole turns, and `rotor_speeds`, rad/s: an array (nt,) for each exciter. If there is only one
       exciter, `rotor_angle` and `rotor_speed` are its arrays
     """
 
@@ -49,7 +49,7 @@ class Trajectory(eqx.Module):
 
     @property
     def rotor_angle(self) -> Array:
-        """Angle of the rotor of a scene with one exciter, rad, without whole turns. **Raises** `InputError` for several."""
+        """Angle of the rotor of a scene with one exciter, rad, continuous over whole turns. **Raises** `InputError` for several."""
         return only_exciter_value(self.rotor_angles, "rotor_angles")
 
     @property
@@ -71,7 +71,9 @@ class AbstractMeasured(eqx.Module):
 
     **Attributes**
 
-    - `omega`, rad/s: mean speed of the loads over whole turns, and `load_speed` (count,), rad/s: the same for each load
+    - `load_speed` (count,), rad/s: mean speed of each load over whole turns, negative if it turns clockwise; for an exciter
+      without loads, that of its rotor
+    - `omega`, rad/s: mean of these speeds, each positive in the direction of rotation of its exciter
     - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, that is half of peak to peak; for a force
       with two directions the root of the sum of both squares; typical: 0.5 to 10 mm, 10 N to 10 kN
     - `drift`: the largest of three relative changes within the window
@@ -217,7 +219,7 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def _extrema(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array, Array]:
-    """Return the least and greatest values of each output, and their places, (2, 3, outputs) each, see `locate_extrema`."""
+    """Return extrema of each output, their first samples and positions, (2, 3, outputs) each, see `locate_extrema`."""
     # One output after the other fits the processor's cache.
     values_and_places = jax.lax.map(lambda pair: locate_extrema(*pair), _sampled_outputs(model, field, times, states))
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), values_and_places)
@@ -276,7 +278,7 @@ def _mean_speed(t: Array, phi: Array, rate: Array, first: Array, last: Array) ->
     i = jnp.argmin(jnp.where((k >= first) & (k <= last), jnp.abs(phi - target), jnp.inf))
     t_i, phi_i, rate_i = jnp.unstack(sample(i))
     start = t_i + (target - phi_i) / _away_from_zero(rate_i)
-    # One secant step on the cubic is accurate enough because the sample is next to the root.
+    # Secant step for a rate that is linear in time; accurate enough because the sample is next to the root.
     j = jnp.where(start > t_i, jnp.minimum(i + 1, last), jnp.maximum(i - 1, first))
     t_j, _, rate_j = jnp.unstack(sample(j))
     h = jnp.where(i == j, 1.0, t_j - t_i)

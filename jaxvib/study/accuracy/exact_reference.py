@@ -39,7 +39,7 @@ class ExactJam(NamedTuple):
 def exact_jam(scene: Scene, mode: int | None) -> ExactJam:
     """Return the exact jam of a mode (default: that of `usual_mode`).
 
-    **Raises** `InputError` for a drive whose speed is not constant, and if no mode is stable.
+    **Raises** `InputError` for a drive whose speed is not constant, and without a `mode` if no mode is stable by slope.
     """
     if not scene.drive.constant:
         raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; a jam needs a constant speed: use ConstantSpeed")

@@ -25,7 +25,7 @@ class Variant(NamedTuple):
     """Variant of the audited scene with one effect added or removed.
 
     **Attributes**: `name` of the effect; `present`: True if the audited scene has the effect; `scene`: the variant; `note`: the
-    values of an added effect.
+    values of an added effect or drive, or the drive of the comparison.
     """
 
     name: str
@@ -77,9 +77,12 @@ def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
 
 
 def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[Effect] | None) -> Iterator[Variant]:
-    """Yield variants of the scene with one effect that it lacks and could have, and with a motor if its speed is prescribed.
+    """Yield variants of the scene with one effect that it lacks and could have.
 
-    The effects are those of `given`, by default those of the package with typical values (`Effect.typical`).
+    The effects are those of `given`. If it is None, they are those of the package with typical values (`Effect.typical`), and
+    the last variant of a scene with constant rotor speed has a speed that is lower by `_DROOP`, as with a motor.
+
+    **Arguments**: `amplitude` (nd,): amplitudes of the coordinates, m or rad, for the typical values.
     """
     present = {effect.kind for effect in scene.all_effects if not effect.repeatable}
     for effect in given or ():
