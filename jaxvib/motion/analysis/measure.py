@@ -37,8 +37,8 @@ class Trajectory(eqx.Module):
     - `time` (nt,), s
     - `state`: a `State` whose arrays have a leading axis over the times
     - `foundation_force` (nt, nb), N: force of the supports on the foundation in its nb directions
-    - `rotor_angles`, rad, continuous over whole turns, and `rotor_speeds`, rad/s: an array (nt,) for each exciter. If there is only one
-      exciter, `rotor_angle` and `rotor_speed` are its arrays
+    - `rotor_angles`, rad, continuous over whole turns, and `rotor_speeds`, rad/s: an array (nt,) for each exciter. If there is
+      only one exciter, `rotor_angle` and `rotor_speed` are its arrays
     """
 
     time: Array = eqx.field(metadata=in_unit("s", "time"))
@@ -49,7 +49,7 @@ class Trajectory(eqx.Module):
 
     @property
     def rotor_angle(self) -> Array:
-        """Angle of the rotor of a scene with one exciter, rad, continuous over whole turns. **Raises** `InputError` for several."""
+        """Rotor angle of a scene with one exciter, rad, continuous over whole turns. **Raises** `InputError` for several."""
         return only_exciter_value(self.rotor_angles, "rotor_angles")
 
     @property
