@@ -150,6 +150,7 @@ class Dimensionless(eqx.Module):
         return self.mass_scale * self.frequency_scale**2 * self.length_unit
 
     def _by_platform(self, others: Array | np.ndarray, exciter: float) -> Array:
+        others = known(others)  # within `jit` even a slice of a JAX array is traced
         index = min(1, others.shape[0])
         return numpy_of(others).concatenate([others[:index], np.full(1, exciter, dtype=others.dtype), others[index:]])
 
