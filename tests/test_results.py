@@ -138,6 +138,7 @@ RESULTS = {
     "MotorRunUp": lambda: jv.run_up(SCREEN, 2.0),
     "JamModes": cached(lambda: jv.jam_modes(SCENE)),
     "Jam": lambda: RESULTS["JamModes"]().select(1),
+    "DragLimits": cached(lambda: jv.drag_limits(SCENE)),
     "Branches": lambda: jv.branches(SCENE, points=50),
     "ModeShapes": lambda: jv.mode_shapes(SCENE),
     "Spectrum": lambda: RESULTS["Run"]().spectrum(),

@@ -52,8 +52,6 @@ class DragLimits(Result):
     - `resonances`, rad/s
     """
 
-    outer_axes = ("resonance",)
-
     status: DragStatus
     factor: Array = eqx.field(metadata=in_unit("", "resonance"))
     drag: Array = eqx.field(metadata=in_unit("N s/m", "resonance"))
@@ -110,7 +108,7 @@ def drag_limits(scene: Scene, *, phases: bool = False) -> DragLimits:
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
     >>> [round(float(factor), 3) for factor in jv.drag_limits(form.scene()).factor]
-    [0.043, 1.037]
+    [0.174, 2.092]
 
     Source: the branch of the antiphase paper, equations (31), (35), solved for the drag.
     """
