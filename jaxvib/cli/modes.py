@@ -169,13 +169,13 @@ def _mode_document(jam: jv.Jam, growth: float) -> dict[str, Any]:
 
 
 def _left_out(scene: jv.Scene) -> list[str]:
-    """Return a line about the imbalances that a table of jams of light loads ignores; an empty list for a balanced rotor."""
+    """Return lines about the imbalances that a table of jams of light loads ignores; an empty list for a balanced rotor."""
     from jaxvib.machine.effects.base import has_term
     from jaxvib.machine.effects.terms import RotorImbalance
 
     named = [effect.kind.replace("_", " ") for effect in scene.all_effects if has_term([effect], RotorImbalance)]
     adds = f"the {' and '.join(named)} {'adds' if len(named) == 1 else 'add'} a vibration at the rotor speed"
-    return [f"amplitudes and forces are those of the loads only: {adds}"] if named else []
+    return ["amplitudes and forces are those of the loads only:", f"  {adds}"] if named else []
 
 
 def _print_phase_jams(scene: jv.Scene, output: Output) -> None:

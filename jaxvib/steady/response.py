@@ -178,7 +178,7 @@ class Response(AbstractResponse, Result):
             lands = float(self.folds.lands_at[k])
             jump = f", jump to {speed_text(lands)}" if np.isfinite(lands) else ""
             lines.append(
-                f"fold at {speed_text(self.folds.speed[k])}: {float(self.folds.factor[k]):.4g} times the motor's torque{jump}"
+                f"fold at {speed_text(self.folds.speed[k])}: {float(self.folds.factor[k]):.4g} times the drive torque{jump}"
             )
         return "\n".join(lines)
 

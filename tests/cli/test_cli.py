@@ -148,7 +148,7 @@ def test_modes_note_that_an_imbalance_is_left_out(typed, tmp_path):
     plain = scene("two_mass", speed=150.0)
     shaken = jv.Scene(plain.machine, plain.loads, plain.drive, (jv.StaticImbalance("5 g m"),))
     jv.save_scene(shaken, tmp_path / "shaken.toml")
-    said = "amplitudes and forces are those of the loads only: the static imbalance adds a vibration at the rotor speed"
+    said = "amplitudes and forces are those of the loads only:\n  the static imbalance adds a vibration at the rotor speed"
     assert said in typed("modes", "shaken.toml")[1]
     assert said not in typed("modes", "machine.toml")[1]
     assert said in typed("modes", "shaken.toml", "--phases")[1]

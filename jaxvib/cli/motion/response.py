@@ -145,6 +145,6 @@ def _text(
             ]
             for k in folds
         ]
-        head = [unit, "torque, N m", "times the motor's torque", f"jump to, {unit}"]
-        lines.append(table("folds: the speed jumps if the motor has this torque", head, rows))
+        head = [unit, "torque, N m", "times the drive torque", f"jump to, {unit}"]
+        lines.append(table("folds: the speed jumps if the drives have this torque", head, rows))
     return "\n".join(lines)
