@@ -85,9 +85,9 @@ def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
 def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
     """Return the design task for an anti-resonance machine of three masses: the least ratio of middle and outer amplitude.
 
-    The springs of the links are free, and the frequency of the jam keeps its value. Without damping the middle platform (2) is
-    at rest if k12/M1 = k23/M3 = w^2; the outer amplitude is the amplitude of the displacement of platform 1 relative to
-    platform 3.
+    The springs of the links are free, and the frequency of the jam keeps its value. If the outer platforms stand on no supports
+    and nothing is damped, the middle platform (2) is at rest for k12/M1 = k23/M3 = w^2. The outer amplitude is the amplitude of
+    the displacement of platform 1 relative to platform 3.
 
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
 

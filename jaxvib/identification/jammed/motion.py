@@ -34,7 +34,7 @@ from jaxvib.runtime.programs import cached
 
 
 class _Turned(IdealDrive):
-    """Prescribed `drive` whose angle is larger by `phase`, rad; from the time `end` on the rotor stands still."""
+    """Prescribed `drive` whose angle is larger by `phase`, rad; after the time `end`, angle and speed are constant."""
 
     drive: Drive
     phase: Array

@@ -144,8 +144,8 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
 
     - `scene` as for `envelope`, with at least one motor
     - `until`, s or text: end of the run; an exciter that has not passed by then is regarded as caught; typical: 5 to 60
-    - `least`: True to search for `least_torque` by bisection, in about 16 runs, to 1 %. The search assumes that a motor that
-      passes also passes with more torque
+    - `least`: True to search for `least_torque` by bisection, in about 16 runs, to 1 %, between 1/64 and 64 times the torque.
+      The search assumes that a motor that passes also passes with more torque
 
     The peaks of several exciters depend on the angles between them when they reach the resonance. The starting angles and the
     weight of the unbalances, which averaging omits, determine these angles. Peaks are therefore the largest ones of runs with

@@ -253,8 +253,8 @@ class BranchTangent(NamedTuple):
 def branch_tangent(model: JammedBodies, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
     """Return the tangent of the branch at a periodic motion, and the error of the motion.
 
-    The error is estimated as the change in one Newton step with the residuals at twice as many points; for the deviation the
-    highest harmonic of psi is added.
+    The error is estimated as the change in one Newton step with the residuals at twice as many points. The error of the
+    deviation is the amplitude of the highest harmonic of psi, if this is larger.
     """
     deviation, omega, speed = motion
     # The orders of the fine grid are those of `grid`, followed by higher orders.

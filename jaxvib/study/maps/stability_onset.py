@@ -117,7 +117,10 @@ def stability_onset(
     points: int = 300,
     accuracy: float = 1e-3,
 ) -> float:
-    """Return the smallest x at which the exact diagram of `make(x)` has a special point of a kind, by bisection in log x.
+    """Return the x from which the exact diagram of `make(x)` has a special point of a kind, by bisection in log x.
+
+    The bisection finds one change from diagrams without such a point to diagrams with one; it is the smallest x if the point
+    exists for all larger x.
 
     Odd jam modes of light loads are stable on their whole range. This function finds, for example, the load mass above which a
     torus bifurcation ends the stable range before the fold, or above which the half-turn symmetry breaks.
