@@ -145,5 +145,5 @@ def test_invalid_arguments_raise_clear_errors(asked, message):
 
 def test_single_precision_raises_a_clear_error():
     scene = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), light())
-    with pytest.raises(jv.InputError, match="scene is in single precision; errors are measured against double"):
+    with pytest.raises(jv.InputError, match="scene is in single precision; errors need double precision"):
         jv.work_precision(scene)
