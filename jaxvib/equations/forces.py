@@ -182,8 +182,8 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     """Return the power input by the rotor, and the power that dampers, drag and friction dissipate, W.
 
         P_in = speed T,    T = sum_j M_j + d'(theta).P q'' + S g cos(theta)  (ideal drive),    the motor's torque otherwise
-        P_diss = q'.C q' + sum_j M_j (speed - phi_j') + power of supports and contacts
-        M_j = b_W R^2 (speed - phi_j') + friction + resistance of effects
+        P_diss = q'.C q' + sum_j M_j (speed - phi_j') + power of supports, contacts and effects
+        M_j = b_W R^2 (speed - phi_j') + friction
 
     T is the torque with which an ideal drive turns its rotor against the loads, the unbalance S with its imbalances (d, see
     `energy`) and the weight of the unbalance. `speed` is the speed of the rotor, in P_in relative to a housing that turns with
