@@ -143,7 +143,8 @@ def test_use_of_the_package_is_no_replacement():
         inspect.getdoc(owner)
         with contextlib.suppress(ValueError):
             inspect.signature(owner)
-        copyreg._slotnames(owner)  # by copy and pickle
+        if not getattr(owner, "_is_protocol", False):  # it has no instances, and `isinstance` would require the new attribute
+            copyreg._slotnames(owner)  # by copy and pickle
     assert code_changes.code_state(look=True).is_on_disk
 
 
