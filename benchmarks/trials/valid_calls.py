@@ -276,7 +276,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     csv = later(_csv)
     yield call("read_record", path=csv, columns=("time (s)", "angle (rad)"), angle_unit="rad")
     yield call("ten_periods", pendulum=p, record=rec, periods=4, instrument=0.0, turns=None)
-    yield call("identify", pendulum=p, record=rec, dry=False, air=False, torque=False, instrument=0.0, throw=False)
+    yield call("identify", subject=p, records=rec, dry=False, air=False, torque=False, instrument=0.0, throw=False)
     # Capture
     torus = dict(turns=2, starts=1, spread=1e-3, seed=0, resolution=None, rotation="rolling")
     fewer = dict(stepsize_controller=later(lambda: jv.EqualSteps(100)), equations=jv.vector_field)
