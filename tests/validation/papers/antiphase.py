@@ -97,7 +97,9 @@ def _platform_2_again(own: int) -> float:
 
 _number = partial(PrintedNumber, "antiphase")
 _formula = partial(PrintedNumber, "antiphase", within=1e-9, note=_SETTING)
-_three_loads = partial(_number, printed=3.0, within=1e-6, note="three loads, each with three times the drag; mode 3 at n = 3")
+_three_loads = partial(
+    _number, printed=3.0, within=1e-6, note="three loads, each with three times the drag of the single load; mode 3 at n = 3"
+)
 
 NUMBERS = (
     _number("5.3, after (40)", "resonance 1", 0.3333, lambda: _resonance(0), within=5e-5),

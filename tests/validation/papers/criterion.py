@@ -154,13 +154,13 @@ NUMBERS = (
     ),
     _two(
         "after (38)",
-        "f(0)",
+        "first factor of f(0)",
         lambda: _static()[2] * _static()[0],
         lambda: math.prod(_two_speeds()) ** 2,
         misprint=Misprint(
             "n1^2 n2^2 + (n1^2 + rho n12^2) n12^2",
             "n1^2 n2^2 + n12^2 (n1^2 + rho n2^2), as in (34)",
-            "q1^2 q2^2 q~^2 of the machine",
+            "f(0) = q1^2 q2^2 q~^2 of the machine, divided by the other factor n1^2 + rho n12^2",
             lambda: _static()[1] * _static()[0],
         ),
     ),
