@@ -85,9 +85,10 @@ def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
 def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
     """Return the design task for an anti-resonance machine of three masses: the least ratio of middle and outer amplitude.
 
-    The springs of the links are free, and the frequency of the jam keeps its value. If the outer platforms stand on no supports
-    and nothing is damped, the middle platform (2) is at rest for k12/M1 = k23/M3 = w^2. The outer amplitude is the amplitude of
-    the displacement of platform 1 relative to platform 3.
+    The springs of the links are free, and the frequency of the jam keeps its value. The outer amplitude is the amplitude of the
+    displacement of platform 1 relative to platform 3. Without damping and without a link 1-3, a natural mode of the frequency w
+    leaves the middle platform (2) at rest if (k1 + k12)/M1 = (k3 + k23)/M3 = w^2, with the stiffnesses k1 and k3 of the
+    supports.
 
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
 
@@ -140,12 +141,14 @@ def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[
 
 
 def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[int, int] | None = None) -> Design:
-    """Return the design task for springs with which a jam mode exists over the widest range of rotor speeds.
+    """Return the design task for springs with which the rotor speed is farthest from the folds of a jam mode.
 
-    The range includes the present rotor speed. The objective is the distance of the rotor speed from the nearer fold, above or
-    below. The amplitude must be at least `keep` times the present amplitude.
+    The jam mode then exists over a wide range of rotor speeds on both sides of the present one. The objective, to be maximized,
+    is the distance of the rotor speed from the nearer fold, above or below. The amplitude must be at least `keep` times the
+    present amplitude.
 
-    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` if `keep` is not between 0 and 1.
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` if `keep` is not greater than 0 and
+    at most 1.
     """
     count(mode, "mode")
     if not 0.0 < keep <= 1.0:
@@ -166,8 +169,8 @@ def linear_screen(
 ) -> Design:
     """Return the design task for a linear screen: all points of the deck have the same motion, along a line of given angle.
 
-    The objective is the spread of the motions over the deck (`motion_spread`). The mean of the `points` keeps the throw angle
-    and the stroke. The positions of the exciters and their unbalances are free; the unbalances keep their ratios.
+    The objective is the spread of the motions over the deck (`motion_spread`). The motion of the mean of the `points` has the
+    given throw angle and stroke. The positions of the exciters and their unbalances are free; the unbalances keep their ratios.
 
     **Arguments**
 
@@ -196,9 +199,9 @@ def circular_screen(
 ) -> Design:
     """Return the design task for a circular screen: all points of the deck have the same motion, on a circle.
 
-    The objective is the spread of the motions over the deck (`motion_spread`). The mean of the `points` keeps its stroke, and
-    its roundness must be at least 0.9. The positions of the exciters and their unbalances are free; the unbalances keep their
-    ratios.
+    The objective is the spread of the motions over the deck (`motion_spread`). The motion of the mean of the `points` has the
+    given stroke, and its roundness must be at least 0.9. The positions of the exciters and their unbalances are free; the
+    unbalances keep their ratios.
 
     **Arguments**: `scene`: a body in a plane, typical: with one exciter; `points`, `stroke`, `reach` as for `linear_screen`.
 
@@ -223,8 +226,8 @@ def feeder(
     """Return the design task for a feeder: least foundation force per amplitude of the trough, for a given throw angle and
     stroke.
 
-    The mean of the `points` keeps the throw angle and the stroke. The positions of the exciters, their unbalances and the
-    stiffness of the supports are free; the unbalances keep their ratios.
+    The motion of the mean of the `points` has the given throw angle and stroke. The positions of the exciters, their unbalances
+    and the stiffness of the supports are free; the unbalances keep their ratios.
 
     **Arguments**
 

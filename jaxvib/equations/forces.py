@@ -1,4 +1,11 @@
-"""Forces, energy and power of a state."""
+"""Forces, energy and power of a state.
+
+Symbols: q are the coordinates of the carrier, M, C and K its mass, damping and stiffness matrices. P maps q to the displacement
+of the axis of the rotor, and B_j to that of the point that carries load j. theta is the angle of the rotor. Load j has the mass
+m_j, the coordinates u_j (the angle phi_j for a load on a circle of radius R), the position p_j(u_j) relative to its point, and
+the inertia factor kappa_j (7/5 for balls). b_W is the drag. The prime of d(theta) is d/dtheta; all other primes are time
+derivatives.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +43,12 @@ from jaxvib.units import Number, numbers
 
 @validated
 def foundation_force(scene: Scene, state: State) -> Array:
-    """Return the force of all supports on the foundation, gravity excluded, N: R = sum_i (k_i y_i + b_i y_i').
+    """Return the force of all supports on the foundation, gravity excluded, N.
+
+        F = sum_i (k_i y_i + b_i y_i')
+
+    y_i is the displacement of the machine at support i, k_i and b_i are its stiffness and damping: numbers for platforms, 2 x 2
+    matrices for other machines.
 
     **Arguments**
 
@@ -61,7 +73,9 @@ def foundation_force(scene: Scene, state: State) -> Array:
 def foundation_moment(scene: Scene, state: State, about: Sequence[Number] = (0.0, 0.0)) -> Array:
     """Return the moment of all supports on the foundation about a fixed point, gravity excluded, N m, anticlockwise.
 
-        M = sum_i (r_i - p) x (k_i u_i + c_i u_i')
+        sum_i (r_i - p) x (k_i y_i + b_i y_i')
+
+    r_i is the position of support i at rest; y_i, k_i and b_i as in `foundation_force`.
 
     **Arguments**
 
@@ -96,7 +110,7 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
             + sum_j [ (kappa_j - 1) m_j (|c_j|^2/2 - p_j'.c_j) + I_j s_j^2/2 ]
 
     - V_j and V are the potentials of the effects on the loads and on the supports
-    - d is the unbalance S of the rotor, with its imbalances
+    - d(theta) is the vector of the unbalance S of the rotor and of its other imbalances
     - J_r is the inertia of a motor's rotor (an ideal drive has none); g is the gravity in the plane of the rotor
     - the terms of the loads and of the rotor are added over all exciters
     - c is the sliding velocity of a load's contact point and s its spin about the contact normal; each is 0 unless an effect
@@ -182,14 +196,19 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     """Return the power input by the rotor, and the power that dampers, drag and friction dissipate, W.
 
         P_in = speed T,    T = sum_j M_j + d'(theta).P q'' + S g cos(theta)  (ideal drive),    the motor's torque otherwise
-        P_diss = q'.C q' + sum_j M_j (speed - phi_j') + power of supports, contacts and effects
+        P_diss = q'.C q' + sum_j M_j (speed - phi_j') + power of effects
         M_j = b_W R^2 (speed - phi_j') + friction
 
-    T is the torque with which an ideal drive turns its rotor against the loads, the unbalance S with its imbalances (d, see
-    `energy`) and the weight of the unbalance. `speed` is the speed of the rotor, in P_in relative to a housing that turns with
-    the machine. The drive also supplies the power that the spin of the loads needs. Loads that slide dissipate in addition the
-    power -F_t.c of the contact force F_t at the sliding velocity c. The powers of all exciters are added. The rate of the
-    energy is the difference, dE/dt = P_in - P_diss.
+    - M_j is the torque of the rotor on load j; `friction` is the torque of contact friction
+    - T is the torque with which an ideal drive turns its rotor against the loads, the unbalance S with the other imbalances (d,
+      see `energy`) and the weight of the unbalance; g is the gravity in the plane of the rotor
+    - `speed` is the speed of the rotor. If the housing of the drive turns with the machine, the speed in P_in is that of the
+      rotor relative to the housing
+    - the effects that dissipate power are those on supports, contacts between loads, and resistances to the motion of the loads
+    - loads that slide also dissipate the power -F_t.c of the contact force F_t at the sliding velocity c, and P_in includes the
+      power that the spin of the loads needs
+
+    The powers of all exciters are added. The rate of the energy is the difference, dE/dt = P_in - P_diss.
 
     **Arguments**
 
@@ -334,11 +353,11 @@ def _spin_power(
 def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
     """Return the force N with which each load presses on its track, (count,) N; negative if the track would have to pull.
 
-        N = m (centrifugal acceleration of u' - n . (a + g e)),    see `Loads.normal_force`
+        N = m (z - n . (a + g e)),      z = R phi'^2 for a load on a circle,      see `Loads.normal_force`
 
-    n is the direction in which the load presses, a the acceleration of the point that carries the load, g that of gravity, and
-    e the unit vector against gravity. If N is negative, the equations keep the load on its track, and friction that is
-    proportional to N is 0.
+    z is the centrifugal acceleration of the motion of the load relative to the point that carries it, a the acceleration of
+    this point, n the direction in which the load presses, g the acceleration of gravity, and e the unit vector against gravity.
+    If N is negative, the equations keep the load on its track, and friction that is proportional to N is 0.
 
     **Arguments**
 
@@ -379,7 +398,8 @@ def _normal_force(scene: Scene, t: Array, state: State) -> Array:
 
 
 def _imbalance_rate(exciter: Exciter, mount: Mount, turn: Array) -> Array:
-    """Return d'(theta).P (nd,) of the rotor's imbalance: its momentum in the carrier's coordinates per rotor speed."""
+    """Return d'(theta).P (nd,) of the rotor's imbalance: the momentum along the coordinates of the carrier that it has per unit
+    of the rotor speed."""
     static, moment = mount.rotor_rows(), mount.tilt
     row = jnp.zeros_like(static[0])
     for term in terms_of(exciter.effects, RotorImbalance):

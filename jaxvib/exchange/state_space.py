@@ -78,7 +78,7 @@ class StateSpace(NamedTuple):
 
     @validated
     def frequency_response(self, omega: Numbers) -> np.ndarray:
-        """Return the frequency responses C (i w - A)^-1 B + D, complex amplitude of each output per amplitude of each input.
+        """Return the frequency responses C (i w I - A)^-1 B + D: complex amplitude of each output per amplitude of each input.
 
         **Arguments**: `omega`: frequencies w, rad/s or text.
 
@@ -134,12 +134,16 @@ def state_space(
 ) -> StateSpace:
     """Return the state-space model of a scene's machine, at rest or in a jam.
 
-    At rest, M includes the masses of the loads, and stiffness K and damping B include the linear parts of nonlinear supports:
+    At rest the model is
 
-        M q'' + (B + n G) q' + K q = f + P^T f_e,      x = (q, q'),  u = (f, f_e),  y = (q, q', q'', T_K q + T_B q')
+        M q'' + (R + n G) q' + K q = f + P^T f_e,      x = (q, q'),  u = (f, f_e),  y = (q, q', q'', F_K q + F_R q')
 
-    q are the coordinates, G is the gyroscopic matrix, f are forces on the coordinates, f_e forces at the exciters, and the last
-    output is the force on the foundation.
+    - q are the coordinates, f forces on the coordinates and f_e forces at the exciters; P maps q to the displacements of the
+      exciters
+    - the mass matrix M includes the masses of the loads; the stiffness matrix K and the damping matrix R include the linear
+      parts of nonlinear supports; G is the gyroscopic matrix
+    - the last output is the force on the foundation; F_K and F_R contain stiffness and damping of the supports on the
+      foundation
 
     In a jam, the model is the linearization of the averaged equations (`envelope`) about the jam:
 
@@ -151,7 +155,8 @@ def state_space(
 
     **Arguments**
 
-    - `scene`; a model at rest depends only on its machine, loads and nonlinear supports, and may have several exciters
+    - `scene`; a model at rest depends only on its machine, loads, nonlinear supports and rotor speed, and may have
+      several exciters
     - `at`: "rest" (the default), or a jam from `jam_modes(scene).select(mode)` or `phase_jams(scene)`
     - `rotor_speed` n, rad/s, for a machine at rest with a gyroscopic matrix (default: the mean speed of the drives); typical:
       0 to 500

@@ -1,6 +1,8 @@
 """Many small quadratic programs at once, by a primal-dual interior-point method.
 
-Sizes of arrays: s problems, d unknowns, me equalities, mi inequalities; n unknowns and m inequalities with slacks.
+Sizes of arrays: s problems with d unknowns, me equalities and mi inequalities. Each constraint gets one more unknown, its
+violation. The interior-point method solves these programs of n = d + me + mi unknowns with m = 3 me + 2 mi + 2 d inequalities.
+A slack is the distance of an inequality from its limit, and a dual the multiplier of an inequality.
 """
 
 from __future__ import annotations
@@ -64,7 +66,7 @@ def solve_penalized(
     me, mi, d = a.shape[1], c.shape[1], slope.shape[1]
     program = _with_slacks(hessian, slope, held, demands, box, penalty)
     # Start in the middle of the box with equal products of slacks and duals. `constraint_values` are the values of the
-    # constraints there, `first_violation` is the first value of all violations.
+    # constraints there. All violations have the initial value `first_violation`.
     p = (low + high) / 2.0
     constraint_values = np.concatenate([_times(a_rows, p) + a, _times(c_rows, p) + c], axis=1)
     first_violation = 1.0 + 2.0 * np.max(np.abs(constraint_values), axis=1, initial=0.0)
@@ -145,7 +147,7 @@ def _interior_point(program: _Program, x: np.ndarray, slack: np.ndarray, dual: n
             break
         dx, ds, dl = _predicted_and_corrected(program, stationary, primal, gap, slack, dual)
         keep = np.where(done, 0.0, 0.995)
-        # One step length for x and the duals, because the equation of the duals contains the quadratic term.
+        # One step length for x and the duals, because the stationarity condition contains both: Q x + q + rows^T dual = 0.
         length = keep * np.minimum(_longest(slack, ds), _longest(dual, dl))
         x = x + length[:, None] * dx
         slack = np.maximum(slack + length[:, None] * ds, 1e-300)
@@ -156,7 +158,8 @@ def _interior_point(program: _Program, x: np.ndarray, slack: np.ndarray, dual: n
 def _predicted_and_corrected(
     program: _Program, stationary: np.ndarray, primal: np.ndarray, gap: np.ndarray, slack: np.ndarray, dual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Mehrotra's step of x, slacks and duals; a predictor determines the possible decrease of slack-dual products."""
+    """Return Mehrotra's step of x, slacks and duals: a predictor step determines how far the products of slacks and duals can
+    decrease, and the corrector step has this target."""
     rows, transposed = program.rows, np.swapaxes(program.rows, 1, 2)
     (m, n), weight = rows.shape[1:], dual / slack
     matrix = program.quadratic + (transposed * weight[:, None, :]) @ rows
@@ -164,7 +167,7 @@ def _predicted_and_corrected(
     matrix = matrix + ridge * np.trace(matrix, axis1=1, axis2=2)[:, None, None] / n + 1e-300 * np.eye(n)
 
     def solved(target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the step that increases the products of slacks and duals by `target`."""
+        """Return the step that changes the products of slacks and duals by `target`, to first order."""
         rest = -stationary - _times(transposed, weight * primal + target / slack)
         dx = np.linalg.solve(matrix, rest[..., None])[..., 0]
         ds = -primal - _times(rows, dx)

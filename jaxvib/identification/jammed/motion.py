@@ -1,14 +1,17 @@
 """Motion of a machine with loads on a rotor of known angle, at the samples of a record, and its normal equations.
 
 The state is y = (q, q', angles of the loads, their rates, states of high-pass filters). The exact equations of the scene are
-integrated by equal steps of order 8, over J stretches of a record at once, each with its forward derivatives G by its first
-state and H by all other unknowns z. A change of z and of the state at the first sample then changes the states at the starts
-of the stretches by
+integrated by equal steps of order 8, over J stretches of a record at once. The last state end_j of stretch j has the derivative
+G_j with respect to the first state start_j of the stretch, and H_j with respect to all other unknowns z. A change dz, and a
+change of the state at the first sample, then change start_j by D_j:
 
-    D_1 = d(first state),      D_{j+1} = G_j D_j + H_j dz + (end_j - start_{j+1})
+    D_1 = d(state at the first sample),      D_{j+1} = G_j D_j + H_j dz + (end_j - start_{j+1})
 
 The last term closes the gaps between the stretches. Without gaps this is the derivative of the whole motion. The motion of
-loads that are jammed is stable, so that the products of G do not grow.
+loads that are jammed is stable; therefore the products of G_j do not grow.
+
+Sizes of arrays: n samples, J stretches of `length` samples, C channels, nd coordinates of the carrier, ns states, p unknowns x
+of the scene and the sensors (see `Unknowns`). `pair` are the two components of the unbalance.
 """
 
 from __future__ import annotations
@@ -34,7 +37,8 @@ from jaxvib.runtime.programs import cached
 
 
 class _Turned(IdealDrive):
-    """Prescribed `drive` whose angle is larger by `phase`, rad; after the time `end`, angle and speed are constant."""
+    """Prescribed `drive` whose angle is larger by `phase`, rad; after the time `end` its angle, speed and acceleration keep
+    their values at `end`."""
 
     drive: Drive
     phase: Array
@@ -57,8 +61,8 @@ class _Turned(IdealDrive):
 
 
 class _Equations(NamedTuple):
-    """Equations of a run: the `dynamics` of the scene; `rows` (C, 3, nd) and `gains` (C,) of the readings; `corners` (k,),
-    rad/s, of the high-pass filters."""
+    """Equations of a run: the `dynamics` of the scene; `rows` (C, 3, nd) from displacements, velocities and accelerations to
+    the readings, and `gains` (C,) of the readings; `corners`, rad/s, of the channels with a high-pass filter."""
 
     dynamics: Dynamics
     rows: Array
@@ -86,7 +90,7 @@ def _equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pai
 
 
 def _rates(samples: Samples, t: Array, y: Array, equations: _Equations) -> tuple[Array, Array]:
-    """Return the rates of the state `y`, and the readings (C,) without their gains."""
+    """Return the rates of the state `y`, and the readings (C,) before their gains are applied."""
     nd, filters = equations.rows.shape[2], equations.corners.shape[0]
     loads = (y.shape[0] - 2 * nd - filters) // 2
     q, v, angle, rate, slow = jnp.split(y, np.cumsum([nd, nd, loads, loads]))
@@ -125,7 +129,7 @@ def stretches(
 ) -> tuple[Array, Array, Array]:
     """Return the readings (J, length, C), the states (J, length, ns) and the last states (J, ns) of J stretches.
 
-    **Arguments**: `x`; `pair`: components of the unbalance; `starts` (J, ns): first states.
+    **Arguments**: `x` (p,) and `pair` (2,): unknowns; `starts` (J, ns): first states.
     """
     begins = length * jnp.arange(starts.shape[0])
     return jax.vmap(lambda start, begin: _stretch(unknowns, samples, scene, x, pair, start, begin, length))(starts, begins)
@@ -135,7 +139,8 @@ def stretches(
 def _slopes(
     unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pair: Array, starts: Array
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return readings and last states as `stretches`, and their derivatives (..., p + 2 + ns) by (x, pair, first state)."""
+    """Return readings and last states as `stretches`, and their derivatives (..., p + 2 + ns) with respect to x, pair and first
+    state."""
     length, p = samples.stretches[1], x.shape[0]
 
     def motion(free: Array, begin: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -150,10 +155,15 @@ def _slopes(
 
 
 class Linearized(NamedTuple):
-    """Motion of a run about its unknowns (x, states at the first sample, pair, offsets), and the closing of its gaps.
+    """Linearized motion of a run.
 
-    **Attributes** (f = p + ns + 2 + C unknowns, and one more, 1 for closed gaps): `model` (n, C), filtered readings; `columns`
-    (n, C, f + 1) of them; `moves` (J, ns, f + 1) of the starts of the stretches; `gaps` (J - 1, ns).
+    The f = p + ns + 2 + C unknowns are x, the state at the first sample, `pair` and the offsets of the channels, in this order.
+    The last axis of `columns` and `moves` has f + 1 entries: the derivatives with respect to the unknowns, and the change that
+    closes the gaps between the stretches.
+
+    **Attributes**: `model` (n, C): readings of the model after the filter; `columns` (n, C, f + 1): their changes; `moves`
+    (J, ns, f + 1): changes of the first states of the stretches; `gaps` (J - 1, ns): last state of each stretch minus the first
+    state of the next one.
     """
 
     model: np.ndarray
@@ -165,7 +175,10 @@ class Linearized(NamedTuple):
 def linearized(
     unknowns: Unknowns, samples: Samples, scene: Scene, x: np.ndarray, own: np.ndarray, starts: np.ndarray
 ) -> Linearized:
-    """Return the motion of a run about its unknowns. `own`: first state, pair, offsets; `starts` (J, ns) of the stretches."""
+    """Return the linearized motion of a run.
+
+    **Arguments**: `x` (p,); `own`: state at the first sample, pair, offsets; `starts` (J, ns): first states of the stretches.
+    """
     p, count = x.size, starts.shape[1]
     found, slopes = _slopes(unknowns, samples, scene, jnp.asarray(x), jnp.asarray(own[count : count + 2]), jnp.asarray(starts))
     (readings, ends), (by_readings, by_ends) = jax.tree.map(np.asarray, (found, slopes))
@@ -185,7 +198,7 @@ def linearized(
     n = samples.readings.shape[0] * samples.readings.shape[1]
     model, slopes = (np.concatenate(each)[:n] for each in (readings, columns))
     model, slopes = _filtered(samples, model), _filtered(samples, slopes)
-    level = np.sum(np.asarray(samples.taps), axis=0)  # an offset that has always been there
+    level = np.sum(np.asarray(samples.taps), axis=0)  # response of the filter to a constant offset
     offsets = np.arange(len(level))
     slopes[:, offsets, p + count + 2 + offsets] = level
     return Linearized(model + level * own[count + 2 :], slopes, np.stack(moves), gaps)
@@ -201,7 +214,7 @@ def _filtered(samples: Samples, values: np.ndarray) -> np.ndarray:
 
 
 def weighted(samples: Samples, model: np.ndarray) -> np.ndarray:
-    """Return readings minus model (n, C), by the weights of the readings."""
+    """Return the products (n, C) of weights and differences, readings minus model."""
     count = model.shape[1]
     data, weights = (np.asarray(each).reshape(-1, count)[: len(model)] for each in (samples.readings, samples.weights))
     return weights * (data - model)
@@ -210,7 +223,10 @@ def weighted(samples: Samples, model: np.ndarray) -> np.ndarray:
 def closed_motion(
     unknowns: Unknowns, samples: Samples, scene: Scene, x: np.ndarray, own: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the readings (n, C) of a run with their offsets, without the filter, and the starts (J, ns) of its stretches.
+    """Return the readings (J x length, C) of a run with offsets, before the filter, and the first states (J, ns) of its
+    stretches.
+
+    The motion is integrated from the state at the first sample, without gaps.
 
     **Arguments**: `own`: state at the first sample, pair, offsets.
     """
@@ -222,13 +238,14 @@ def closed_motion(
 
 
 def motion_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return Z^T Z of Z = (derivatives by x and the own unknowns, readings minus model), as `normal_equations`."""
+    """Return Z^T Z like `normal_equations`. The columns of Z are the derivatives with respect to x and `own`, and readings
+    minus model."""
     at = linearized(unknowns, samples, scene, x, own, closed_motion(unknowns, samples, scene, x, own)[1])
     return products(samples, at, at.columns[:, :, :-1])
 
 
 def products(samples: Samples, at: Linearized, columns: np.ndarray) -> np.ndarray:
-    """Return Z^T Z of some weighted columns and the weighted readings minus model."""
+    """Return Z^T Z, where Z contains `columns` and the differences, readings minus model, all multiplied by the weights."""
     weights = np.asarray(samples.weights).reshape(-1, at.model.shape[1])[: len(at.model)]
     z = np.concatenate([columns * weights[:, :, None], weighted(samples, at.model)[:, :, None]], axis=2)
     z = z.reshape(-1, z.shape[2])
@@ -236,6 +253,7 @@ def products(samples: Samples, at: Linearized, columns: np.ndarray) -> np.ndarra
 
 
 def motion_cost(samples: Samples, readings: np.ndarray, offsets: np.ndarray) -> float:
-    """Return the cost of the readings (n, C) of a model without the filter, with their `offsets`."""
+    """Return the sum of the squared weighted differences between the record and `readings`, the readings of a model before the
+    filter, with their `offsets`."""
     level = np.sum(np.asarray(samples.taps), axis=0)
     return float(np.sum(weighted(samples, _filtered(samples, readings - offsets) + level * offsets) ** 2))

@@ -37,7 +37,7 @@ _SAMPLES = 4096
 """Number of stored times of a run-up, from which peaks are read."""
 
 _START_ANGLES = 8
-"""Number of initial angles between two exciters for which peaks are computed."""
+"""Number of runs with different initial angles for each motor of `_turned_motors`."""
 
 _LIFTING_SHARE = 0.02
 """Relative difference between the least torque and the torque that lifts an unbalance up to which they count as equal; the
@@ -72,7 +72,8 @@ class MotorRunUp(Result):
     - `peak_amplitude` (nd,), m, zero to peak, and `peak_force`, N: largest values on the way, of all initial angles between the
       exciters that were computed
     - `least_torque`: the smallest factor by which the torques of all motors can be multiplied such that all exciters still pass
-      their resonances; NaN if it was not requested, or if even motors 64 times as strong do not pass
+      their resonances; 1/64 if this factor is still sufficient; NaN if it was not requested, or if even motors 64 times as
+      strong do not pass
     - `run`: the averaged motion, an `Envelope`
     - `scene`
     """
@@ -148,15 +149,17 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
       The search assumes that a motor that passes also passes with more torque
 
     The peaks of several exciters depend on the angles between them when they reach the resonance. The starting angles and the
-    weight of the unbalances, which averaging omits, determine these angles. Peaks are therefore the largest ones of runs with
-    8 initial angles of each further motor; those of a single run can be half as large. Compared with the full equations from
-    the same angles without gravity they have errors of 2 % for a screen that passes its resonances within two turns.
+    weight of the unbalances, which averaging omits, determine these angles. Peaks are therefore the largest ones of several
+    runs from different initial angles: 8 runs for each motor after the first one, or for
+    each motor if another exciter has an ideal drive. The peaks of a single run
+    can be half as large. Compared with the full equations from the same angles without gravity, the peaks have errors of 2 %
+    for a screen that passes its resonances within two turns.
 
     **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between capture and
-    passage use `simulate`. Motors with currents have their steady torque here. The currents change neither the speed at
-    which a resonance holds a motor nor the fold at which it releases the motor. If the currents lag behind the speed (L/R of a
-    DC motor) longer than the vibration of the machine takes to decay, the motor may pass a resonance that catches it in the
-    averaged equations: use `simulate` for such motors.
+    passage use `simulate`. The torque of a motor with currents is its steady torque here. This changes neither the speed at
+    which a resonance holds the motor nor the fold at which the resonance releases it. It can change the outcome of a run-up if
+    the time constant of the currents (L/R of a DC motor) is longer than the decay time of the vibration: the motor may then
+    pass a resonance that catches it in the averaged equations. Use `simulate` for such motors.
 
     **Raises** `InputError` for a scene without a motor, for a motor that is switched off before the end, and as `envelope`. A
     run that fails has a status.

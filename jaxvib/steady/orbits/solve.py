@@ -1,4 +1,13 @@
-"""Periodic motions of coincident loads, by collocation of their phase deviation; the carrier is eliminated by harmonics."""
+"""Periodic motions of jammed loads, by collocation of their phase deviation; the carrier is eliminated by harmonics.
+
+Symbols: the carrier has the matrices K (stiffness), M (mass), C (damping) and G (gyroscopic, multiplied by the rotor speed n),
+and B maps its coordinates to the displacement of the mount. The loads form bodies g with the unbalances S_g and the moments of
+inertia I_g (see `JammedBodies`); e(phi) is the point of the unit circle at the angle phi, in the directions of the mount. m_j
+is the mass of load j. Omega is the load speed.
+
+Sizes of arrays: G bodies, M points of the grid, K harmonics of the carrier, J harmonics of the deviation, nd coordinates of the
+carrier, p directions of the mount.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +28,11 @@ Parameter = Literal["omega", "rotor_speed"]
 
 
 def unbalance_response(model: JammedBodies, omega: Array, speed: Array, orders: np.ndarray) -> Array:
-    """Return the response of the carrier to unbalance, (K, nd, p) for a mount with p directions.
+    """Return the response of the carrier to unbalance, (K, nd, p).
 
         X_k = D(k Omega)^-1 B^T k^2 Omega^2,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
-    X_k is the k-th harmonic of the displacement per k-th harmonic of sum_g S_g e(phi_g), 1/kg.
+    X_k is the k-th harmonic of the carrier's displacement per k-th harmonic of sum_g S_g e(phi_g), 1/kg.
 
     **Arguments**: load speed `omega` and rotor `speed`, rad/s; `orders` k (K,).
     """
@@ -37,8 +46,8 @@ def unbalance_response(model: JammedBodies, omega: Array, speed: Array, orders: 
 
 
 def _port_response(model: JammedBodies, grid: Grid, omega: Array, speed: Array) -> Array:
-    """Return the response A_k (K, p, p) of the mount with p directions to unbalance: k-th harmonic of its acceleration per k-th
-    harmonic of sum_g S_g e(phi_g)."""
+    """Return the response A_k (K, p, p) of the mount to unbalance: k-th harmonic of its acceleration per k-th harmonic of
+    sum_g S_g e(phi_g)."""
     return _port_response_from(model, grid, omega, unbalance_response(model, omega, speed, grid.orders))
 
 
@@ -49,8 +58,7 @@ def _port_response_from(model: JammedBodies, grid: Grid, omega: Array, response:
 
 
 def _feedback(grid: Grid, port_response: Array) -> Array:
-    """Return the matrix (p, p, M, M), with p directions of the mount, from sum_g S_g e(phi_g) to the acceleration of the mount,
-    both at the points."""
+    """Return the matrix (p, p, M, M) from sum_g S_g e(phi_g) to the acceleration of the mount, both at the points."""
     by_distance = jnp.einsum("kab,dk->abd", port_response.real, grid.cosine) - jnp.einsum(
         "kab,dk->abd", port_response.imag, grid.sine
     )
@@ -58,8 +66,12 @@ def _feedback(grid: Grid, port_response: Array) -> Array:
 
 
 class _Balance(NamedTuple):
-    """Torque balance of the bodies at the points, in units of drag times load speed: `residual` (G, M), the `scale` of its
-    terms, and the terms that its derivative needs."""
+    """Torque balance of the bodies at the points.
+
+    **Attributes**: `residual` (G, M) of the balance, divided by drag times load speed of each body; `scale` of the terms in it;
+    `acceleration` (p, M) of the mount, m/s^2; `moving` (p, G, M): de/dphi; `vibration_stiffness` (G, M): derivative of the
+    vibrational torque with respect to the angle, at a fixed acceleration, in the units of the residual.
+    """
 
     residual: Array
     scale: Array
@@ -125,14 +137,15 @@ def periodic_motion(
     *,
     is_known: bool = False,
 ) -> PeriodicSolution:
-    """Solve for the periodic motion psi_g(theta) of the bodies of loads, phi_g = theta + psi_g, theta = Omega t, mean psi = 0.
+    """Solve for the periodic motion phi_g = theta + psi_g(theta) of the bodies of loads, with theta = Omega t.
 
         I_g Omega^2 psi_g'' = torque_g(phi_g, Omega (1 + psi_g'), n, a) - S_g e'(phi_g) . a
         a_k = - k^2 Omega^2 B D(k Omega)^-1 B^T k^2 Omega^2 sum_g S_g (e(phi_g))_k
         D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
-    at the M points of `grid`, with the index k for harmonics, a the acceleration of the mount, e the position of a load on the
-    unit circle. The unknowns are psi at the points and one of Omega and n; the other one is `given`.
+    at the points of `grid`. Primes are derivatives with respect to the argument, the index k denotes the k-th harmonic, and a
+    is the acceleration of the mount. The unknowns are psi at the points and one of Omega and n; the other one is `given`. The
+    mean of psi over all points and bodies is 0, which selects the zero of time.
 
     **Arguments**
 
@@ -239,7 +252,7 @@ class BranchTangent(NamedTuple):
     - `speed_error`: estimated relative error of the rotor speed at this load speed, due to the number of points
     - `deviation_error`: estimated error of psi, rad
     - `response` (K, nd, p): `unbalance_response` of the carrier at the orders of the grid
-    - `acceleration` (p, M) of the mount with p directions at the points, m/s^2
+    - `acceleration` (p, M) of the mount at the points, m/s^2
     """
 
     slope: Array
@@ -293,7 +306,7 @@ def branch_tangent(model: JammedBodies, grid: Grid, motion: PeriodicSolution) ->
 
 
 def _append_mean_condition(residual: Array) -> Array:
-    """Append the residual of the condition mean psi = 0, which is zero, to the residuals."""
+    """Append the residual of the condition mean psi = 0, which is zero, or its derivative, to those of the balance."""
     return jax.lax.pad(residual, np.zeros((), residual.dtype), [(0, 1, 0)])
 
 
@@ -307,7 +320,8 @@ def _bordered(by_deviation: Array, by_unknown: Array) -> Array:
 
 class Harmonics(NamedTuple):
     """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `deviation` (G, J) rad; `displacement` (nd, K)
-    m of the carrier, `acceleration` (directions, K) m/s^2 of the mount, `force` (directions, K) N on the foundation."""
+    m of the carrier, `acceleration` (p, K) m/s^2 of the mount, `force` (directions of the foundation, K) N on the
+    foundation."""
 
     deviation: Array
     displacement: Array

@@ -1,4 +1,9 @@
-"""Torque balance near a synchronous regime: rank, derivative with respect to the scene, quasi-static stability, margin."""
+"""Torque balance near a synchronous regime: rank, derivative with respect to the scene, quasi-static stability, margin.
+
+Symbols: the rotating mass i has the unbalance S_i, the moment of inertia I_i, the angular velocity w_i, the phase alpha_i, the
+driving torque L_i and the vibrational torque V_i. Omega is the speed of the regime. H_ik is the influence coefficient of the
+carrier: the complex displacement at mass i per force of mass k, m/N.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +19,11 @@ from jaxvib.equations.torque_balance import TorqueBalance, balance_residuals, in
 from jaxvib.numerics.linalg import eliminate, magnitude, small_solve, svd_in_turn
 
 _TRIALS, _NEWTON_STEPS, _POLISHING_STEPS = 120, 6, 8
-"""Numbers of steps of the search for a fold, of Newton's method in each step, and at the fold."""
+"""Number of steps of the search for a fold, number of Newton steps in each of them, and number of Newton steps that refine the
+fold."""
 
 _LARGEST_FACTOR = 1e6
-"""Factor of the differences beyond which a margin counts as infinite."""
+"""Largest finite margin; see `margin_of`."""
 
 _LONGEST_STEP = 0.3
 """Largest change of a phase in a step of the search for a fold, rad."""
@@ -89,7 +95,10 @@ def regime_growth(balance: TorqueBalance, omega: Array, phase: Array, neutral: A
 
 
 def decays(growth: Array, omega: Array) -> Array:
-    """Return True if disturbances with a growth rate, 1/s, of a motion at the speed `omega`, rad/s, decay beyond rounding."""
+    """Return True if disturbances with a growth rate, 1/s, of a motion at the speed `omega`, rad/s, decay.
+
+    The rate must be more negative than a limit, because small computed rates can be rounding errors.
+    """
     return growth < -max(_MIN_DAMPING, 100.0 * float(jnp.finfo(growth.dtype).eps)) * omega
 
 
@@ -164,7 +173,7 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
     ends = factor < _LARGEST_FACTOR
     # Without a fold the values below are not used; finite ones leave no NaN in derivatives.
     at, factor = jnp.where(ends, at, start), jnp.where(ends, factor, one)
-    # At the fold the left null vector times the residuals is 0 to first order for any unknowns.
+    # At the fold, changes of the unknowns do not change the left null vector times the residuals to first order.
     left = jnp.where(ends, slopes.rows * slopes.left[:, -1], 1.0)
     by_factor = left @ jax.jvp(lambda f: balance_residuals(at, frozen, f), (factor,), (one,))[1]
     by_factor = jnp.where(ends, by_factor, 1.0)
