@@ -150,10 +150,9 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
 
     The peaks of several exciters depend on the angles between them when they reach the resonance. The starting angles and the
     weight of the unbalances, which averaging omits, determine these angles. Peaks are therefore the largest ones of several
-    runs from different initial angles: 8 runs for each motor after the first one, or for
-    each motor if another exciter has an ideal drive. The peaks of a single run
-    can be half as large. Compared with the full equations from the same angles without gravity, the peaks have errors of 2 %
-    for a screen that passes its resonances within two turns.
+    runs from different initial angles: 8 runs for each motor after the first one, or for each motor if another exciter has an
+    ideal drive. The peaks of a single run can be half as large. Compared with the full equations from the same angles without
+    gravity, the peaks have errors of 2 % for a screen that passes its resonances within two turns.
 
     **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between capture and
     passage use `simulate`. The torque of a motor with currents is its steady torque here. This changes neither the speed at
