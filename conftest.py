@@ -70,10 +70,8 @@ def pytest_configure(config):
 @pytest.fixture(autouse=True, scope="module")
 def _stored():
     """A worker keeps what a module compiled no longer than the module: hundreds of programs fill gigabytes, and what a test
-    finds compiled depends on no other module. Where `coverage` asks which lines run, all programs are traced: a stored one runs
-    none."""
-    measured = "coverage" in sys.modules and sys.modules["coverage"].Coverage.current() is not None
-    set_program_folder(None if measured else PROGRAMS)
+    finds compiled depends on no other module."""
+    set_program_folder(PROGRAMS)
     yield
     set_program_folder(None)
     for function in _functions:
