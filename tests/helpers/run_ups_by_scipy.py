@@ -120,11 +120,12 @@ def free_motions(times, case):
     return list(np.einsum("ai,tik->kta", flow[2:], free).real)
 
 
-def bound(times, names, noise, color=0.0, gain_error=0.0, turning=ramp, phase=0.4, delay_error=0.0):
+def bound(times, names, noise, color=0.0, gain_error=0.0, turning=ramp, phase=0.4, pulse_error=0.0, pulses=1):
     """Return the Cramer-Rao bound of the relative standard errors of numbers `names`.
 
     The derivatives are differences of SciPy's run-ups. The states at the first sample, the offsets and the phase of the
-    unbalance are free. The noise is that of `record`. `delay_error`, s: standard error of a common delay of all pulses.
+    unbalance are free. The noise is that of `record`. `pulse_error`, s: standard error of the time of each of `pulses` per
+    turn, and of a common delay of all pulses; the angle is then a polynomial of degree 5, see `pulse_rows`.
     """
     step = 1e-4
     cases = [TRUTH | {name: TRUTH[name] * (1.0 + s * step)} for name in names for s in (1.0, -1.0)]
@@ -137,18 +138,54 @@ def bound(times, names, noise, color=0.0, gain_error=0.0, turning=ramp, phase=0.
     readings = accelerations(times, [TRUTH], phase, turning)[0]
     columns += [readings * each for each in np.eye(2)] if gain_error else []
     errors = [gain_error] * 2 if gain_error else []
-    if delay_error:
-        shifted = [accelerations(times, [TRUTH], phase, lambda t, s=s: turning(t + s)) for s in (step, -step)]
-        columns.append((shifted[0] - shifted[1])[0] / (2.0 * step))
-        errors.append(delay_error)
+    if pulse_error:
+        columns += [*by_angle(times, turning, phase), np.zeros((times.size, 2))]
     slopes = np.stack(columns, axis=-1)
     slopes[1:] -= color * slopes[:-1]
     slopes[0] *= np.sqrt(1.0 - color**2)
     slopes = slopes.reshape(-1, slopes.shape[-1]) / (noise * np.sqrt(1.0 - color**2))
     information = slopes.T @ slopes
+    first = len(columns) - (DEGREE + 2) * bool(pulse_error)
     for k, error in enumerate(reversed(errors)):
-        information[-1 - k, -1 - k] += 1.0 / error**2
+        information[first - 1 - k, first - 1 - k] += 1.0 / error**2
+    if pulse_error:
+        rows = pulse_rows(turning, float(times[-1]), pulses) / pulse_error
+        information[first:, first:] += rows.T @ rows
+        information[-1, -1] += 1.0 / pulse_error**2
     return np.sqrt(np.diagonal(np.linalg.inv(information))[: len(names)])
+
+
+DEGREE = 5
+"""Degree of the polynomial of the angle, whose coefficients pulses determine."""
+
+
+def polynomials(t, end):
+    """Return the Legendre polynomials of the time until `end`, and their first and second derivatives (3, ..., DEGREE + 1)."""
+    legendre, scale = np.polynomial.legendre, 2.0 / end
+    place = 2.0 * np.asarray(t) / end - 1.0
+    return np.stack([legendre.legval(place, legendre.legder(np.eye(DEGREE + 1), k)).T * scale**k for k in range(3)])
+
+
+def by_angle(times, turning, phase):
+    """Return the derivatives (n, 2) of the accelerations by each coefficient of a polynomial that is added to the angle."""
+    step, end = 1e-4, float(times[-1])
+    signs = step * np.repeat([1.0, -1.0], DEGREE + 1)
+
+    def moved(t):
+        return tuple(each + signs * np.tile(change, 2) for each, change in zip(turning(t), polynomials(t, end), strict=True))
+
+    both = accelerations(times, [TRUTH] * signs.size, phase, moved)
+    return list((both[: DEGREE + 1] - both[DEGREE + 1 :]) / (2.0 * step))
+
+
+def pulse_rows(turning, end, pulses):
+    """Return the rows (pulses, DEGREE + 2) of the errors of the times of pulses, by the polynomial and a common delay.
+
+    A pulse at the speed w reads the angle with the error w (delay + its own error).
+    """
+    _, edges = pulse_times(turning, end, pulses)
+    speed = turning(edges)[1]
+    return np.column_stack([polynomials(edges, end)[0] / speed[:, None], np.ones(edges.size)])
 
 
 def noise_like(size, noise, rng, color=0.0, outliers=0.0):

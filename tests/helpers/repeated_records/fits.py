@@ -115,8 +115,8 @@ def repeated(count, seed=0, motor=False, balls=False, **options):
     return Repeated(np.array(away), np.array(relative), least, np.array(statuses))
 
 
-def _bound(turning, color=0.0, gain_error=0.0, outliers=0.0, resolution=0.0, **_):
+def _bound(turning, color=0.0, gain_error=0.0, outliers=0.0, resolution=0.0, pulses=24, **_):
     """Return the Cramer-Rao bound of a record with known places of outliers, an angle that is known but for a common delay of
     rounded pulses, and without clipping."""
-    noise, delay_error = NOISE / np.sqrt(1.0 - outliers), resolution / np.sqrt(12.0)
-    return bound(TIMES, SINGLE, noise, color, gain_error, turning, delay_error=delay_error)
+    noise, pulse_error = NOISE / np.sqrt(1.0 - outliers), resolution / np.sqrt(12.0)
+    return bound(TIMES, SINGLE, noise, color, gain_error, turning, pulse_error=pulse_error, pulses=pulses)
