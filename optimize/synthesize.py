@@ -19,7 +19,7 @@ from jaxvib.equations.linear import jammed_loads, require_drag
 from jaxvib.equations.state import State
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.validation import validate_scene
+from jaxvib.machine.validation import require_double, validate_scene
 from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
 from jaxvib.results.status import failure
@@ -237,16 +237,10 @@ def _validate_demands(space: DesignSpace, objective: Quantity, subject_to: Deman
                 "; == is no demand, hold(quantity, value) in the DesignSpace keeps a value" if isinstance(demand, bool) else ""
             )
             raise InputError("subject_to", f"has {quoted(demand)}; write demands such as amplitude(mode=3) > '2 mm'{hint}")
-    validate_scene(space.scene)
+    require_double(space.scene, "a search")
     between(space.scene, objective.of)
     if space.scene.is_plain and not space.scene.drive.constant:
         raise InputError("drive", f"is {quoted(space.scene.drive.kind)}; a search needs a constant speed, use ConstantSpeed")
-    if space.scene.top_speed.dtype != jnp.float64:
-        raise InputError(
-            "scene",
-            'is in float32; a search needs double precision: call jax.config.update("jax_enable_x64", '
-            "True) before the scene is created",
-        )
     return demands
 
 

@@ -24,6 +24,7 @@ from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import GravityField
 from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import require_double
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.stiffness import equal_step_length, fastest_decay
 from jaxvib.numerics.noise import Noise, bounded, limited
@@ -145,8 +146,9 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     """Return the least-squares problem of an identification.
 
     **Raises** `InputError` for unknowns that the scene does not have, for loads, effects and motors that are not included, and
-    for runs without a usable channel.
+    for runs without a usable channel, and if JAX computes in single precision.
     """
+    scene = require_double(scene, "an identification")
     _require_linear(scene)
     if isinstance(unknown, str) or not unknown:
         raise InputError("unknown", f"is {quoted(unknown)}; it must be a list of names, such as ['machine.stiffness']")

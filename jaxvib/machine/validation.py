@@ -68,6 +68,22 @@ def validate_scene(scene: Scene) -> Scene:
     return scene
 
 
+def require_double(scene: Scene, purpose: str) -> Scene:
+    """Return `validate_scene(scene)`.
+
+    **Raises** `InputError` if JAX computes in single precision.
+
+    **Arguments**: `purpose`: what needs double precision, as the subject of a sentence, such as "a search".
+    """
+    if isinstance(scene, Scene) and float_dtype() != np.float64:
+        raise InputError(
+            "scene",
+            f"is in single precision; {purpose} needs double precision: call jax.config.update("
+            '"jax_enable_x64", True) before the scene is created',
+        )
+    return validate_scene(scene)
+
+
 def allowed_unknowns(scene: Scene) -> Array | None:
     """Return a traced Boolean, True if the constructors allow the traced parameters of a scene.
 

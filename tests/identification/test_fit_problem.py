@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from scipy.linalg import eig
@@ -316,3 +317,8 @@ def test_natural_modes_of_the_damped_machine():
     frequency, ratio = natural(scene)
     np.testing.assert_allclose(frequency, np.abs(poles), rtol=1e-9)
     np.testing.assert_allclose(ratio, -np.real(poles) / np.abs(poles), rtol=1e-7)
+
+
+def test_identification_in_single_precision_is_refused():
+    with jax.enable_x64(False), pytest.raises(jv.InputError, match="single precision; an identification needs double"):
+        build_problem(scene_of(), [], ["machine.stiffness"], {})

@@ -18,7 +18,7 @@ from jaxvib.display import Axes, Drawn
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, put_numbers
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.validation import validate_scene
+from jaxvib.machine.validation import require_double
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
@@ -205,9 +205,7 @@ def check_gradients(
 
     Source: Ridders 1982, for the extrapolation and its error.
     """
-    scene = validate_scene(scene)
-    if scene.drive.speed.dtype.itemsize < 8:
-        raise InputError("scene", "is in single precision; differences need double: switch JAX to float64 before it is made")
+    scene = require_double(scene, "a comparison with differences")
     requested = tuple(_MODES) if routes is None else routes
     unknown = [route for route in requested if route not in _MODES]
     if unknown or not (requested or implicit):

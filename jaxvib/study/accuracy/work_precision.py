@@ -18,6 +18,7 @@ from jaxvib.boundary import call_user, validated
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import require_double
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error, with_nearest_turns
 from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.motion.integrate import frequency_bounds
@@ -123,9 +124,7 @@ def work_precision(
     if not tolerances:
         raise InputError("tolerances", f"are {quoted(tuple(tolerances))}; name one at least, such as 1e-6")
     count(repeats, "repeats")
-    if scene.drive.speed.dtype.itemsize < 8:
-        problem = "is in single precision; errors need double precision: switch JAX to float64 before you build the scene"
-        raise InputError("scene", problem)
+    scene = require_double(scene, "a comparison of errors")
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
     request = _Request(scene, tuple(tolerances), tuple(solvers), repeats, progress)
     if quantity == "final_state":
