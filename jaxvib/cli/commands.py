@@ -10,7 +10,15 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, loaded_scene, shared
-from jaxvib.cli.document import SEPARATION, chosen_steps, deck_options, require_deck_options, run_document, run_measures
+from jaxvib.cli.document import (
+    SEPARATION,
+    chosen_steps,
+    deck_options,
+    require_deck_options,
+    run_document,
+    run_measures,
+    run_text,
+)
 from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
 
@@ -94,7 +102,7 @@ def simulate(
     output.save_result("run.npz", run)
     output.csv(csv, run, "time")
     measures = run_measures(run)
-    output.done(run_document(run, measures), lambda: run.summary(measures), "simulate", run)
+    output.done(run_document(run, measures), lambda: run_text(run, measures), "simulate", run)
 
 
 def _long(scene: jv.Scene, until: str) -> bool:

@@ -73,9 +73,30 @@ def require_deck_options(scene: jv.Scene) -> None:
         raise InputError(option, f"is for bodies in a plane, not for a machine of kind '{scene.machine.kind}'; leave it out")
 
 
-def run_measures(run: jv.Run) -> jv.VibrationMeasures | None:
-    """Return the measures of a run; None if its window is too short for them."""
-    return measures_of(run.scene, run.vibration()) if run.has_vibration else None
+def run_measures(run: jv.Run | jv.Envelope) -> jv.VibrationMeasures | None:
+    """Return the measures of a run; None, with a note about --deck and --slope, for a run without vibration."""
+    if not run.no_vibration:
+        return measures_of(run.scene, run.vibration())
+    if click.get_current_context().meta.get(_DECK_KEY):
+        click.echo("note: --deck, --slope: no stroke, throw and conveying, because the run ends without a vibration", err=True)
+    return None
+
+
+def _deck_peaks(run: jv.Run) -> list[tuple[list[float], float]]:
+    """Return the points of the option --deck with their largest displacements, m, during a run whose trajectory was stored."""
+    points = [] if run.trajectory is None else click.get_current_context().meta.get(_DECK_KEY, {}).get("at", [])
+    return [(at, float(run.point(at, part="all").largest_displacement)) for at in points]
+
+
+def run_text(run: jv.Run, measures: jv.VibrationMeasures | None) -> str:
+    """Return the summary of a run, and the largest displacement of each point of the option --deck."""
+    from jaxvib.display import quantity_text  # slow import, which --help does not need
+
+    peaks = [
+        f"  largest on the way: point ({', '.join(f'{x:.4g}' for x in at)}) m {quantity_text(peak, 'm', 4)}"
+        for at, peak in _deck_peaks(run)
+    ]
+    return "\n".join([run.summary(measures), *peaks])
 
 
 def indented(title: str, measures: jv.VibrationMeasures) -> str:
@@ -104,13 +125,22 @@ def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, o
     }
 
 
+def measures_document(run: jv.Run | jv.Envelope, measures: jv.VibrationMeasures | None) -> dict[str, object]:
+    """Return the measures of a run, or the reason for which it has none, for a document."""
+    return {"no_vibration": run.no_vibration} if measures is None else {"measures": measures.document()}
+
+
 def run_document(run: jv.Run, measures: jv.VibrationMeasures | None) -> dict[str, object]:
     """Return the quantities of a run in its window, its error and its cost, for a document."""
+    peaks = [{"point": at, "largest_displacement": peak} for at, peak in _deck_peaks(run)]
     return {
         **measured_document(run, run.scene),
-        **({} if measures is None else {"measures": measures.document()}),
+        **measures_document(run, measures),
         **({"regime": _regime(run.regime)} if run.scene.is_plain else {}),
         **({} if run.trajectory is None else fields_of(run, "largest_displacement", "largest_force")),
+        **(
+            {"deck": [{"point": at, "largest_displacement": peak} for at, peak in peaks]} if (peaks := _deck_peaks(run)) else {}
+        ),
         **fields_of(run, "coincident", "error", "evaluations", "seconds"),
     }
 

@@ -23,15 +23,24 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import start_notes
 from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory
-from jaxvib.motion.analysis.points import PointMotion, fit_harmonic, motion_of_point, vibration_of
-from jaxvib.motion.analysis.regime import Regime, regime
+from jaxvib.motion.analysis.points import (
+    PointMotion,
+    absent_vibration,
+    fit_harmonic,
+    measures_text,
+    motion_of_point,
+    require_turns,
+    require_vibration,
+    vibration_of,
+)
+from jaxvib.motion.analysis.regime import STILL_SHARE, Regime, regime
 from jaxvib.motion.analysis.separation import overlap, would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.measures import Vibration, VibrationMeasures, vibration_measures
+from jaxvib.steady.measures import Vibration, VibrationMeasures
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.units import Number
@@ -75,9 +84,6 @@ ENDS = ("done", "beating", "creeping", "would_separate", "overlapping")
 
 SETTLED_DRIFT = 1e-3
 """Drift below which a motion counts as settled."""
-
-_MIN_TURNS = 3
-"""Smallest number of turns of the exciters to which a harmonic is fitted."""
 
 
 class Run(AbstractMeasured, PathsOfPoints, Result):
@@ -163,6 +169,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         rotors = [w[-1] for w in self.window.rotor_speeds]
         rotor = "rotor" if len(rotors) == 1 else "rotors"
         stuck = [] if np.max(np.abs(rotors)) > 1.0 else start_notes(self.scene)
+        if not stuck and float(jnp.abs(self.omega)) < STILL_SHARE * float(self.scene.top_speed):
+            stuck = [f"the {self._turning} are almost at rest"]
         state = "settled" if bool(self.settled) else f"not settled: {stuck[0] if stuck else 'run longer'}"
         state = "steady in the mean" if bool(self.status == RunStatus.beating) else state
         state = "balanced" if bool(self.status == RunStatus.creeping) else state
@@ -184,7 +192,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 f"  {self._turning} turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), "
                 f"{rotor} at {speed_text(rotors, 6)}",
                 f"  {self.amplitude_text(self.scene)}",
-                *(f"  {line}" for line in self._measures_text(measures)),
+                *(f"  {line}" for line in measures_text(self.scene, self.no_vibration, self.vibration, measures)),
                 *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
                 *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
@@ -197,11 +205,6 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         if not overlap(self.scene, self._whole):
             return []
         return [f"  loads passed through each other on the way, which may change the result; {_CONTACT}"]
-
-    def _measures_text(self, measures: VibrationMeasures | None) -> list[str]:
-        if not self.has_vibration:
-            return []
-        return (measures or vibration_measures(self.scene, self.vibration())).summary().splitlines()
 
     def _on_the_way(self) -> str:
         structure = self.scene.machine.structure()
@@ -300,22 +303,26 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
         **Raises** `InputError` if the exciters make fewer than 3 turns in the window.
         """
-        when_known(_require_turns, self.window.time, self.omega)
+        when_known(require_turns, self.window.time, self.omega)
         amplitude, rest = fit_harmonic(self.window.time, self.window.state.displacement, self.omega)
         return Harmonic(self.scene.machine, self.omega, amplitude, rest)
 
     @property
-    def has_vibration(self) -> bool:
-        """True if the window contains the 3 turns of the exciters that `vibration` needs."""
-        return bool(_turns(np.asarray(self.window.time), float(self.omega)) >= _MIN_TURNS)
+    def no_vibration(self) -> str:
+        """Reason for which the window has no vibration that can be measured; an empty text if it has one.
+
+        The exciters must make 3 turns in the window, and at least half of the amplitude must be at their speed. Otherwise
+        `vibration` raises an error, and the summary contains this reason in place of the measures.
+        """
+        return absent_vibration(self.scene.machine, self.window.time, self, self.harmonic)
 
     def vibration(self) -> Vibration:
         """Return the vibration over the window, for `vibration_measures`: the fitted harmonic, measured amplitudes and force,
         mean torques and powers of the drives.
 
-        **Raises** `InputError` if the exciters make fewer than 3 turns in the window.
+        **Raises** `InputError` if there is `no_vibration`.
         """
-        when_known(_require_turns, self.window.time, self.omega)
+        when_known(lambda *_: require_vibration(self.no_vibration), self.window.time, self.omega, self.amplitude)
         measured = Measured(self.omega, self.load_speed, self.amplitude, self.foundation_force, self.drift)
         return vibration_of(self.scene, self.window, measured)
 
@@ -356,18 +363,6 @@ def _histories(trajectory: Trajectory) -> list[np.ndarray]:
         rotors,
         np.asarray(trajectory.foundation_force),
     ]
-
-
-def _turns(time: np.ndarray, speed: float) -> float:
-    return abs(speed) * (time[-1] - time[0]) / (2.0 * np.pi)
-
-
-def _require_turns(time: np.ndarray, speed: float) -> None:
-    if not (turns := _turns(time, speed)) >= _MIN_TURNS:
-        raise InputError(
-            "run",
-            f"has {turns:.2g} turns in its window; vibration measures need {_MIN_TURNS}; increase `until` or `window_periods`",
-        )
 
 
 def with_separation_status(run: Run) -> Run:

@@ -14,7 +14,7 @@ from jax import Array
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import suggest_name
 from jaxvib.motion.analysis.measure import mean_speeds, turning_angles, turning_directions
-from jaxvib.motion.analysis.points import vibration_of
+from jaxvib.motion.analysis.points import has_vibration, vibration_of, vibration_share
 from jaxvib.motion.analysis.regime import REGIMES
 from jaxvib.motion.batch import BatchRun
 from jaxvib.steady.measures import vibration_measures
@@ -94,6 +94,10 @@ def _relative_rotation(run: BatchRun) -> Array:
     return jnp.max(turned) - jnp.min(turned)
 
 
+_MEANS = ("torque", "power", "static_load")
+"""Fields of `VibrationMeasures` that are mean values, and exist for motions without a vibration."""
+
+
 def _vibration_measure(name: str, unit: str, field: str, axis: str = "") -> RunMeasure:
     """Return a measure with the name of a `field` of `VibrationMeasures`."""
 
@@ -102,7 +106,10 @@ def _vibration_measure(name: str, unit: str, field: str, axis: str = "") -> RunM
         value = getattr(vibration_measures(run.scene, motion), field)
         if value is None:
             raise InputError("measure", f"is {name}, which needs a body in a plane, not a {quoted(run.scene.machine.kind)}")
-        return value
+        if field in _MEANS:
+            return value
+        share = vibration_share(run.scene.machine, run.window.time, run.measured, motion.displacement)
+        return jnp.where(has_vibration(share), value, jnp.nan)
 
     return RunMeasure(name, unit, read, axis)
 
@@ -145,8 +152,9 @@ which each load speed differs from its final value by less than 1 % of the rotor
 before the measuring window; it is the end of the run if the loads do not settle. The relative rotation is the largest
 difference between the angles through which two loads, or rotors without loads, turn in the measuring window. Regime, jam mode,
 ripple and rotor speed need a scene with one exciter and loads. The measures from stroke to conveying speed are those of
-`VibrationMeasures`, for the centre of mass as the point. The support load is the sum of the static and the vertical dynamic
-load."""
+`VibrationMeasures`, for the centre of mass as the point; all but torque and power are NaN for a run that does not end in a
+vibration at the speed of its exciters (see `Run.no_vibration`). The support load is the sum of the static and the vertical
+dynamic load."""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:

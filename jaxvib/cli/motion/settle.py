@@ -25,10 +25,11 @@ from jaxvib.cli.document import (
     chosen_steps,
     deck_options,
     measured_document,
-    measures_of,
+    measures_document,
     require_deck_options,
     run_document,
     run_measures,
+    run_text,
 )
 from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
@@ -80,7 +81,7 @@ def settle(
         {"tolerances": [ranges_of_quantity._asdict() for ranges_of_quantity in ranges]} if tolerances else {}
     )
     table = [tolerance_table(ranges, tolerances)] if tolerances else []
-    output.done(document, lambda: "\n".join([run.summary(measures), *table]), "settle", run)
+    output.done(document, lambda: "\n".join([run_text(run, measures), *table]), "settle", run)
 
 
 def _modes_of(run: jv.Run) -> list[int] | None:
@@ -116,8 +117,8 @@ def envelope(
     output.picture("envelope.png", run.plot)
     output.save_result("envelope.npz", run)
     output.csv(csv, run, "trajectory_time")
-    measures = measures_of(loaded, run.vibration())
-    document = {**measured_document(run, loaded), "measures": measures.document(), "ripple": run.ripple}
+    measures = run_measures(run)
+    document = {**measured_document(run, loaded), **measures_document(run, measures), "ripple": run.ripple}
     output.done(document, lambda: run.summary(measures), "envelope", run)
 
 

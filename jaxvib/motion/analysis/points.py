@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -10,20 +11,30 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.display import speed_text
 from jaxvib.equations.dynamics import dynamics_of
 from jaxvib.equations.forces import drive_torques
 from jaxvib.equations.linear import linear_model, peak_force
 from jaxvib.equations.model import assemble
 from jaxvib.equations.torque_balance import resultant_of
+from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine, Place
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory, turning_angles, turning_directions
+from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.measures import Vibration
-from jaxvib.steady.points import rows_in_plane
+from jaxvib.steady.measures import Vibration, VibrationMeasures, vibration_measures
+from jaxvib.steady.points import Harmonic, rows_in_plane
+
+_MIN_TURNS = 3
+"""Smallest number of turns of the exciters to which a harmonic is fitted."""
+
+_MIN_SHARE = 0.5
+"""Smallest amplitude of the harmonic at the speed of the exciters, relative to the measured amplitude, of a motion with
+vibration measures. It is about 1 in a steady motion, and small if a rotor slows down or a free vibration decays."""
 
 _HARMONICS = 3
 """Number of fitted harmonics. The second and the third are included because they would otherwise influence the first."""
@@ -40,6 +51,11 @@ class PointMotion(eqx.Module):
     time: Array = eqx.field(metadata=in_unit("s", "time"))
     displacement: Array = eqx.field(metadata=in_unit("m", "time", "direction"))
     velocity: Array = eqx.field(metadata=in_unit("m/s", "time", "direction"))
+
+    @property
+    def largest_displacement(self) -> Array:
+        """Largest distance from the place at rest, m, among the stored states."""
+        return jnp.max(magnitude(self.displacement[:, 0] + 1j * self.displacement[:, 1]))
 
 
 @cached
@@ -98,6 +114,64 @@ def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -
         torque=jnp.where(has_spin, jnp.nan, torque),
         power=jnp.where(has_spin, jnp.nan, power),
     )
+
+
+def require_turns(time: np.ndarray, speed: float) -> None:
+    """**Raises** `InputError` if the exciters make too few turns for the fit of a harmonic."""
+    if not (turns := _turns(time, speed)) >= _MIN_TURNS:
+        raise InputError(
+            "run", f"has {turns:.2g} turns in its window; a harmonic needs {_MIN_TURNS}; increase `until` or `window_periods`"
+        )
+
+
+def vibration_share(machine: Machine, time: Array, measured: AbstractMeasured, harmonic: Array) -> Array:
+    """Return the share of the amplitude of a motion that is a vibration at the speed of the exciters; 0 for too few turns.
+
+    Measures describe a vibration at this speed. The share is small if the exciters stand almost still, if their speed changes
+    fast, and if the motion is a free vibration.
+
+    **Arguments**: `time` (nt,) of the window, its `measured` quantities, and the `harmonic` (nd,) of this speed.
+    """
+    is_length = np.asarray(machine.carrier().units) == "m"
+    moves = is_length if np.any(is_length) else np.ones_like(is_length)
+    part, whole = (jnp.linalg.norm(magnitude(each)[moves]) for each in (harmonic, measured.amplitude))
+    share = jnp.where(whole > 0.0, part / jnp.where(whole > 0.0, whole, 1.0), 1.0)
+    return jnp.where(_turns(time, measured.omega) >= _MIN_TURNS, share, 0.0)
+
+
+def has_vibration(share: Array) -> Array:
+    """Return True for the `vibration_share` of a motion that has vibration measures."""
+    return share >= _MIN_SHARE
+
+
+def absent_vibration(machine: Machine, time: Array, measured: AbstractMeasured, harmonic: Callable[[], Harmonic]) -> str:
+    """Return the reason for which a motion has no vibration measures, an empty text if it has; see `vibration_share`."""
+    turns, speed = _turns(time, measured.omega), speed_text(measured.omega, 4)
+    if not turns >= _MIN_TURNS:
+        return f"the exciters make {float(turns):.2g} turns in the measured window, fewer than {_MIN_TURNS}"
+    share = vibration_share(machine, time, measured, harmonic().amplitude)
+    part = f"{100.0 * float(share):.2g} % of the amplitude is at the mean speed of the exciters, {speed}"
+    return "" if has_vibration(share) else f"{part}; their speed changes, or the motion is a free vibration"
+
+
+def require_vibration(reason: str) -> None:
+    """**Raises** `InputError` if a motion has no vibration measures for a `reason`."""
+    if reason:
+        raise InputError("run", f"has no vibration to measure: {reason}; measure a run that ends in a steady motion")
+
+
+def measures_text(
+    scene: Scene, reason: str, vibration: Callable[[], Vibration], measures: VibrationMeasures | None
+) -> list[str]:
+    """Return the lines of a summary about a vibration: its `measures` (default: at the centre of mass, for a level deck), or
+    the `reason` for which there is none."""
+    if reason:
+        return [f"no vibration to measure: {reason}"]
+    return (measures or vibration_measures(scene, vibration())).summary().splitlines()
+
+
+def _turns(time: Array | np.ndarray, speed: Array | float) -> Array:
+    return jnp.abs(speed) * (time[-1] - time[0]) / (2.0 * np.pi)
 
 
 def _hann(count: int) -> np.ndarray:

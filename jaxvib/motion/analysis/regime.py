@@ -36,6 +36,9 @@ _STEADY_SLIP = 0.02
 """Relative difference between the lags of a load (angles by which it falls behind the rotor) in the two halves of the window,
 below which the lag is steady. A load with a steady lag is jammed, even if the lag is small."""
 
+STILL_SHARE = 0.01
+"""Speed of a rotor, relative to a working or resonance speed, below which texts state that it is at rest."""
+
 _BALANCED_UNBALANCE_SHARE = 0.02
 """Residual unbalance below which loads count as balancing the rotor, relative to the unbalance of all loads at one angle."""
 
@@ -123,7 +126,8 @@ class Regime(Result):
             evidence += [self._remainder(), pattern]
         if bool(self.caught):
             evidence.append("the rotor itself is caught at a resonance, below the speed of its motor")
-        evidence.append(f"speeds change by {float(self.change):.1e}")
+        if abs(float(self.rotor_speed)) > STILL_SHARE * float(self.resonance_speed):
+            evidence.append(f"speeds change by {float(self.change):.1e}")
         return f"{self.message} ({'; '.join(evidence)})"
 
     def _remainder(self) -> str:

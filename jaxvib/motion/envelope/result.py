@@ -21,13 +21,15 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, only_exciter_value
+from jaxvib.motion.analysis.points import absent_vibration, measures_text, require_vibration
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import status_name
-from jaxvib.steady.measures import Vibration, VibrationMeasures, vibration_measures
+from jaxvib.steady.measures import Vibration, VibrationMeasures
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.steady.points import Harmonic, PathsOfPoints
+from jaxvib.units.known import when_known
 
 
 class EnvelopeStatus(eqx.Enumeration):
@@ -119,12 +121,20 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         rest = 0.5 * (away.T @ jnp.conj(away)).real / away.shape[0]
         return Harmonic(self.scene.machine, jnp.mean(self.window.omega), mean, rest)
 
+    @property
+    def no_vibration(self) -> str:
+        """Reason for which the window has no vibration that can be measured, see `Run.no_vibration`."""
+        return absent_vibration(self.scene.machine, self.window.time, self, self.harmonic)
+
     def vibration(self) -> Vibration:
         """Return the mean vibration over the window, for `vibration_measures`.
 
         The torque of a motor is its torque at the averaged speed. The torque of an ideal drive is that of the drag of its
         loads, NaN for loads with dry friction and for unbalances.
+
+        **Raises** `InputError` if there is `no_vibration`.
         """
+        when_known(lambda *_: require_vibration(self.no_vibration), self.window, self.amplitude)
         scene, window = self.scene, self.window
         turn = jnp.mean(jnp.exp(1j * window.phase), axis=0)
         force = peak_force(self.omega**2 * resultant_of(linear_model(scene), turn))
@@ -150,7 +160,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         **Arguments**: `measures` of the vibration that are shown; default: those of the centre of mass on a level deck.
         """
         moves = bool(np.all(np.isfinite(self.amplitude)))
-        measured = (measures or vibration_measures(self.scene, self.vibration())).summary().splitlines() if moves else []
+        measured = measures_text(self.scene, self.no_vibration, self.vibration, measures) if moves else []
         named, first = status_name(self.status), []
         end, state = self.message, "settled" if bool(self.settled) else "not settled: run longer"
         if named in ("would_separate", "unstable"):

@@ -1,0 +1,90 @@
+"""Ends of runs that have no vibration at the speed of the exciters."""
+
+import json
+
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.cli.app import run as run_command
+from jaxvib.machine.files import SCREENS
+
+AT = (1.5, 0.1)
+
+
+def coasting(at="2 s", bearing=0.3):
+    screen = jv.scene_from_toml(SCREENS["linear_screen"])
+    exciters = [each.with_parts(None, jv.SwitchedOff(each.drive, at, bearing), each.effects) for each in screen.exciters]
+    return jv.Scene(screen.machine, exciters=exciters, effects=screen.effects)
+
+
+@pytest.fixture(scope="module")
+def stopped():
+    return jv.simulate(coasting(), "60 s")
+
+
+def test_a_screen_that_coasts_down_has_no_measures(stopped):
+    assert "turns in the measured window, fewer than 3" in stopped.no_vibration
+    text = stopped.summary()
+    assert f"no vibration to measure: {stopped.no_vibration}" in text and "% reach the foundation" not in text
+    assert "not settled: the exciters are almost at rest" in text and "largest on the way: x" in text
+    with pytest.raises(jv.InputError, match="run has no vibration to measure: the exciters make"):
+        stopped.vibration()
+
+
+def test_a_rotor_that_slows_down_has_no_measures():
+    slowing = jv.simulate(coasting(), "8 s")
+    assert "of the amplitude is at the mean speed of the exciters" in slowing.no_vibration
+    with pytest.raises(jv.InputError, match="their speed changes, or the motion is a free vibration"):
+        slowing.vibration()
+
+
+def test_a_free_vibration_has_no_measures():
+    machine = jv.one_mass(mass=200.0, stiffness=8e5, damping=60.0)
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(300.0), unbalance=0.2)])
+    early, late = jv.simulate(scene, "1 s"), jv.simulate(scene, "60 s")
+    assert "free vibration" in early.no_vibration and late.no_vibration == ""
+    forced = 0.2 * 300.0**2 / abs(8e5 - 200.0 * 300.0**2 + 60.0 * 300.0j)  # closed form
+    assert forced < 0.5 * float(early.amplitude[0])
+    np.testing.assert_allclose(abs(late.harmonic().amplitude), forced, rtol=1e-3)
+
+
+def test_sweeps_have_no_stroke_of_a_free_vibration(tmp_path):
+    machine = jv.one_mass(mass=200.0, stiffness=8e5, damping=60.0)
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(300.0), unbalance=0.2)])
+    measures = ["run.stroke", "run.shaft_torque"]
+    found = jv.sweep(scene, {"machine.damping[0]": [60.0, 8000.0]}, measures, tmp_path / "free.zarr", until=4.0).data
+    forced = 0.4 * 300.0**2 / abs(8e5 - 200.0 * 300.0**2 + 8000.0 * 300.0j)  # closed form, peak to peak
+    np.testing.assert_allclose(found["stroke"][:, 0], [np.nan, forced], rtol=1e-3)
+    assert np.all(np.isfinite(found["shaft_torque"]))
+
+
+def test_an_averaged_stop_has_no_measures():
+    profile = jv.SpeedProfile([0, 10, 20, 22], ["0 rpm", "600 rpm", "600 rpm", "0 rpm"])
+    machine = jv.one_mass(mass=120.0, stiffness="50 N/mm", damping=40.0)
+    scene = jv.Scene(machine, jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), profile)
+    averaged = jv.envelope(scene, "60 s")
+    assert averaged.no_vibration and averaged.no_vibration in averaged.summary()
+    with pytest.raises(jv.InputError, match="run has no vibration"):
+        averaged.vibration()
+
+
+def test_peaks_of_a_deck_are_those_of_its_rigid_motion(stopped):
+    x, y, turn = np.asarray(stopped.trajectory.state.displacement).T
+    expected = np.max(np.hypot(x - AT[1] * turn, y + AT[0] * turn))
+    np.testing.assert_allclose(stopped.point(AT, part="all").largest_displacement, expected, rtol=1e-12)
+
+
+def test_a_deck_without_vibration_has_a_note_and_its_peak(stopped, tmp_path, monkeypatch, capsys):
+    path = tmp_path / "screen.toml"
+    path.write_text(SCREENS["linear_screen"], encoding="utf-8")
+    monkeypatch.setattr("jaxvib.simulate", lambda *a, **b: stopped)
+    assert run_command(["simulate", str(path), "--until", "60s", "--deck", "1.5,0.1"]) == 0
+    text, err = capsys.readouterr()
+    peak = 1e3 * float(stopped.point(AT, part="all").largest_displacement)
+    assert f"largest on the way: point (1.5, 0.1) m {peak:.4g} mm" in text
+    assert "--deck, --slope: no stroke, throw and conveying" in err
+    assert run_command(["simulate", str(path), "--until", "60s", "--deck", "1.5,0.1", "--json"]) == 0
+    document = json.loads(capsys.readouterr()[0])
+    assert document["no_vibration"] == stopped.no_vibration and "measures" not in document
+    np.testing.assert_allclose(document["deck"][0]["largest_displacement"], peak / 1e3, rtol=1e-12)
