@@ -294,13 +294,13 @@ FORMS = (
     ),
     ClosedForm("5: one exciter below a resonance", "fold of the motor's line", jam_limit, (1e-6, 1e-12, 0.05)),
     ClosedForm(
-        "6: two auto-balancers below the translation",
+        "6: two auto-balancers below the resonance of translation",
         "in step, b R^2 (n - Omega) = 2 c S^2 Omega^5 / |D|^2",
         of(lambda: balancers(0.0)),
         (2e-14, 2e-14, 1e-11),
     ),
     ClosedForm(
-        "6: two auto-balancers below the turn",
+        "6: two auto-balancers below the resonance of rotation",
         "opposed, b R^2 (n - Omega) = c l^2 S^2 Omega^5 / |D|^2",
         of(lambda: balancers(np.pi)),
         (2e-14, 4e-4, 4e-4),

@@ -298,7 +298,7 @@ def jam_modes(scene: Scene) -> JamModes:
       use `simulate`
 
     **Arguments**: `scene` with a drive of constant speed and loads with drag; typical: loads of 0.1 % to 5 % of the machine's
-    mass. The relative error of the result is about this share times the magnification at resonance, see `jam_orbit`.
+    mass. The relative error of the result is proportional to the mass of the loads, see `jam_orbit`.
 
     Resonances whose distance is smaller than their bandwidth have one common peak of the branch and one pair of modes, with
     the number of the resonance nearest to the peak; the status of the other modes is `absent`, and `unresolved` lists them.
