@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -87,9 +87,12 @@ Tables: TypeAlias = dict[str, Any]
 """Content of a file by name, before validation: tables, arrays, texts and numbers."""
 
 
-def suggest_name(name: str, allowed: list[str]) -> str:
-    """Return the end of an error message about an unknown name: the most similar allowed name, and all allowed names."""
-    similar = difflib.get_close_matches(name, allowed, n=1)
+def suggest_name(name: str, allowed: list[str], present: Container[str] = ()) -> str:
+    """Return the end of an error message about an unknown name: the most similar allowed name, and all allowed names.
+
+    A name that is `present` beside the unknown one is not suggested, because it has its value already.
+    """
+    similar = difflib.get_close_matches(name, [other for other in allowed if other not in present], n=1)
     question = f"did you mean {similar[0]!r}? " if similar else ""
     return f"{question}allowed: {', '.join(allowed)}"
 
@@ -325,7 +328,7 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
     prefix = f"{section}." if section else ""
     for name in values:
         if name not in parameters:
-            raise InputError(prefix + name, f"is not a field here; {suggest_name(name, list(parameters))}")
+            raise InputError(prefix + name, f"is not a field here; {suggest_name(name, list(parameters), values)}")
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in values:
             raise InputError(prefix + name, f"is missing; needed here: {', '.join(_needed(parameters))}")

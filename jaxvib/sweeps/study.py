@@ -212,7 +212,8 @@ def load_study(path: str | Path) -> Study:
     run = dict(tables.get("run", {}))
     for name in run:
         if name not in ("until", "start", "mode", "steps"):
-            raise InputError(f"run.{name}", f"is not a field here; {suggest_name(name, ['until', 'start', 'mode', 'steps'])}")
+            advice = suggest_name(name, ["until", "start", "mode", "steps"], run)
+            raise InputError(f"run.{name}", f"is not a field here; {advice}")
     named_measures = [_measure(table, f"measure[{k}]", Path(path)) for k, table in enumerate(tables["measure"])]
     measure: Measures = [m for _, m in named_measures]
     if any(name for name, _ in named_measures):

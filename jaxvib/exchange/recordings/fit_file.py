@@ -85,7 +85,7 @@ def _entries(tables: Mapping[str, object], name: str) -> list[Mapping[str, objec
 def _run(table: Mapping[str, object], k: int, channels: list[Channel], folder: Path) -> MeasuredRun:
     for name in table:
         if name not in _RUN_FIELDS:
-            raise InputError(f"run[{k}].{name}", f"is not a field here; {suggest_name(name, list(_RUN_FIELDS))}")
+            raise InputError(f"run[{k}].{name}", f"is not a field here; {suggest_name(name, list(_RUN_FIELDS), table)}")
     file = table.get("file")
     if not isinstance(file, str):
         raise InputError(f"run[{k}].file", f"is {'missing' if file is None else quoted(file)}; write the path of a recording")
@@ -102,7 +102,7 @@ def _candidate(table: Mapping[str, object], k: int, channels: list[Mapping[str, 
     field = f"candidate[{k}]"
     for name in table:
         if name not in _CANDIDATE_FIELDS:
-            raise InputError(f"{field}.{name}", f"is not a field here; {suggest_name(name, _CANDIDATE_FIELDS)}")
+            raise InputError(f"{field}.{name}", f"is not a field here; {suggest_name(name, _CANDIDATE_FIELDS, table)}")
     for name in ("name", "drive", "duration"):
         if name not in table:
             raise InputError(f"{field}.{name}", "is missing; a candidate needs a name, a drive and a duration")
