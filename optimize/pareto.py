@@ -132,25 +132,25 @@ def pareto(
     def values_of(synthesis: Synthesis) -> tuple[float, float]:
         return float(first(synthesis.scene)), float(second(synthesis.scene))
 
-    def search_with_limit(objective: Quantity, other: Quantity, limit: float) -> list[Synthesis]:
+    def search_with_limit(objective: Quantity, other: Quantity, limit: float) -> Synthesis:
         """Search for the least objective with a limit on the other quantity, then for the least value of that quantity among
-        machines with the same objective."""
+        machines with the same objective. The second search may fail; its machine counts only if it is not worse."""
         best = synthesize(space, objective, subject_to=[*demands, other < limit], starts=starts, seed=seed, verify=False)
         # A flat objective has many minima; the first search ends at any of them.
         with_best_objective = [*demands, objective < float(objective(best.scene))]
         refined = synthesize(space, other, subject_to=with_best_objective, begin=best, seed=seed, verify=False, throw=False)
         if "interrupted" in (best.status_name, refined.status_name):
             raise KeyboardInterrupt  # a front needs all of its searches
-        return [best, refined] if refined.status_name != "contradictory" else [best]
+        return refined if not_dominated(np.asarray([values_of(refined), values_of(best)])) == [0] else best
 
     # The limit excludes only machines that do not have the other quantity. Because of it, all searches share two programs.
     lowest = search_with_limit(first, second, _NO_LIMIT)
     highest = search_with_limit(second, first, _NO_LIMIT)
-    (_, worst), (_, least) = values_of(lowest[-1]), values_of(highest[-1])
-    results = [*lowest, *highest]
+    (_, worst), (_, least) = values_of(lowest), values_of(highest)
+    results = [lowest, highest]
     for limit in np.linspace(worst, least, points)[1:-1] if worst > least else ():
         with contextlib.suppress(ComputationError):  # a search may not find a narrow range of feasible machines
-            results += search_with_limit(first, second, float(limit))
+            results.append(search_with_limit(first, second, float(limit)))
     values = np.asarray([values_of(result) for result in results])
     indices = not_dominated(values)
     return Front(

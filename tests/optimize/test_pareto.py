@@ -47,7 +47,7 @@ def test_fronts_are_those_of_dense_scans_in_both_orders(one, other, free):
         values = front.values[:, order]
         for own in values:  # no machine of the scan is better in both, none of the front is as good as another one
             assert not np.any(np.all(scan < own - 1e-6 * span, axis=1))
-        assert len(not_dominated(values)) == len(values)
+        assert len(not_dominated(values)) == len(values) <= 4
         assert np.all(values.min(axis=0) <= best.min(axis=0) + 1e-6 * span)  # both ends are there
         if one is FLAT:
             assert len(values) == 1
@@ -130,3 +130,17 @@ def test_interrupt_of_a_search_ends_the_front(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         pareto(DesignSpace(SCENE, TWO), FLAT[0], BOWL[0])
     assert len(searches) == 2
+
+
+def test_each_search_of_a_front_adds_one_machine(monkeypatch):
+    """Second searches that end elsewhere on the front are left out."""
+    ends = iter([1.0, 1.1, 9.0, 8.5, 3.0, 3.3, 5.0, 5.5])
+
+    def searched(*_, **__):
+        stiffness = jnp.asarray([1e4 * next(ends), 1e4])
+        return SimpleNamespace(status_name="not_converged", scene=eqx.tree_at(lambda s: s.machine.stiffness, SCENE, stiffness))
+
+    monkeypatch.setattr(sys.modules[pareto.__module__], "synthesize", searched)
+    inverse, _ = of_springs("inverse", lambda x, y, link: 9.0 / x)
+    front = pareto(DesignSpace(SCENE, TWO), FIRST[0], inverse, points=4)
+    np.testing.assert_allclose(front.values[:, 0], [1.0, 3.0, 5.0, 9.0], rtol=1e-12)
