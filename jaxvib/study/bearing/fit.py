@@ -190,6 +190,10 @@ def _least_squares(
     undamped (Gauss-Newton) step is below 0.01 standard errors. The fit counts as converged if that step is below 0.1 standard
     errors, because the time steps of the integration limit the resolution. The code compares the squares, 1e-4 and 1e-2.
 
+    Trials within 0.001 standard errors are accepted although the sum of squares is larger, because only the error of the
+    integration differs. The estimated error of a time step may be accidentally small at a reversal of the dry friction. Without
+    this rule, a sum of squares that is too small for this reason ended the iteration.
+
     **Returns** x (p,), the residual (n,), its Jacobian (n, p), the other two outputs of `residual` (`stopped_at` and the fitted
     angles (n,)), and True if the fit converged.
     """
@@ -201,10 +205,10 @@ def _least_squares(
         return (carry[0] < _MAX_ITERATIONS) & (carry[-1] > 1e-4) & (carry[2] < 1e6)
 
     def step(carry: tuple[Array, ...]) -> tuple[Array, ...]:
-        count, trial, damping, *best, _ = carry
+        count, trial, damping, length_squared, *best, _ = carry
         jacobian, (scaled_residual, stopped_at, fitted) = jacobian_of(trial)
         cost = jnp.sum(scaled_residual**2)
-        better = cost < best[0]  # and not NaN
+        better = (cost < best[0]) | ((length_squared < 1e-6) & jnp.isfinite(cost))
         latest = (cost, trial, scaled_residual, jacobian, stopped_at, fitted)
         best = [jnp.where(better, new, old) for new, old in zip(latest, best, strict=True)]
         damping = jnp.where(better, 0.1 * damping, 10.0 * damping)
@@ -213,12 +217,14 @@ def _least_squares(
         reached = basis.T @ scaled_residual
         normal = triangle.T @ triangle
         damped = normal + damping * jnp.diag(jnp.diagonal(normal))
-        trial = x - jnp.linalg.solve(damped, triangle.T @ reached)
+        change = jnp.linalg.solve(damped, triangle.T @ reached)
+        variance = cost / (n - p) + floor
         # The square of the next undamped step in standard errors, from the best point so far, because the sum of squares may
         # not decrease further at a kink.
-        next_step_squared = jnp.sum(reached**2) / (cost / (n - p) + floor)
-        return count + 1, trial, damping, *best, next_step_squared
+        length_squared, next_step_squared = jnp.sum((triangle @ change) ** 2) / variance, jnp.sum(reached**2) / variance
+        return count + 1, x - change, damping, length_squared, *best, next_step_squared
 
     none = (jnp.asarray(jnp.inf), start, jnp.zeros(size), jnp.zeros((size, p)), jnp.asarray(jnp.nan), jnp.zeros(size))
-    end = jax.lax.while_loop(is_unfinished, step, (jnp.asarray(0), start, jnp.asarray(0.1), *none, jnp.asarray(jnp.inf)))
-    return end[4], end[5], end[6], (end[7], end[8]), end[-1] < 1e-2
+    far = jnp.asarray(jnp.inf)
+    end = jax.lax.while_loop(is_unfinished, step, (jnp.asarray(0), start, jnp.asarray(0.1), far, *none, far))
+    return end[5], end[6], end[7], (end[8], end[9]), end[-1] < 1e-2

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.signal import lfilter
 from swings import ROD, T, noisy, scipy_swing, scipy_swings
 
@@ -12,7 +13,7 @@ import jaxvib as jv
 from jaxvib.results.estimate import student_quantile
 from jaxvib.runtime.compat import no_host_checks
 from jaxvib.study.bearing.decrement import turning_points
-from jaxvib.study.bearing.fit import first_guess, fit_swing, steps_for
+from jaxvib.study.bearing.fit import _least_squares, first_guess, fit_swing, steps_for
 
 
 @pytest.mark.parametrize("degrees", [2.0, 20.0, 40.0, 80.0])
@@ -179,6 +180,27 @@ def test_notes_name_what_is_wrong_with_a_fit():
     faster_and_faster = 0.2 * np.sin(4.0 * t + 0.15 * t**2)
     with pytest.raises(jv.ComputationError, match="not_converged: record: no fit was found"):
         jv.identify(ROD, jv.Record(t, faster_and_faster))
+
+
+def test_a_sum_of_squares_too_small_by_chance_ends_no_fit():
+    """An error of the integration makes one point, a standard error from the minimum, better than all others."""
+    t = np.linspace(0.0, 1.0, 200)
+    data = np.exp(-1.3 * t) + 0.01 * np.random.default_rng(0).normal(size=t.size)
+
+    def model(x):
+        return x[1] * jnp.exp(-x[0] * t) - data
+
+    right = least_squares(model, [1.0, 1.0], xtol=1e-12)
+    error = np.sqrt(np.diagonal(np.linalg.inv(right.jac.T @ right.jac)) * 2.0 * right.cost / (t.size - 2))
+    start = jnp.asarray(right.x + error * [1.0, 0.0])
+
+    def residual(x):
+        value = jnp.where(jnp.all(x == start), 0.9, 1.0) * model(x)
+        return value, (value, jnp.asarray(0.0), value)
+
+    x, *_, converged = _least_squares(residual, start, jnp.asarray(200.0))
+    assert bool(converged)
+    np.testing.assert_array_less(np.abs(x - right.x), 0.1 * error)
 
 
 def test_student_quantile_is_scipys():
