@@ -70,6 +70,7 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
             f"rotation: {', '.join(f'exciter {k} {direction}' for k, direction in enumerate(directions))}",
             "margin: factor by which the differences of the motors' torques can grow; inf for",
             "equal motors",
+            *([] if status_name(result.search) == "done" else [jv.RegimeSearchStatus[result.search]]),
         ]
         blocks = (indented(f"at {speed_text(regime.speed)}, stable:", figures) for regime, figures in stable)
         return "\n".join([drawing, *notes, *blocks])

@@ -11,6 +11,7 @@ from jax import Array
 
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.torque_balance import TorqueBalance, balance_residuals, influence_of, motion_of, unknowns_of
+from jaxvib.numerics.linalg import eliminate
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
@@ -21,8 +22,17 @@ from jaxvib.steady.regimes.symmetry import Exchange, distinct_regimes, exchanges
 _EVEN_SPEEDS, _NEAR_SPEEDS = 200, 40
 """Numbers of speeds at equal distances, and on each side of a resonance or of a drive's working speed."""
 
+MAX_COMPLETE = 6
+"""Largest number of rotating masses for which the search finds all regimes. Their number doubles with each further mass."""
+
 _PHASES_PER_UNKNOWN, _MAX_REGULAR_SETS = 24, 64
 """Random sets of phases for each squared number of unknown phases, and largest number of regular sets."""
+
+_SETS_AT_ONCE = 64
+"""Number of sets of phases whose torques are computed in one operation, which limits the memory."""
+
+_RELAXATIONS, _RELAXATION_TIME, _RELAXATION_GROWTH = 80, 0.3, 1.15
+"""Number of steps that approach a stable regime, size of the first one, and ratio of the sizes of two steps."""
 
 _STARTS_PER_PROGRAM = 256
 """Number of starts in one program."""
@@ -43,6 +53,8 @@ def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
     turn
     3. Regimes that differ by a common shift of all phases or by an exchange of equal masses are one regime. Regimes of one
     speed whose phases can change without a change of torques belong to a family, of which one member is kept
+
+    For more than `MAX_COMPLETE` masses the starts first approach stable regimes, see `relaxed`, and step 2 is left out.
     """
     count, speed = balance.unbalance.size, np.asarray(balance.speed)
     if balance.is_prescribed.all():
@@ -58,7 +70,7 @@ def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
         kept = kept[distinct_regimes(omega[kept], phases[kept], exchanges, tolerance)]
         known = omega[kept], phases[kept], neutral[kept]
         grown = kept[kept >= before]
-        if grown.size == 0 or count == 1:
+        if grown.size == 0 or count == 1 or count > MAX_COMPLETE:
             break
         sets = _related(phases[grown], balance.is_prescribed)
     return known[:2]
@@ -119,13 +131,14 @@ def _speeds(balance: TorqueBalance) -> np.ndarray:
 def sets_of_phases(prescribed: np.ndarray, dtype: np.dtype, per_unknown: int = _PHASES_PER_UNKNOWN) -> np.ndarray:
     """Return regular and random sets of phases (n, count).
 
-    The number of random sets is `per_unknown` times the square of the number of unknown phases. The phases of masses with
-    prescribed speed are 0.
+    The number of random sets is `per_unknown` times the square of the number of unknown phases, and not larger than that for
+    `MAX_COMPLETE` masses. The phases of masses with prescribed speed are 0.
     """
     free = np.flatnonzero(~prescribed) if prescribed.any() else np.arange(1, prescribed.size)
     n = free.size
     even = np.linspace(-np.pi, np.pi, per_unknown, endpoint=False)[:, None] if n == 1 else np.zeros((0, n))
-    random = np.random.default_rng(0).uniform(-np.pi, np.pi, (per_unknown * n * n if n > 1 else 0, n))
+    drawn = per_unknown * min(n, MAX_COMPLETE - 1) ** 2 if n > 1 else 0
+    random = np.random.default_rng(0).uniform(-np.pi, np.pi, (drawn, n))
     sets = np.concatenate([_regular_sets(n), even, random])
     phases = np.zeros((len(sets), prescribed.size), dtype)
     phases[:, free] = sets
@@ -148,7 +161,9 @@ def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tup
         return np.full(len(sets), np.asarray(balance.speed)), sets
     influence, torque = _data_at(balance, speeds)
     forces = np.asarray(balance.unbalance) * np.exp(1j * sets)
-    braking = np.einsum("ai,gik,ak->ag", forces.conj(), influence, forces, optimize=True).imag * speeds**4 / 2.0
+    parts = np.array_split(forces, -(-len(forces) // _SETS_AT_ONCE))
+    each = [np.einsum("ai,gik,ak->ag", part.conj(), influence, part, optimize=True).imag for part in parts]
+    braking = np.concatenate(each) * speeds**4 / 2.0
     total = np.sum(torque, axis=1) + braking
     place, passed = np.nonzero(total[:, :-1] * total[:, 1:] <= 0.0)
     low, high = total[place, passed], total[place, passed + 1]
@@ -195,12 +210,39 @@ def _solved(omega: Array, phases: Array, balance: TorqueBalance) -> tuple[Array,
 
 def solve_near(omega: Array, phase: Array, balance: TorqueBalance) -> tuple[Array, Array, Array, Array]:
     """Return speed, phases, number of neutral directions, and True if the start leads to a solution."""
-    start = unknowns_of(balance, omega, phase)
+    start = relaxed(unknowns_of(balance, omega, phase), balance)
     x, _ = damped_newton(lambda x, given: (balance_residuals(x, given), None), start, balance, _ITERATIONS, on_scalars=False)
     w, angles = motion_of(balance, x)
     good = is_balanced(balance, x)
     neutral = slopes_of(jnp.where(good, x, start), balance).neutral
     return w, jnp.arctan2(jnp.sin(angles), jnp.cos(angles)), neutral, good
+
+
+def relaxed(x: Array, balance: TorqueBalance) -> Array:
+    """Return unknowns near a regime of more than `MAX_COMPLETE` masses that is stable according to the quasi-static criterion.
+
+        Omega' = mean of r,     alpha_k' - alpha_0' = r_k - r_0,     r_i = (L_i + V_i)/(largest possible V_i)
+
+    Steps of the implicit Euler method with growing sizes first follow this slow motion and then become those of Newton's method.
+    Newton's method alone leads from most starts to unstable regimes if there are many masses.
+    """
+    if balance.unbalance.size <= MAX_COMPLETE:
+        return x
+    n, free = x.size, np.flatnonzero(~balance.is_prescribed)
+    mix = np.eye(n, dtype=x.dtype)
+    if free.size == balance.is_prescribed.size:
+        mix[:, 0], mix[0] = -1.0, 1.0 / n
+
+    def rates(x: Array) -> Array:
+        scale = vibration_scale(balance, jax.lax.stop_gradient(motion_of(balance, x)[0]))
+        return mix @ (balance_residuals(x, balance) * (balance.torque_scale / scale)[free])
+
+    def step(k: int, x: Array) -> Array:
+        size = _RELAXATION_TIME * _RELAXATION_GROWTH**k
+        matrix = jnp.eye(n, dtype=x.dtype) / size - jax.jacfwd(rates)(x)
+        return x + jnp.clip(eliminate(matrix, rates(x)), -0.5, 0.5)
+
+    return jax.lax.fori_loop(0, _RELAXATIONS, step, x)
 
 
 def is_balanced(balance: TorqueBalance, x: Array) -> Array:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
 
-_MAX_EXCHANGED_MASSES = 7
-"""Largest number of rotating masses for which all exchanges are tried; 7! are 5040."""
+_MAX_EXCHANGES = 5040
+"""Largest number of exchanges: all of 7 masses, 7!. If a machine has more, some regimes may be listed several times."""
 
 
 class Exchange(NamedTuple):
@@ -30,26 +29,37 @@ def exchanges_of(influence: np.ndarray, numbers: np.ndarray) -> list[Exchange]:
     **Arguments**: `influence` H (speeds, count, count) at several speeds; `numbers` (count, m) of each mass, such as its
     unbalance and its torque at several speeds.
     """
-    count = influence.shape[1]
-    identity = Exchange(np.arange(count), np.zeros(count))
-    if not 1 < count <= _MAX_EXCHANGED_MASSES:
-        return [identity]
-    orders = np.array(list(itertools.permutations(range(count))))
-    scale = np.maximum(np.max(np.abs(numbers), axis=0), np.finfo(float).tiny)
     tolerance = 100.0 * np.finfo(influence.dtype).eps
-    same = np.all(np.abs(numbers[orders] - numbers) <= tolerance * scale, axis=(1, 2))
-    orders = orders[same]
-    turned = influence[:, orders[:, :, None], orders[:, None, :]].transpose(1, 0, 2, 3)
+    scale = np.maximum(np.max(np.abs(numbers), axis=0), np.finfo(float).tiny)
+    same = np.all(np.abs(numbers[:, None] - numbers) <= tolerance * scale, axis=2)
     size = np.max(np.abs(influence), axis=(1, 2), keepdims=True)
     tolerance = np.sqrt(tolerance)
-    alike = np.all(np.abs(np.abs(turned) - np.abs(influence)) <= tolerance * size, axis=(1, 2, 3))
+    orders = _orders(np.abs(influence) / np.where(size > 0.0, size, 1.0), same, tolerance)
+    turned = influence[:, orders[:, :, None], orders[:, None, :]].transpose(1, 0, 2, 3)
     found = []
-    for order, there in zip(orders[alike], turned[alike], strict=True):
+    for order, there in zip(orders, turned, strict=True):
         shift = _shifts(influence, there, tolerance * size)
         wanted = np.exp(1j * (shift[:, None] - shift[None, :])) * influence
         if np.all(np.abs(there - wanted) <= 4.0 * tolerance * size):
             found.append(Exchange(order, shift))
     return found
+
+
+def _orders(size: np.ndarray, same: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return the orders (n, count) of the masses that leave `size` |H| (speeds, count, count) unchanged, first the identity.
+
+    `same` (count, count): True for masses with equal numbers. The orders grow by one mass at a time. At most `_MAX_EXCHANGES`
+    are kept.
+    """
+    orders = np.zeros((1, 0), int)
+    for i in range(len(same)):
+        k = np.arange(len(same))[None, :, None]
+        others = np.concatenate([orders[:, None, :].repeat(len(same), axis=1), k.repeat(len(orders), axis=0)], axis=2)
+        alike = np.abs(size[:, k, others] - size[:, None, None, i, : i + 1]) <= tolerance
+        alike &= np.abs(size[:, others, k] - size[:, None, None, : i + 1, i]) <= tolerance
+        good = same[i] & np.all(alike, axis=(0, 3)) & np.all(others[:, :, :-1] != k, axis=2)
+        orders = others[good][:_MAX_EXCHANGES]
+    return orders
 
 
 def _shifts(influence: np.ndarray, turned: np.ndarray, small: np.ndarray) -> np.ndarray:

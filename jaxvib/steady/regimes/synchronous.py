@@ -55,7 +55,7 @@ from jaxvib.steady.regimes.local import (
     slopes_of,
     vibration_scale,
 )
-from jaxvib.steady.regimes.search import all_regimes, is_balanced
+from jaxvib.steady.regimes.search import MAX_COMPLETE, all_regimes, is_balanced
 from jaxvib.units import Number, number, numbers
 from jaxvib.units.known import when_known
 
@@ -83,6 +83,10 @@ class RegimeSearchStatus(eqx.Enumeration):
     """Outcomes of a search for all regimes."""
 
     done = "all regimes were searched for"
+    sampled = (
+        "more than 6 rotating masses: these regimes were reached from a limited number of starts, which approach stable "
+        "regimes; there may be others"
+    )
     none = (
         "no regime: there is no speed at which the vibrational torque balances the driving torque of every mass; "
         "each mass turns at its own speed"
@@ -213,7 +217,8 @@ class SynchronousRegimes(AbstractSynchronousRegime):
     def summary(self) -> str:
         """Return a line of text for each regime."""
         lines = [self.select(k).summary() for k in range(self.speed.shape[0])]
-        return "\n".join(lines) or RegimeSearchStatus[RegimeSearchStatus.none]
+        complete = lines and status_name(self.search) == "done"
+        return "\n".join(lines if complete else [*lines, RegimeSearchStatus[self.search]])
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
@@ -270,11 +275,13 @@ def synchronous_regimes(
       radian close to where two regimes exchange stability
     - In this approximation exciters with different speeds do not act on each other. `masses` selects a group that turns at one
       speed; `regime_partitions` returns the motions of all divisions into such groups
+    - With more than 6 masses the number of regimes, most of them unstable, is too large for a complete list. The starts then
+      approach stable regimes before Newton's method begins; the list may be incomplete, and `search` is "sampled"
 
     **Arguments**
 
     - `scene`, with gravity as its only effect or without effects; exciters have an unbalance, or loads and an ideal drive;
-      typical: 2 to 6 rotating masses
+      typical: 2 to 32 rotating masses
     - `masses`: numbers, from 0, of the rotating masses that turn at the common speed; the result contains only these and their
       exciters. The others turn at different speeds; only their mass affects the result. Default: all
     - `near`: (speed, phases), rad/s and (mass,) rad, from which Newton's method finds one regime. The function can then be used
@@ -311,11 +318,13 @@ def synchronous_regimes(
             raise InputError("near", f"must be (speed, phases) with one phase for each of the {count} rotating masses")
         speed, phases = number(near[0], "rad/s", "near[0]", low=0.0, open_low=True), numbers(near[1], "rad", "near[1]", count)
         return outcome(_regime_near(scene, speed, phases, group), scene)
-    omega, phases = all_regimes(assemble_for_search(scene, group))
+    balance = assemble_for_search(scene, group)
+    omega, phases = all_regimes(balance)
     fields = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: _regimes_near(scene, w, a, group), omega, phases)
     order = np.flatnonzero(status_names(fields["status"]) != "not_converged")
     order = order[np.lexsort((-fields["speed"][order], ~fields["stable"][order]))]
     search = RegimeSearchStatus.done if order.size else RegimeSearchStatus.none
+    search = RegimeSearchStatus.sampled if count > MAX_COMPLETE and not balance.is_prescribed.all() else search
     return SynchronousRegimes(**on_device(jax.tree.map(lambda leaf: leaf[order], fields)), scene=scene, search=search)
 
 

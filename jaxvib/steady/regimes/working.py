@@ -24,7 +24,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.outcome import outcome, without_numbers
 from jaxvib.steady.regimes.local import Slopes, decays, regime_growth, slopes_of
-from jaxvib.steady.regimes.search import is_balanced, sets_of_phases
+from jaxvib.steady.regimes.search import is_balanced, relaxed, sets_of_phases
 from jaxvib.steady.regimes.synchronous import RegimeStatus, SynchronousRegime, fields_at, require_one_speed
 
 _PHASES_PER_UNKNOWN = 4
@@ -52,11 +52,12 @@ def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
         Lambda = -(Omega^4/4) sum_ik S_i S_k Re(exp(i (alpha_k - alpha_i)) H_ik)
 
     If none of them is stable, slower regimes follow in the order of their speeds. The search takes a hundredth of the time of
-    `synchronous_regimes`, and works under `jit`, `vmap` and `grad`. Derivatives are those of the implicit function theorem.
+    `synchronous_regimes`, and works under `jit`, `vmap` and `grad`. Derivatives are those of the implicit function theorem. With
+    more than 6 exciters the starts first approach stable regimes, as those of `synchronous_regimes`.
 
     **Arguments**
 
-    - `scene` as for `synchronous_regimes`, whose exciters have unbalances and no loads; typical: 1 to 4 exciters
+    - `scene` as for `synchronous_regimes`, whose exciters have unbalances and no loads; typical: 1 to 32 exciters
     - `throw`: True to raise an error if no start leads to a stable regime; with False, and under a JAX transformation, only the
       status shows it
 
@@ -106,7 +107,7 @@ def _stable_solution(balance: TorqueBalance) -> tuple[Array, Slopes | None, Arra
 
     def solve(omega: Array, phase: Array) -> tuple[Array, Array, Array]:
         """Return the unknowns, the speed (0 without a solution) and Blekhman's function."""
-        start = unknowns_of(balance, omega, phase)
+        start = relaxed(unknowns_of(balance, omega, phase), balance)
         x, _ = damped_newton(
             lambda x, given: (balance_residuals(x, given), None), start, balance, _ITERATIONS, on_scalars=False
         )

@@ -465,7 +465,8 @@ def as_list(regime, n):
     fields = {name: getattr(regime, name) for name in jv.SynchronousRegime.__dataclass_fields__ if name != "scene"}
     fields = jax.tree.map(lambda leaf: jnp.repeat(leaf[None], n, axis=0), fields)
     fields["speed"] = fields["speed"] - jnp.arange(float(n))
-    return jv.SynchronousRegimes(**fields, scene=regime.scene, search=jv.RegimeSearchStatus.done)
+    search = jv.RegimeSearchStatus.done if n else jv.RegimeSearchStatus.none
+    return jv.SynchronousRegimes(**fields, scene=regime.scene, search=search)
 
 
 def test_summary_and_plot_of_regimes(two):
