@@ -308,6 +308,6 @@ FORMS = (
 )
 """Closed forms 1 to 6. The middle one of three on a line opposes to the extent that damping permits.
 
-The phase of the balancers in step returns at 0.05 1/s only. It therefore contains the rounding errors of its last 2000 steps, at
-angles of 1e4 rad: about 5e-11 rad, for any tolerance of the integration.
+The phase of the balancers in step returns at 0.05 1/s only. It therefore contains the rounding errors of its last 2000 steps,
+at angles of 1e4 rad: about 5e-11 rad, for any tolerance of the integration.
 """
