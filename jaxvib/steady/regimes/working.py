@@ -52,8 +52,8 @@ def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
         Lambda = -(Omega^4/4) sum_ik S_i S_k Re(exp(i (alpha_k - alpha_i)) H_ik)
 
     If none of them is stable, slower regimes follow in the order of their speeds. The search takes a hundredth of the time of
-    `synchronous_regimes`, and works under `jit`, `vmap` and `grad`. Derivatives are those of the implicit function theorem. With
-    more than 6 exciters the starts first approach stable regimes, as those of `synchronous_regimes`.
+    `synchronous_regimes`, and works under `jit`, `vmap` and `grad`. Derivatives are those of the implicit function theorem.
+    With more than 6 exciters the starts first approach stable regimes, as those of `synchronous_regimes`.
 
     **Arguments**
 
