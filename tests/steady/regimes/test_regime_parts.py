@@ -18,7 +18,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.steady.regimes import local, partitions, search, symmetry, synchronous, working
 
 S, PLACES, WAYS, SPEEDS = (0.4, 0.3, 0.5), ((-0.5, 0.3), (0.4, 0.1), (0.1, -0.4)), (1, -1, 1), (100.0, 99.5, 101.0)
-STALL, J = (60.0, 50.0, 40.0), (0.05, 0.06, 0.07)
+STALL, J, STATUSES = (60.0, 50.0, 40.0), (0.05, 0.06, 0.07), jv.RegimeSearchStatus
 
 
 def body():
@@ -465,8 +465,7 @@ def as_list(regime, n):
     fields = {name: getattr(regime, name) for name in jv.SynchronousRegime.__dataclass_fields__ if name != "scene"}
     fields = jax.tree.map(lambda leaf: jnp.repeat(leaf[None], n, axis=0), fields)
     fields["speed"] = fields["speed"] - jnp.arange(float(n))
-    search = jv.RegimeSearchStatus.done if n else jv.RegimeSearchStatus.none
-    return jv.SynchronousRegimes(**fields, scene=regime.scene, search=search)
+    return jv.SynchronousRegimes(**fields, scene=regime.scene, search=STATUSES.done if n else STATUSES.none)
 
 
 def test_summary_and_plot_of_regimes(two):
@@ -483,7 +482,7 @@ def test_summary_and_plot_of_regimes(two):
     several = as_list(regime, 3)
     assert [float(several.select(k).speed) for k in range(3)] == [float(regime.speed) - k for k in range(3)]
     assert len(several.summary().splitlines()) == 3 and several.summary().startswith(regime.summary())
-    assert as_list(regime, 0).summary() == synchronous.RegimeSearchStatus[synchronous.RegimeSearchStatus.none]
+    assert as_list(regime, 0).summary() == STATUSES[STATUSES.none]
     for index in (3, -1):
         with pytest.raises(jv.InputError, match=rf"^index is {index}; there are 3 regimes, counted from 0"):
             several.select(index)
