@@ -20,6 +20,9 @@ SEPARATION = click.option(
 _DECK_KEY = "jaxvib.deck_point"
 """Key of the values of --deck and --slope in the context of click."""
 
+_NOTED_KEY = "jaxvib.noted_measures"
+"""Key of True in the context of click if a note about implausible measures was printed."""
+
 
 def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options --deck and --slope, which `measures_of` reads, to a command."""
@@ -52,17 +55,23 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def measures_of(scene: jv.Scene, motion: jv.Jam | jv.PhaseJam | jv.Orbit | jv.Vibration) -> jv.VibrationMeasures:
-    """Return the measures of a vibration, at the points of the option --deck.
+    """Return the measures of a vibration, at the points of the option --deck, with a note on stderr about implausible ones.
 
-    **Raises** `InputError` for a machine that is not a body in a plane.
+    **Raises** `InputError` for the option with a machine that is not a body in a plane.
     """
     import jax  # slow import, which --help does not need
 
     require_deck_options(scene)
-    deck = dict(click.get_current_context().meta.get(_DECK_KEY, {}))
+    meta = click.get_current_context().meta
+    deck = dict(meta.get(_DECK_KEY, {}))
     if "at" in deck:
         deck["at"] = deck["at"][0] if len(deck["at"]) == 1 else deck["at"]
-    return jax.device_get(jv.vibration_measures(scene, motion, **deck))
+    measures = jax.device_get(jv.vibration_measures(scene, motion, **deck))
+    if not meta.get(_NOTED_KEY):  # one note for each command
+        for note in measures.notes():
+            meta[_NOTED_KEY] = True
+            click.echo(f"note: {note}", err=True)
+    return measures
 
 
 def require_deck_options(scene: jv.Scene) -> None:

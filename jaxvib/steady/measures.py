@@ -58,6 +58,11 @@ _LARGEST_TRANSMISSIBILITY = 1e4
 left."""
 
 
+_MAX_ACCELERATION, _MAX_THROW_NUMBER = 8.0, 8.0
+"""Acceleration, g, and throw number above which `VibrationMeasures.notes` doubts a vibration: usual values of practice are 3 to
+6 g, and up to 7 g for fine sieving and dewatering."""
+
+
 def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
     """Return the amplitude of the acceleration, in g, of a sine of `amplitude`, m zero to peak, and `speed`, rad/s."""
     return speed**2 * amplitude / STANDARD_GRAVITY
@@ -176,6 +181,20 @@ class VibrationMeasures(eqx.Module):
     def isolation_efficiency(self) -> Array:
         """Share of the exciter's force that does not reach the foundation: 1 - transmissibility, negative above 1."""
         return 1.0 - self.transmissibility
+
+    def notes(self) -> list[str]:
+        """Return a sentence for an acceleration above 8 g, and for a throw number above 8, which usual screens do not reach."""
+        accelerations, throws = (self.acceleration, self.point_acceleration), (self.throw_number,)
+        fastest, highest = (
+            max((float(x) for value in values if value is not None for x in np.ravel(value) if np.isfinite(x)), default=0.0)
+            for values in (accelerations, throws)
+        )
+        notes = []
+        if fastest > _MAX_ACCELERATION:
+            notes.append(f"the acceleration is {fastest:.3g} g; screens usually have 3 to 6 g, up to 7 g for fine sieving")
+        if highest > _MAX_THROW_NUMBER:
+            notes.append(f"the throw number is {highest:.3g}; screens usually have 3 to 5")
+        return notes
 
     def document(self) -> dict[str, object]:
         """Return all measures by name."""

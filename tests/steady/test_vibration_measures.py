@@ -280,3 +280,14 @@ def test_an_averaged_motor_has_the_torque_of_its_speed():
     np.testing.assert_allclose([measures.torque[0], measures.power[0]], [line, n * line], rtol=1e-6)
     lost = 300.0 * n**2 * float(run.amplitude[0]) ** 2  # c (w A)^2 / 2
     np.testing.assert_allclose(measures.power, lost, rtol=1e-3)  # the tolerance of a step is 1e-4
+
+
+@pytest.mark.parametrize(("unbalance", "notes"), [(0.6, []), (1.9, ["the acceleration is 9.", "the throw number is 9."])])
+def test_accelerations_above_8_g_have_notes(unbalance, notes):
+    springs = [jv.support(at=(x, 0.0), stiffness=(1e4, 1e4), damping=(50.0, 50.0)) for x in (-1.0, 1.0)]
+    body = jv.plane_body(mass=200.0, inertia=100.0, supports=springs)
+    scene = jv.Scene(body, exciters=[jv.Exciter(drive=jv.ConstantSpeed(100.0), unbalance=unbalance, at=(0.0, 0.0))])
+    measures = jv.vibration_measures(scene, jv.response(scene, speeds=[100.0]).vibration())
+    y = unbalance * 1e4 / abs(2e4 - 200.0 * 1e4 + 1e4j)  # closed form
+    np.testing.assert_allclose(measures.throw_number, 1e4 * y / G, rtol=1e-9)
+    assert [each[: len(start)] for each, start in zip(measures.notes(), notes, strict=True)] == notes
