@@ -15,6 +15,7 @@ from jaxvib.boundary import is_real, validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
 from jaxvib.machine.scene import Scene
+from jaxvib.results.readable import Readable
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_known
 from optimize.quantities.evaluation import Evaluation
@@ -29,7 +30,7 @@ Source = str | tuple[str, float | Literal["keep"]]
 """Source of a tied parameter: the name of another parameter, with a factor, or "keep" for their present ratio."""
 
 
-class HeldQuantity(eqx.Module):
+class HeldQuantity(Readable):
     """Quantity that keeps its value during the search.
 
     Returned by `hold`.
@@ -92,7 +93,7 @@ class Choice(NamedTuple):
     start: int
 
 
-class DesignSpace(eqx.Module):
+class DesignSpace(Readable):
     """Parameters of a scene that may change, between bounds, and quantities that must keep their value.
 
     **Arguments**

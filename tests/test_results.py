@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 
@@ -14,6 +15,8 @@ from matplotlib.figure import Figure
 from small_machine import checked_gradients, small_sweep
 
 import jaxvib as jv
+import optimize
+from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.growth import Growth, GrowthStatus
 from jaxvib.motion.run import RunStatus
 from jaxvib.results.files import _digest
@@ -24,6 +27,7 @@ from jaxvib.steady.balance.speeds import characteristic_speeds
 from jaxvib.steady.balance.states import balanced_stability
 from jaxvib.steady.jams.phase_search import phase_branch
 from jaxvib.steady.orbits.diagram import SpecialPoint
+from jaxvib.steady.response import OperatingPoints, TorqueFolds
 from jaxvib.study.accuracy.cost import CostRow
 from jaxvib.study.accuracy.harmonics import HarmonicConvergence
 from jaxvib.study.accuracy.tiers import Tiers, TierValues
@@ -283,9 +287,39 @@ def test_representation_is_the_summary_and_html_has_the_figure(result):
     assert result._repr_html_().startswith("<pre>") and "data:image/png;base64," in result._repr_html_()
 
 
-def test_representation_of_a_batch_shows_shapes():
+def test_representation_of_a_batch_shows_values():
     batch = jax.vmap(lambda n: jv.jam_modes(at_speed(n)))(jnp.array([40.0, 60.0]))
-    assert repr(batch).startswith("JamModes(") and "omega=f64[2,3]" in repr(batch) and "<img" not in batch._repr_html_()
+    rpm = 30.0 / np.pi * np.asarray(batch.omega)
+    rows = ", ".join(f"[{', '.join(f'{x:.5g}' for x in row)}]" for row in rpm)
+    assert repr(batch).startswith("JamModes:") and f"\n  omega: {rows} rpm\n" in repr(batch)
+    assert "<img" not in batch._repr_html_()
+
+
+def test_parts_of_results_show_values_with_units():
+    motor = jv.DCMotor("1500 rpm", stall_torque=12.0, inertia=0.1)
+    scene = jv.Scene(jv.one_mass(mass=200.0, stiffness=8e5, damping=600.0), exciters=[jv.Exciter(drive=motor, unbalance=0.2)])
+    found = jv.response(scene)
+    speeds = ", ".join(f"{30.0 / np.pi * float(w):.5g}" for w in found.operating.speed)
+    assert f"\n  speed: {speeds} rpm\n" in repr(found.operating) and "f64[" not in repr(found.operating) + repr(found.folds)
+    shown = []
+    jax.jit(lambda x: shown.append(repr(jv.State(x, x, angle=(x,), rate=(x,)))))(jnp.zeros(2))
+    assert "displacement=f64[2]" in shown[0]  # a traced object has no values
+
+
+def test_every_public_class_with_arrays_shows_values():
+    """Classes of parts of scenes, results and their parts, and inputs; not those of integration methods."""
+    public = [getattr(package, name) for package in (jv, optimize) for name in package.__all__]
+    classes = {each for each in public if isinstance(each, type) and issubclass(each, eqx.Module)}
+    for each in list(classes):
+        hints = " ".join(str(field.type) for field in dataclasses.fields(each))
+        module = vars(sys.modules[each.__module__])
+        classes |= {
+            value for name, value in module.items() if re.search(rf"\b{name}\b", hints)
+            and isinstance(value, type) and issubclass(value, eqx.Module)
+        }  # fmt: skip
+    assert {jv.State, jv.Run, Trajectory, OperatingPoints, TorqueFolds} <= classes
+    shapes = {each.__name__ for each in classes if each.__repr__ is eqx.Module.__repr__}
+    assert shapes == set()
 
 
 def test_pandas_table_has_a_row_for_each_point(result):

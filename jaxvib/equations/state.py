@@ -11,9 +11,10 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.results.fields import in_unit, part
+from jaxvib.results.readable import Readable
 
 
-class Spin(eqx.Module):
+class Spin(Readable):
     """Free rotation of rolling loads, if effects permit it (`FreeSpin`, `Sliding`), or its time derivative.
 
     **Attributes** (each is None if no effect permits it)
@@ -32,7 +33,7 @@ class Spin(eqx.Module):
     slip: tuple[Array, ...] | None = None
 
 
-class ExciterState(eqx.Module):
+class ExciterState(Readable):
     """Positions and velocities of one exciter, or their time derivatives.
 
     All angles are anticlockwise.
@@ -67,7 +68,7 @@ class _Omitted:
 _OMITTED: Any = _Omitted()
 
 
-class State(eqx.Module):
+class State(Readable):
     """Positions and velocities of all parts of a scene, or their time derivatives.
 
     **Arguments**

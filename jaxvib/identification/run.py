@@ -16,6 +16,7 @@ from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.records.pulses import number_pulses, rising_edges
 from jaxvib.identification.records.recorded import described_channels, recorded_from_sep005
 from jaxvib.identification.records.sampling import clipped_at, even_samples, require_ascending
+from jaxvib.results.readable import Readable
 from jaxvib.results.table import is_number
 from jaxvib.units import Number, number
 
@@ -38,7 +39,7 @@ class Change(NamedTuple):
     amount: float | str
 
 
-class MeasuredRun(eqx.Module):
+class MeasuredRun(Readable):
     """Recorded run of a machine.
 
     **Attributes**

@@ -16,10 +16,11 @@ from jax.typing import ArrayLike
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers import Part
+from jaxvib.results.readable import Readable
 from jaxvib.units import Number, count, number, numbers
 
 
-class BodyPoint(eqx.Module):
+class BodyPoint(Readable):
     """Point of one of several bodies.
 
     **Attributes**: `at` (2,): the point (x, y), m from the body's centre of mass, None for the centre itself; `body`: number of
@@ -58,7 +59,7 @@ def on_body(at: int | Array | None, body: int) -> Place:
     return at if body == 0 or isinstance(at, int) else BodyPoint(at, body)
 
 
-class Mount(eqx.Module):
+class Mount(Readable):
     """Mount of an exciter on a machine with nd coordinates q, whose points move in np directions.
 
         load j moves by sum_l levers[l][j] rows[l] q,      the rotor's centre of mass by sum_l rotor_levers[l] rows[l] q
@@ -150,7 +151,7 @@ def _combine(levers: Sequence[Array | None], values: Sequence[Array]) -> Array:
     return sum(terms[1:], terms[0])
 
 
-class Carrier(eqx.Module):
+class Carrier(Readable):
     """Linear structure of a machine.
 
         M q'' + (C + speed G) q' + K q = forces,        force on the foundation = T_K q + T_C q'

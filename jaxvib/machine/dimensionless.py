@@ -17,6 +17,7 @@ from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.platforms import Platforms
+from jaxvib.results.readable import Readable
 from jaxvib.runtime.devices import known, numpy_of, on_device
 from jaxvib.units import Number, Numbers, number, numbers
 from jaxvib.units import count as whole
@@ -25,7 +26,7 @@ _LINKS: dict[int, tuple[tuple[int, int], ...]] = {1: (), 2: ((1, 2),), 3: ((1, 2
 _KINDS = {1: "one_mass", 2: "two_mass", 3: "three_mass"}
 
 
-class Dimensionless(eqx.Module):
+class Dimensionless(Readable):
     """Platform machine in the dimensionless parameters of the antiphase paper or the criterion paper (see the source). The
     exciter is on platform 2, or on the only platform.
 

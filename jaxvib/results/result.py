@@ -16,6 +16,7 @@ from jaxvib.display import Figure
 from jaxvib.errors import InputError, optional_module, quoted
 from jaxvib.results import fields, files
 from jaxvib.results.csv import main_axis, table_along
+from jaxvib.results.readable import Readable
 from jaxvib.results.status import sentence, status_name
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     import xarray
 
 
-class Result(eqx.Module):
+class Result(Readable):
     """Base of all results: numbers with a status.
 
     - `status`, and its sentence `message`
@@ -69,10 +70,6 @@ class Result(eqx.Module):
     @abc.abstractmethod
     def plot(self) -> "Figure":
         """Plot the result by matplotlib; `plot(ax=axes)` draws onto given axes, one for each panel, and returns them."""
-
-    def __repr__(self) -> str:
-        """Return the summary, or the shapes of the arrays for a batch of results and for a traced result."""
-        return self.summary() if fields.is_single(self) else super().__repr__()
 
     def _repr_html_(self) -> str:
         """Return the representation and, for a single result, its figure, for notebooks."""

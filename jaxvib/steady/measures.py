@@ -26,7 +26,8 @@ from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import bracketed_root
-from jaxvib.results.fields import in_unit, is_single
+from jaxvib.results.fields import in_unit
+from jaxvib.results.readable import Readable
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import Jam
 from jaxvib.steady.jams.phases import PhaseJam
@@ -136,7 +137,7 @@ class Vibration(NamedTuple):
     power: Array
 
 
-class VibrationMeasures(eqx.Module):
+class VibrationMeasures(Readable):
     """Measures of a vibration as data sheets state them.
 
     Returned by `vibration_measures`.
@@ -243,9 +244,6 @@ class VibrationMeasures(eqx.Module):
                 f"  throw number {throw:.3g}, {conveys}",
             ]
         return lines
-
-    def __repr__(self) -> str:
-        return self.summary() if is_single(self) else super().__repr__()
 
 
 def _zone_text(velocity: float) -> str:

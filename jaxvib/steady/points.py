@@ -21,7 +21,8 @@ from jaxvib.display import Axes, Drawn, quantity_text
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Machine, Place, on_body, read_place
 from jaxvib.numerics.linalg import magnitude
-from jaxvib.results.fields import in_unit, is_single, part
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.readable import Readable
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
@@ -35,7 +36,7 @@ _MIN_AXES_DIFFERENCE = 1e-12
 """Relative difference of the semi-axes below which the path counts as a circle, whose long axis has no direction."""
 
 
-class Ellipse(eqx.Module):
+class Ellipse(Readable):
     """Path of a point that vibrates at one speed.
 
     **Attributes**
@@ -81,9 +82,6 @@ class Ellipse(eqx.Module):
         numbers = f"{float(self.acceleration):.4g} g, throw number {float(self.throw_number):.4g}"
         rest = f", remainder {float(self.remainder):.2g}" if float(self.remainder) > 0.0 else ""
         return f"{axes}, {along}, {numbers}{rest}"
-
-    def __repr__(self) -> str:
-        return self.summary() if is_single(self) else super().__repr__()
 
 
 @validated

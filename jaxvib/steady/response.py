@@ -24,6 +24,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit, part
+from jaxvib.results.readable import Readable
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Pieces, branch_pieces, branch_root, fold_points, scanned_speed, spread_points
@@ -46,7 +47,7 @@ class ResponseStatus(eqx.Enumeration):
     refused = REFUSED
 
 
-class AbstractResponse(eqx.Module):
+class AbstractResponse(Readable):
     """Vibration q = Re(displacement exp(i w t)) under unbalances that turn at the speed w, for several speeds.
 
     **Attributes** (nd coordinates, of which nt are displacements in m)
@@ -109,7 +110,7 @@ class OperatingPoints(AbstractResponse):
     stable: Array = eqx.field(metadata=in_unit("", "*"))
 
 
-class TorqueFolds(eqx.Module):
+class TorqueFolds(Readable):
     """Folds: speeds at which `torque_share` is a maximum (at a resonance) or a minimum (beyond it).
 
     **Attributes** (2 nd,), ascending in `speed`; entries whose `exists` is False are NaN

@@ -19,10 +19,11 @@ from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive
 from jaxvib.numerics.noise import Noise
+from jaxvib.results.readable import Readable
 from jaxvib.units import Number, number
 
 
-class PlannedRun(eqx.Module):
+class PlannedRun(Readable):
     """Run that is not recorded yet.
 
     **Arguments**

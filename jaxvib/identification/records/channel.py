@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted, require_one_of
+from jaxvib.results.readable import Readable
 from jaxvib.results.table import is_number
 from jaxvib.units import Number, number
 from jaxvib.units.columns import unit_factor
@@ -36,7 +37,7 @@ _GAIN_ERROR = {"acceleration": 0.01}
 _DIRECTIONS = {"up": (0.0, 1.0), "down": (0.0, -1.0), "across": (1.0, 0.0), "-across": (-1.0, 0.0)}
 
 
-class Channel(eqx.Module):
+class Channel(Readable):
     """Channel of a recorded run: a sensor with its place, or a quantity that the recorder computed.
 
     **Arguments**

@@ -19,6 +19,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
+from jaxvib.results.readable import Readable
 from jaxvib.runtime.programs import cached
 
 MIN_CHANGE_SCALE = 1e-4
@@ -29,7 +30,7 @@ Field = Callable[[Array, State], State]
 """Equations of motion: function from a time and a state to the rates of the state."""
 
 
-class Trajectory(eqx.Module):
+class Trajectory(Readable):
     """States at some times.
 
     **Attributes** (nt times)
@@ -66,7 +67,7 @@ def only_exciter_value(values: tuple[Array, ...], name: str) -> Array:
     return values[0]
 
 
-class AbstractMeasured(eqx.Module):
+class AbstractMeasured(Readable):
     """Quantities of a motion, measured over the window at the end of a run.
 
     **Attributes**

@@ -25,6 +25,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory, turning_angles, turning_directions
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit
+from jaxvib.results.readable import Readable
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.measures import Vibration, VibrationMeasures, vibration_measures
 from jaxvib.steady.points import Harmonic, rows_in_plane
@@ -40,7 +41,7 @@ _HARMONICS = 3
 """Number of fitted harmonics. The second and the third are included because they would otherwise influence the first."""
 
 
-class PointMotion(eqx.Module):
+class PointMotion(Readable):
     """Motion of a point of a machine at nt times.
 
     Returned by `Run.point`.

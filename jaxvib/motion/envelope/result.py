@@ -24,6 +24,7 @@ from jaxvib.motion.analysis.measure import AbstractMeasured, only_exciter_value
 from jaxvib.motion.analysis.points import absent_vibration, measures_text, require_vibration
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.results.fields import in_unit, part
+from jaxvib.results.readable import Readable
 from jaxvib.results.result import Result
 from jaxvib.results.status import status_name
 from jaxvib.steady.measures import Vibration, VibrationMeasures
@@ -52,7 +53,7 @@ class EnvelopeStatus(eqx.Enumeration):
     )
 
 
-class Envelopes(eqx.Module):
+class Envelopes(Readable):
     """Averaged motion at some times; the rotor of an exciter without loads counts as one load.
 
     **Attributes** (nt times, nd coordinates, nb directions of the force)

@@ -22,6 +22,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_solve
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
+from jaxvib.results.readable import Readable
 
 Excited = TypeVar("Excited", bound=ExcitedModel)
 
@@ -32,7 +33,7 @@ _BLOCK_SIZE = 1024
 """Number of load speeds whose sums over the poles fit into the processor's first cache."""
 
 
-class Folds(eqx.Module):
+class Folds(Readable):
     """Points with dn/dOmega = 0, where two jam modes appear or merge.
 
     **Attributes**, all (2 nd,), ascending in `omega`; `exists` is False for unused entries, which are at the end

@@ -13,6 +13,7 @@ from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.linear import jammed_loads
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit, part
+from jaxvib.results.readable import Readable
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.steady.jams.jam import Jam, jam_modes
@@ -21,7 +22,7 @@ from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.units import numbers
 
 
-class TierValues(eqx.Module):
+class TierValues(Readable):
     """Results of one tier for n masses, NaN for a missing result.
 
     **Attributes**: `omega` (n,), rad/s; `amplitude` (n, nd), m (tilts: rad), and `foundation_force` (n,), N, zero to peak;

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.results.fields import in_unit
+from jaxvib.results.readable import Readable
 from jaxvib.results.table import TextTable, read_table
 from jaxvib.units.columns import split_head, unit_factor
 
@@ -25,7 +26,7 @@ _SI = {"time": "s", "angle": "rad"}
 _EXAMPLES = {"time": "s, ms, us or min", "angle": "rad, mrad, deg, gon or turn"}
 
 
-class Record(eqx.Module):
+class Record(Readable):
     """Recorded swing of a pendulum.
 
     **Arguments**

@@ -20,6 +20,7 @@ from jaxvib.machine.effects.friction import dry_lever
 from jaxvib.motion.plan import Tolerance, require
 from jaxvib.ode.types import RealScalarLike
 from jaxvib.results.fields import in_unit
+from jaxvib.results.readable import Readable
 from jaxvib.results.result import Result
 from jaxvib.runtime.compat import fast_diffrax_loop_end
 from jaxvib.runtime.programs import cached
@@ -28,7 +29,7 @@ from jaxvib.units import Number, Numbers, count, number, numbers
 from jaxvib.units.known import require_if_known
 
 
-class BearingPendulum(eqx.Module):
+class BearingPendulum(Readable):
     """Pendulum on a stationary bearing; its angle f is measured from the hanging position.
 
         J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) sign(f') - b |f'| f' + M

@@ -1,0 +1,102 @@
+"""Text representation of objects that contain arrays: values with units."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxvib.display import shown_unit
+from jaxvib.results.fields import is_single
+from jaxvib.results.status import is_status, sentence
+
+_MAX_ENTRIES = 12
+"""Largest number of entries of an array that are all shown; of a larger array the shape, the smallest and the largest value are
+shown."""
+
+
+class Readable(eqx.Module):
+    """Base of results, of their parts and of other objects with arrays: `repr` shows values with units.
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> jv.State(jnp.array([0.0012, -0.0004]), jnp.zeros(2), angle=(jnp.arange(100.0),), rate=(jnp.full(100, 60.0),))
+    State:
+      displacement: 0.0012, -0.0004 m or rad
+      velocity: 0, 0 m/s or rad/s
+      exciters:
+        angle: (100,) from 0 to 5672.3 deg
+        rate: (100,) from 572.96 to 572.96 rpm
+    """
+
+    def __repr__(self) -> str:
+        """Return the summary of a single result, otherwise values and units of all fields; for a traced object its shapes."""
+        if not _has_values(self):
+            return super().__repr__()
+        summary = getattr(self, "summary", None)
+        if summary is not None and is_single(self):
+            return summary()
+        return "\n".join([f"{type(self).__name__}:", *_lines(self)])
+
+
+def values_text(values: object, unit: str = "", digits: int = 5) -> str:
+    """Return numbers of any shape in their display unit as text: all of a few, otherwise their shape and range.
+
+    **Arguments**: `values` in the SI `unit`; `digits`: significant digits.
+
+    >>> values_text([[0.01, 0.02], [0.03, float("nan")]], "m"), values_text(np.linspace(0.0, 0.1, 50), "m")
+    ('[10, 20], [30, nan] mm', '(50,) from 0 to 100 mm')
+    """
+    array = np.asarray(values)
+    if array.dtype.kind not in "fc":
+        return _entries(array, str) if array.size <= _MAX_ENTRIES else f"{array.shape} of {array.dtype}"
+    finite = array[np.isfinite(array)]
+    shown, factor = shown_unit(unit, float(np.max(np.abs(finite), initial=0.0)))
+    if array.size <= _MAX_ENTRIES:
+        return f"{_entries(factor * array, lambda x: f'{x:.{digits}g}')} {shown}".rstrip()
+    if finite.size == 0:
+        return f"{array.shape} of nan"
+    name, span = ("magnitude ", np.abs(finite)) if array.dtype.kind == "c" else ("", finite)
+    return f"{array.shape} {name}from {factor * np.min(span):.{digits}g} to {factor * np.max(span):.{digits}g} {shown}".rstrip()
+
+
+def _has_values(tree: eqx.Module) -> bool:
+    """Return True if no number in the tree is traced."""
+    try:
+        for leaf in jax.tree.leaves(tree):
+            np.asarray(leaf)
+    except jax.errors.TracerArrayConversionError:
+        return False
+    return True
+
+
+def _entries(array: np.ndarray, text: object) -> str:
+    if array.ndim == 0:
+        return text(array.item())
+    return ", ".join(_entries(each, text) if each.ndim == 0 else f"[{_entries(each, text)}]" for each in array)
+
+
+def _lines(tree: eqx.Module) -> list[str]:
+    """Return a line for each field of a tree, and indented lines for trees in it."""
+    lines = []
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name, None)
+        trees = list(value) if isinstance(value, (tuple, list)) else [value]
+        if value is None or not trees:
+            continue
+        if all(isinstance(each, Readable) for each in trees):
+            for k, each in enumerate(trees):
+                name = field.name if len(trees) == 1 else f"{field.name}[{k}]"
+                lines += [f"  {name}:", *(f"  {line}" for line in _lines(each))]
+            continue
+        if is_status(value):
+            text = sentence(value)
+        elif all(isinstance(each, (jax.Array, np.ndarray, float)) for each in trees):
+            text = "; ".join(values_text(each, field.metadata.get("unit", "")) for each in trees)
+        elif isinstance(value, eqx.Module):
+            text = f"a {getattr(value, 'kind', type(value).__name__)}"
+        else:
+            text = repr(value)
+        lines.append(f"  {field.name}: {text}")
+    return lines
