@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import weakref
 from collections.abc import Callable, Hashable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -219,20 +220,29 @@ _CARRIED = ("loads", "unbalance")
 
 
 def _rebuild(scene: Scene) -> None:
-    """Construct each part of a scene again. **Raises** `InputError` for a known value that is not allowed."""
-    rebuild_part(scene.machine, "machine")
+    """Construct each part of a scene again. **Raises** `InputError` for a known value or a shape that is not allowed."""
+    _rebuild_part(scene.machine, "machine")
     for k, exciter in enumerate(scene.exciters):
         with within(scene.prefix_of(k)):
             if exciter.loads is not None:
-                rebuild_part(exciter.loads, "loads")
-            rebuild_part(exciter.drive, "drive")
+                _rebuild_part(exciter.loads, "loads")
+            _rebuild_part(exciter.drive, "drive")
             if (exciter.loads is not None, exciter.unbalance is not None) != tuple(x in exciter.carries for x in _CARRIED):
                 raise InputError("carries", f"is {exciter.carries}, but the exciter has other parts; create a new Exciter")
             read_unbalance(exciter.drive, exciter.unbalance, exciter.unbalance_mass)
             for effect in exciter.effects:
-                rebuild_part(effect, f"effects.{effect.kind}")
+                _rebuild_part(effect, f"effects.{effect.kind}")
     for effect in scene.effects:
-        rebuild_part(effect, f"effects.{effect.kind}")
+        _rebuild_part(effect, f"effects.{effect.kind}")
+
+
+def _rebuild_part(part: Any, section: str) -> None:
+    """Construct a part again. **Raises** `InputError` also for a shape that only the constructor accepts, such as one number for
+    an array of one value."""
+    for (path, leaf), new in zip(jax.tree_util.tree_leaves_with_path(part), jax.tree.leaves(rebuild_part(part, section))):
+        if np.shape(leaf) != np.shape(new):
+            name = f"{section}{jax.tree_util.keystr(path)}"
+            raise InputError(name, f"is an array of shape {np.shape(leaf)}; the shape {np.shape(new)} is needed")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,6 +33,14 @@ WRONG = {
     "no speed": (lambda: changed(lambda s: s.drive.speed, 0.0), "drive.speed is 0 rad/s; it must be greater than 0"),
     "a text": (lambda: changed(lambda s: s.drive.speed, "50 rpm"), "scene.drive.speed is '50 rpm', which is not a number"),
     "another shape": (lambda: changed(lambda s: s.machine.mass, jnp.ones(3)), "machine.mass has 3 values; 2 are needed"),
+    "a number for an array": (
+        lambda: changed(lambda s: s.machine.link_stiffness, 2e5),
+        "machine.link_stiffness is an array of shape (); the shape (1,) is needed",
+    ),
+    "an array for a number": (
+        lambda: changed(lambda s: s.drive.speed, jnp.asarray([60.0])),
+        "drive.speed is a list of 1 values",
+    ),
     "heavy loads": (
         lambda: changed(lambda s: s.loads.mass, 1e18),
         "loads.mass gives 3e+18 kg for all loads on a machine of 215 kg",
