@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import re
 import tomllib
 from collections.abc import Callable, Container, Iterator, Mapping
 from functools import partial
@@ -97,6 +98,11 @@ def suggest_name(name: str, allowed: list[str], present: Container[str] = ()) ->
     return f"{question}allowed: {', '.join(allowed)}"
 
 
+_KEY = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+_LONG_KEY = re.compile(rf"(?<![\w\"'.-]){_KEY}(?:[ \t]*\.[ \t]*{_KEY}){{16}}")
+"""A dotted key of more than 16 names; the time of `tomllib` is proportional to the square of their number."""
+
+
 def read_toml(path: str | Path) -> Tables:
     """Return the tables of a TOML file.
 
@@ -108,13 +114,16 @@ def read_toml(path: str | Path) -> Tables:
 
 def _tables(text: str, name: str) -> Tables:
     """Return the tables of a TOML text. **Raises** `InputError` whose message begins with `name`."""
+    too_deep = "is nested too deeply; files of jaxvib have at most four levels"
+    if _LONG_KEY.search(text):
+        raise InputError(name, too_deep)
     try:
         tables = tomllib.loads(text)
         _require_plain(tables, "")
     except InputError:
         raise
     except RecursionError as error:
-        raise InputError(name, "is nested too deeply; files of jaxvib have at most four levels") from error
+        raise InputError(name, too_deep) from error
     except ValueError as error:  # not TOML, or a number with more digits than Python reads
         raise InputError(name, f"is not a TOML file: {error}") from error
     return tables

@@ -196,6 +196,13 @@ def test_a_file_that_cannot_be_read_says_which(tmp_path):
         jv.scene_from_toml("[machine")
 
 
+@pytest.mark.parametrize("key", ["a" + ".a" * 200_000, "a" + " . 'a'" * 100_000, '["a"' + '."a"' * 100_000 + "]"])
+def test_keys_of_thousands_of_names_are_refused_at_once(key):
+    """The time of `tomllib` is proportional to the square of the number of names."""
+    with pytest.raises(jv.InputError, match=r"scene is nested too deeply; files of jaxvib have at most four levels"):
+        jv.scene_from_toml(f"{key} = 1")
+
+
 def test_byte_order_mark_is_read_and_other_encodings_named(tmp_path):
     text = TEMPLATES["one_mass"]
     (tmp_path / "bom.toml").write_text(text, encoding="utf-8-sig")
