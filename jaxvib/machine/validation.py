@@ -239,7 +239,8 @@ def _rebuild(scene: Scene) -> None:
 def _rebuild_part(part: Any, section: str) -> None:
     """Construct a part again. **Raises** `InputError` also for a shape that only the constructor accepts, such as one number for
     an array of one value."""
-    for (path, leaf), new in zip(jax.tree_util.tree_leaves_with_path(part), jax.tree.leaves(rebuild_part(part, section))):
+    named, rebuilt = jax.tree_util.tree_leaves_with_path(part), jax.tree.leaves(rebuild_part(part, section))
+    for (path, leaf), new in zip(named, rebuilt, strict=False):
         if np.shape(leaf) != np.shape(new):
             name = f"{section}{jax.tree_util.keystr(path)}"
             raise InputError(name, f"is an array of shape {np.shape(leaf)}; the shape {np.shape(new)} is needed")
