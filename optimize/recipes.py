@@ -42,7 +42,7 @@ def _platforms(scene: Scene, least: int) -> Platforms:
     if not isinstance(scene, Scene) or not isinstance(scene.machine, Platforms):
         raise InputError("scene", "needs a machine of platforms for this recipe")
     if scene.machine.mass.shape[0] < least:
-        raise InputError("scene", f"has {scene.machine.mass.shape[0]} platforms; this recipe needs {least}")
+        raise InputError("scene", f"has {scene.machine.mass.shape[0]} platforms; this recipe needs at least {least}")
     return scene.machine
 
 
@@ -254,7 +254,7 @@ def _exciters(scene: Scene, least: int, reach: Number) -> tuple[dict[str, Bounds
     if not isinstance(scene, Scene) or scene.machine.places != "plane":
         raise InputError("scene", "needs a body in a plane for this recipe, for example plane_body(...)")
     if len(scene.exciters) < least:
-        raise InputError("scene", f"has {len(scene.exciters)} exciter; this recipe needs {least}")
+        raise InputError("scene", f"has {len(scene.exciters)} exciter; this recipe needs at least {least}")
     free: dict[str, Bounds] = {}
     distance = number_in(reach, "m", "reach")
     for k, exciter in enumerate(scene.exciters):

@@ -43,9 +43,9 @@ def curve_chart(
     figure, (axis,) = panels(1, size=(7.0, 3.4), ax=ax)
     axis.fill_between(value, threshold, 0.0, color=COLORS[0], alpha=0.12, lw=0.0, label="all starts captured")
     axis.errorbar(value, threshold, uncertainty, marker="o", ms=4.0, capsize=3.0, color=COLORS[0], label="threshold")
-    apart = np.where(least < threshold - uncertainty, least, np.nan)
-    if np.any(np.isfinite(apart)):
-        axis.plot(value, apart, "v", color=COLORS[1], label="lowest captured speed")
+    below_threshold = np.where(least < threshold - uncertainty, least, np.nan)
+    if np.any(np.isfinite(below_threshold)):
+        axis.plot(value, below_threshold, "v", color=COLORS[1], label="lowest captured speed")
     missing = np.isnan(threshold)
     if np.any(missing):
         axis.plot(value[missing], np.zeros(np.sum(missing)), "x", color="black", clip_on=False, label="not all starts captured")
@@ -72,7 +72,7 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     late = max(1, round(0.9 * time.size))
     for j in range(around.shape[1]):
         colour = COLORS[j % len(COLORS)]
-        x, y = _within(around[:, j], -np.pi), _within(across[:, j], -0.5 * np.pi)
+        x, y = _wrapped(around[:, j], -np.pi), _wrapped(across[:, j], -0.5 * np.pi)
         # The line is interrupted if a ball leaves the chart on one side and returns on the other.
         leaps = (np.abs(np.diff(x, prepend=x[:1])) > np.pi) | (np.abs(np.diff(y, prepend=y[:1])) > np.pi)
         broken = np.degrees(np.where(leaps, np.nan, x))
@@ -93,6 +93,6 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     return figure if ax is None else ax
 
 
-def _within(angle: np.ndarray, least: float) -> np.ndarray:
+def _wrapped(angle: np.ndarray, least: float) -> np.ndarray:
     """Return the angle, rad, reduced to the turn that begins at `least`, rad."""
     return np.mod(angle - least, 2.0 * np.pi) + least

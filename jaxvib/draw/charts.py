@@ -44,7 +44,7 @@ def branch_diagram(
     units: Sequence[str] | None = None,
     at: float | None = None,
     unit: SpeedUnit | None = None,
-    judged: str = "",
+    criterion: str = "",
     show: Sequence[str] = PARTS,
     linear: bool = False,
     ax: Onto = None,
@@ -56,7 +56,7 @@ def branch_diagram(
     **Arguments** (n points, nd coordinates)
 
     - `rotor_speed` (n,), `omega` (n,): rotor speed and load speed, rad/s, drawn in `unit`
-    - `stable` (n,): True if stable; `judged`: the criterion of stability, written below the figure
+    - `stable` (n,): True if stable; `criterion`: the criterion of stability, written below the figure
     - `amplitude` (n, nd): amplitudes, m, drawn in mm or µm, or rad, drawn in mrad, if `units` (nd,) contains "rad"; `units`
       None: all m
     - `force` (n,): foundation force, N
@@ -89,7 +89,7 @@ def branch_diagram(
         if ax is None:
             axis.set_ylabel(label)
             axis.set_title(title, loc="left", fontsize="medium")
-        else:  # above the caller's axes is the legend
+        else:  # the legend is above the caller's axes
             axis.set_ylabel(f"{title}, {label}")
         if title == _SPEED_TITLE:
             _speed_lines(axis, scale, resonances, marks, high)
@@ -105,8 +105,8 @@ def branch_diagram(
         legend_outside(figure, axes, 4 if columns > 1 else 2)
     else:
         legend_above(axes[0], 2)
-    if judged and ax is None:
-        figure.supxlabel(f"stable {judged}", fontsize="small", color="#555555")
+    if criterion and ax is None:
+        figure.supxlabel(f"stable {criterion}", fontsize="small", color="#555555")
     return figure if ax is None else ax
 
 
@@ -158,16 +158,16 @@ def _branch_rows(
 def log_limits(
     curves: Sequence[np.ndarray], rotor_speed: np.ndarray, omega: np.ndarray, resonances: np.ndarray
 ) -> tuple[float, float]:
-    """Return the limits of a logarithmic axis from the range of the curves above half the lowest resonance.
+    """Return the limits of a logarithmic axis from the range of the curves at load speeds above half the lowest resonance.
 
-    Below this speed the loads run with the rotor, and the curves approach zero.
+    At lower load speeds the loads turn with the rotor, and the curves approach zero.
     """
     there = np.isfinite(rotor_speed)
     shown = np.stack([values[there] for values in curves])
     top = float(np.max(shown, initial=1e-300, where=np.isfinite(shown)))
     lowest = float(np.min(resonances, initial=np.inf, where=resonances > 0.0))
-    counts = np.isfinite(shown) & (shown > 0.0) & (omega[there] > 0.5 * lowest)
-    least = float(np.min(shown, initial=top, where=counts))
+    included = np.isfinite(shown) & (shown > 0.0) & (omega[there] > 0.5 * lowest)
+    least = float(np.min(shown, initial=top, where=included))
     return float(np.clip(0.5 * least, 1e-5 * top, 1e-2 * top)), 2.5 * top
 
 

@@ -221,8 +221,8 @@ def steps_chart(
 ) -> Drawn:
     """Draw the relative `difference` (n, k) between central differences and a derivative over the relative `steps` (k,).
 
-    Each of n `names` has a line. A ring marks its `best` step (n,) with the extrapolated difference `at_best` (n,), and a
-    dotted line marks the tolerance.
+        Each of n `names` has a line. A ring marks its `best` step (n,) with the extrapolated difference `at_best` (n,), and a
+    dotted line marks the tolerance. `route`: mode of the derivative, "forward" or "reverse".
     """
     figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)
     floor = np.finfo(float).eps

@@ -1,4 +1,4 @@
-"""Charts of the agreement between predicted and exact stability."""
+"""Charts of the criterion of auto-balancing, and of its agreement with the exact stability."""
 
 from __future__ import annotations
 

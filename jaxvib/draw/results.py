@@ -99,9 +99,9 @@ def shapes_chart(
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(max(5.0, 1.4 * len(frequency)), 3.4), ax=ax)
-    many, width = len(names), 0.8 / len(names)
+    count, width = len(names), 0.8 / len(names)
     for k, name in enumerate(names):
-        places = np.arange(len(frequency)) + (k - 0.5 * (many - 1)) * width
+        places = np.arange(len(frequency)) + (k - 0.5 * (count - 1)) * width
         look: Look = {
             "color": COLORS[k % len(COLORS)],
             "hatch": ("", "///", "...", "xxx")[k % 4],
@@ -153,7 +153,7 @@ def phase_circles(
             e = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
             tick = np.outer(e, [0.96, 1.04])
             axis.plot(tick[0], tick[1], color=GUIDE, lw=0.9)
-            is_free = np.all(np.abs(np.exp(1j * angles) - complex(*e)) > 0.3)  # of loads
+            is_free = np.all(np.abs(np.exp(1j * angles) - complex(*e)) > 0.3)  # no load is near the label
             if degrees % 90 == 0 and is_free:
                 side = {0: "right", 180: "left"}.get(degrees, "center")
                 axis.text(

@@ -192,12 +192,12 @@ def shares_chart(
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     for k, (colour, (name, (share, low, high))) in enumerate(zip(_label_colors([*shares]), shares.items(), strict=True)):
         look = {"color": colour, "ls": STROKES[k % len(STROKES)], "marker": MARKERS[k % len(MARKERS)]}
-        shift = 0.006 * (k - 0.5 * (len(shares) - 1)) if len(x) <= _MAX_BARS else 0.0  # bars beside each other
+        shift = 0.006 * (k - 0.5 * (len(shares) - 1)) if len(x) <= _MAX_BARS else 0.0  # bars stand beside each other
         place = x * (x[-1] / x[0]) ** shift if log else x + shift * np.ptp(x)
         axis.plot(place, 100.0 * share, ms=3.5, lw=1.1, label=name, **look)
         if len(x) > _MAX_BARS:
             axis.fill_between(x, 100.0 * low, 100.0 * high, color=colour, alpha=0.15, lw=0.0)
-        else:  # overlapping bands of a few wide intervals could not be told apart
+        else:  # overlapping bands of a few wide intervals could not be distinguished
             reach = 100.0 * np.maximum([share - low, high - share], 0.0)
             axis.errorbar(place, 100.0 * share, reach, fmt="none", ecolor=colour, elinewidth=0.9, capsize=2.0)
     axis.set_ylim(-3.0, 103.0)
@@ -229,7 +229,7 @@ def tornado_chart(
 ) -> Drawn:
     """Draw bars from `low` (n,) to `high` (n,) about `middle`, the longest at the top.
 
-    They are values of a quantity for the lowest and the highest fifth of the values of each parameter in `names`.
+    The ends of a bar are the means of a quantity for the lowest and the highest fifth of the values of a parameter in `names`.
 
     >>> import numpy as np
     >>> figure = tornado_chart(["a", "b"], np.array([1.0, 0.0]), np.array([3.0, 9.0]), 2.0, x_label="force, N")

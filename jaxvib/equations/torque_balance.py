@@ -201,7 +201,7 @@ class UnbalancedModel(ExcitedModel):
     def drive_torque(self, omega: Array, required: Array) -> Array:
         """Return the torque of each drive, (count,) N m, from the torques that the rotors need, `required_torque`.
 
-        An ideal drive supplies what its own rotor needs, and an equal share of what the motors of the others lack.
+        An ideal drive supplies the torque that its own rotor needs, and an equal share of the torque that the motors lack.
         """
         prescribed, driving = self.balance.is_prescribed, self.balance.driving_torque(omega)
         if prescribed.all() or not prescribed.any():
@@ -326,10 +326,9 @@ def resultant_of(model: LinearModel, turn: Array) -> Array:
     """Return the resultant of the centrifugal forces per w^2, (np,) kg m complex: sum_j S_j exp(i alpha_j) e_j.
 
     `turn` (count,): exp(i alpha) of each load, or of the unbalance of an exciter without loads, which includes the static
-    imbalance of its rotor. The
-    result is NaN for loads that do not move on a circle.
+    imbalance of its rotor. The result is NaN for loads that do not move on a circle.
     """
-    found, first = jnp.zeros((), turn.dtype), 0
+    total, first = jnp.zeros((), turn.dtype), 0
     for exciter, mount in zip(model.scene.exciters, model.mounts, strict=True):
         loads = exciter.loads
         if loads is None:
@@ -338,9 +337,9 @@ def resultant_of(model: LinearModel, turn: Array) -> Array:
         else:
             size = loads.mass * loads.radius if isinstance(loads, CircularLoads) else jnp.nan
             each = jnp.sum(size * turn[first : first + loads.count])
-        found = found + each * rotating_direction(mount, exciter.direction)
+        total = total + each * rotating_direction(mount, exciter.direction)
         first += 1 if loads is None else loads.count
-    return found
+    return total
 
 
 @cached
@@ -355,26 +354,26 @@ def assemble_for_search(scene: Scene, masses: tuple[int, ...] | None = None) -> 
 
 def balance_of_group(balance: TorqueBalance, masses: tuple[int, ...]) -> TorqueBalance:
     """Return the balance of some rotating masses, by number. The others move with the machine, but exert no force."""
-    field, kept = balance.averaged, np.asarray(masses)
-    owner = owners_of(field.counts)[kept]
+    field, indices = balance.averaged, np.asarray(masses)
+    owner = owners_of(field.counts)[indices]
     exciters = sorted(set(owner.tolist()))
-    rows = kept if field.levers is None else np.flatnonzero(np.isin(field.owners, exciters))
+    rows = indices if field.levers is None else np.flatnonzero(np.isin(field.owners, exciters))
     drives = field.drives
     counts = tuple(int(np.sum(owner == k)) if field.counts[k] else 0 for k in exciters)
     averaged = dataclasses.replace(
         field,
         input_matrix=field.input_matrix[rows],
         port=field.port[rows],
-        levers=None if field.levers is None else field.levers[np.ix_(rows, kept)],
-        unbalance=field.unbalance[kept],
-        inertia=field.inertia[kept],
-        drag=field.drag[kept],
+        levers=None if field.levers is None else field.levers[np.ix_(rows, indices)],
+        unbalance=field.unbalance[indices],
+        inertia=field.inertia[indices],
+        drag=field.drag[indices],
         groups=grouped([drives[k] for k in exciters], counts),
         counts=counts,
         directions=tuple(field.directions[k] for k in exciters),
         owners=tuple(exciters.index(field.owners[row]) for row in rows),
     )
-    return TorqueBalance(balance.model, averaged, balance.direction[kept], balance.motor_torque[kept])
+    return TorqueBalance(balance.model, averaged, balance.direction[indices], balance.motor_torque[indices])
 
 
 def owners_of(counts: Sequence[int]) -> np.ndarray:

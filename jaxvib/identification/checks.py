@@ -67,10 +67,10 @@ class FitStatus(eqx.Enumeration):
     )
 
 
-def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, list[str]]:
+def status_of(fitted: Fitted, information: Information) -> tuple[FitStatus, float, list[str]]:
     """Return the status of a fit, the smallest `residual_chance` of its channels, and notes.
 
-    **Arguments**: `fitted`; the information `found` about its numbers.
+    **Arguments**: `fitted`, and the `information` about its numbers.
     """
     chance, notes = 1.0, [*_contradictions(fitted), *_disagreements(fitted)]
     contradicted = bool(notes)
@@ -93,7 +93,7 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
     notes += foreign
     shares = angle_shares(fitted)
     unknowns = fitted.problem.unknowns.count - fitted.problem.unknowns.errors  # errors of the angle have a known size
-    for k, (samples, left) in enumerate(zip(fitted.problem.runs, fitted.residuals, strict=True)):
+    for k, (samples, residuals) in enumerate(zip(fitted.problem.runs, fitted.residuals, strict=True)):
         for c, channel in enumerate(samples.channels):
             if shares[k][c] > _ANGLE_SHARE:
                 is_inaccurate = True
@@ -109,7 +109,7 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
                 )
             angles = fitted.problem.angles[k].T
             for angle, whose in zip(angles if fitted.problem.has_loads else angles[:1], _TURNING, strict=False):
-                one = residual_chance(left[:, c], np.asarray(samples.taps)[:, c], angle, unknowns)
+                one = residual_chance(residuals[:, c], np.asarray(samples.taps)[:, c], angle, unknowns)
                 if one < CHANCE:
                     notes.append(f"the residuals of channel {channel.name!r} in run {k + 1} repeat with {whose}")
                 chance = min(chance, one)
@@ -119,7 +119,7 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
         return FitStatus.contradicted, chance, notes
     if foreign or chance < CHANCE or is_inaccurate or max(coarse) > _COARSE_ANGLE:
         return FitStatus.patterned, chance, notes
-    return FitStatus.undetermined if found.undetermined.size else FitStatus.found, chance, notes
+    return FitStatus.undetermined if information.undetermined.size else FitStatus.found, chance, notes
 
 
 def resembles(fitted: Fitted) -> bool:
@@ -127,8 +127,8 @@ def resembles(fitted: Fitted) -> bool:
     least one channel is at most half of that of its readings."""
     problem = fitted.problem
     shares = [
-        np.std(left[mask[:, c], c]) / max(float(np.std(raw[mask[:, c], c])), 1e-300)
-        for left, raw, mask in zip(fitted.differences, problem.raw, problem.masks, strict=True)
+        np.std(residuals[mask[:, c], c]) / max(float(np.std(raw[mask[:, c], c])), 1e-300)
+        for residuals, raw, mask in zip(fitted.differences, problem.raw, problem.masks, strict=True)
         for c in range(raw.shape[1])
     ]
     return fitted.converged and bool(min(shares) <= _UNEXPLAINED)
@@ -140,36 +140,36 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
     problem = fitted.problem
     if len(problem.unbalances) > 1:
         return
-    for k, (samples, raw, mask, left) in enumerate(
+    for k, (samples, raw, mask, residuals) in enumerate(
         zip(problem.runs, problem.raw, problem.masks, fitted.residuals, strict=True)
     ):
         for c, channel in enumerate(samples.channels):
             readings = np.where(mask[:, c], raw[:, c], np.nan)
-            values = left[:, c] if has_fit else readings
-            found = foreign_vibration(values, problem.angles[k][:, 0], float(samples.step))
-            if found is None or found.share < _MOSTLY:
+            values = residuals[:, c] if has_fit else readings
+            vibration = foreign_vibration(values, problem.angles[k][:, 0], float(samples.step))
+            if vibration is None or vibration.share < _MOSTLY:
                 continue
-            if has_fit and found.order is None and np.nanvar(values) < _NOISE_LIKE * np.nanvar(readings):
+            if has_fit and vibration.order is None and np.nanvar(values) < _NOISE_LIKE * np.nanvar(readings):
                 continue
             what = "residuals" if has_fit else "readings"
             yield (
-                f"{found.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is {found.place}, "
-                "but an unbalance turns with the rotor: use the tachometer of the vibrating shaft, or leave out the part of "
-                "the record in which loads are jammed or another machine runs"
+                f"{vibration.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is "
+                f"{vibration.place}, but an unbalance turns with the rotor: use the tachometer of the vibrating shaft, or "
+                "leave out the part of the record in which loads are jammed or another machine runs"
                 if not problem.has_loads
-                else f"{found.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is "
-                f"{found.place}: the motion of the loads is not that of the scene, or the minimum is a wrong one"
+                else f"{vibration.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is "
+                f"{vibration.place}: the motion of the loads is not that of the scene, or the minimum is a wrong one"
             )
 
 
-def residual_chance(left: np.ndarray, taps: np.ndarray, angle: np.ndarray, found: int) -> float:
+def residual_chance(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray, fitted_count: int) -> float:
     """Return the probability that noise has vibrations at orders of the rotor's speed as strong as those of the residuals.
 
     The residuals are filtered to white noise and compared with vibrations at the first orders of the rotor's speed in each
     stretch of the record, by an F test.
 
-    **Arguments**: `left` (n,), NaN for samples that do not count; `taps` of the filter; `angle` (n,) rad; `found`: number of
-    fitted unknowns.
+    **Arguments**: `residuals` (n,), NaN for samples that do not count; `taps` of the filter; `angle` (n,) rad; `fitted_count`:
+    number of fitted unknowns.
 
     >>> angle, rng = np.linspace(0.0, 500.0, 4000), np.random.default_rng(0)
     >>> noise = rng.normal(size=4000)
@@ -180,8 +180,8 @@ def residual_chance(left: np.ndarray, taps: np.ndarray, angle: np.ndarray, found
     """
     from scipy.special import fdtrc  # slow to import
 
-    white = np.convolve(np.where(np.isfinite(left), left, 0.0), taps)[: left.size]
-    valid = np.convolve(~np.isfinite(left), np.ones(len(taps)))[: left.size] < 0.5
+    white = np.convolve(np.where(np.isfinite(residuals), residuals, 0.0), taps)[: residuals.size]
+    valid = np.convolve(~np.isfinite(residuals), np.ones(len(taps)))[: residuals.size] < 0.5
     valid[: len(taps) - 1] = False
     place = np.flatnonzero(valid)
     if place.size < 8 * _WINDOWS * (2 * _ORDERS + 1) or not np.any(white[place]):
@@ -192,12 +192,12 @@ def residual_chance(left: np.ndarray, taps: np.ndarray, angle: np.ndarray, found
         for k in range(1, _ORDERS + 1):
             waves += [np.cos(k * angle[part]), np.sin(k * angle[part])]
         basis, triangle = np.linalg.qr(np.stack(waves, axis=1))
-        kept = np.abs(np.diagonal(triangle)) > 1e-6 * math.sqrt(part.size)
-        explained += float(np.sum((basis[:, kept].T @ white[part]) ** 2))
-        columns += int(np.count_nonzero(kept))
-    total, known = float(np.sum(white[place] ** 2)), max(columns - found, 1)
+        independent = np.abs(np.diagonal(triangle)) > 1e-6 * math.sqrt(part.size)
+        explained += float(np.sum((basis[:, independent].T @ white[part]) ** 2))
+        columns += int(np.count_nonzero(independent))
+    total, freedom = float(np.sum(white[place] ** 2)), max(columns - fitted_count, 1)
     free = place.size - columns
-    return float(fdtrc(known, free, explained / known / ((total - explained) / free)))
+    return float(fdtrc(freedom, free, explained / freedom / ((total - explained) / free)))
 
 
 def coverage_notes(fitted: Fitted, frequency: np.ndarray, damping_ratio: np.ndarray) -> Iterator[str]:
@@ -231,14 +231,14 @@ def _contradictions(fitted: Fitted) -> Iterator[str]:
     unknowns = problem.unknowns
     names = [*(number.name for number in unknowns.numbers), *(f"the gain of channel {name!r}" for name in unknowns.gains)]
     for name, x, mean, precision in zip(names, fitted.x, problem.means, problem.precisions, strict=False):
-        away = abs(x - mean) * math.sqrt(precision)
-        if away > _CONTRADICTION:
-            yield f"{name} is {away:.1f} standard errors away from its known value"
+        distance = abs(x - mean) * math.sqrt(precision)
+        if distance > _CONTRADICTION:
+            yield f"{name} is {distance:.1f} standard errors away from its known value"
     for k, known in enumerate(problem.unbalances):
         if known is not None:
-            away = abs(float(np.hypot(*fitted.linear[2 * k : 2 * k + 2])) - known.value) / known.error
-            if away > _CONTRADICTION:
-                yield f"exciters[{k}].unbalance is {away:.1f} standard errors away from its known value"
+            distance = abs(float(np.hypot(*fitted.linear[2 * k : 2 * k + 2])) - known.value) / known.error
+            if distance > _CONTRADICTION:
+                yield f"exciters[{k}].unbalance is {distance:.1f} standard errors away from its known value"
 
 
 class Disagreement(NamedTuple):
@@ -275,25 +275,29 @@ def disagreement(others: np.ndarray, run: np.ndarray, gradient: np.ndarray, name
     """
     from scipy.special import chdtrc  # slow to import
 
-    (alone, ranks), (without, more), (together, both) = pseudoinverse(run), pseudoinverse(others), pseudoinverse(others + run)
-    freedom, size = ranks + more - both, np.diagonal(others + run)
-    shared = np.diagonal(others @ together @ run)  # information about the difference between the run and the others
-    known = np.where(shared > 1e-9 * size, shared, np.inf)
-    most = int(np.argmax(gradient**2 / known))
-    if freedom < 1 or not np.isfinite(known[most]):
-        return Disagreement(1.0, names[most], 0.0, math.inf)
-    statistic = float(gradient @ (alone + without) @ gradient)
-    change, error = gradient[most] / known[most], 1.0 / math.sqrt(known[most])
-    return Disagreement(float(chdtrc(freedom, statistic)), names[most], float(change), float(error))
+    (of_run, rank_of_run), (of_others, rank_of_others), (of_all, rank_of_all) = (
+        pseudoinverse(run),
+        pseudoinverse(others),
+        pseudoinverse(others + run),
+    )
+    freedom, size = rank_of_run + rank_of_others - rank_of_all, np.diagonal(others + run)
+    shared = np.diagonal(others @ of_all @ run)  # information about the difference between the run and the others
+    information = np.where(shared > 1e-9 * size, shared, np.inf)
+    largest = int(np.argmax(gradient**2 / information))
+    if freedom < 1 or not np.isfinite(information[largest]):
+        return Disagreement(1.0, names[largest], 0.0, math.inf)
+    statistic = float(gradient @ (of_run + of_others) @ gradient)
+    change, error = gradient[largest] / information[largest], 1.0 / math.sqrt(information[largest])
+    return Disagreement(float(chdtrc(freedom, statistic)), names[largest], float(change), float(error))
 
 
 def pseudoinverse(matrix: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the pseudoinverse of an information matrix, computed with a diagonal scaled to 1, and its rank."""
     size = np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T) / np.outer(size, size))
-    kept = values > 1e-10 * max(float(values[-1]), 1e-300)
-    root = vectors[:, kept] / size[:, None]
-    return (root / values[kept]) @ root.T, int(np.count_nonzero(kept))
+    determined = values > 1e-10 * max(float(values[-1]), 1e-300)
+    root = vectors[:, determined] / size[:, None]
+    return (root / values[determined]) @ root.T, int(np.count_nonzero(determined))
 
 
 def _disagreements(fitted: Fitted) -> Iterator[str]:
@@ -311,9 +315,9 @@ def _disagreements(fitted: Fitted) -> Iterator[str]:
     for matrix, gradient in (*equations, prior_equations(problem, fitted.x, fitted.linear)):
         polar = turn.T @ matrix @ turn
         parts.append((eliminate(polar, own), elimination(polar, own).T @ (turn.T @ gradient)))
-    total, left = (np.sum(each, axis=0) for each in zip(*parts, strict=True))
-    step = pseudoinverse(total)[0] @ left  # to the exact minimum, which matters for a run with much less information
+    total, gradient_sum = (np.sum(each, axis=0) for each in zip(*parts, strict=True))
+    step = pseudoinverse(total)[0] @ gradient_sum  # to the exact minimum, which matters for a run with much less information
     for k, (part, gradient) in enumerate(parts[:-1]):
-        found = disagreement(total - part, part, gradient - part @ step, names)
-        if found.chance < CHANCE:
-            yield found.sentence(f"run {k + 1}")
+        deviation = disagreement(total - part, part, gradient - part @ step, names)
+        if deviation.chance < CHANCE:
+            yield deviation.sentence(f"run {k + 1}")

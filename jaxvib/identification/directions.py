@@ -215,11 +215,13 @@ def _errors(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return 1.0 / np.sqrt(np.maximum(values, floor)), vectors
 
 
-def directions_of(found: Information) -> tuple[tuple[Direction, ...], tuple[Direction, ...]]:
+def directions_of(information: Information) -> tuple[tuple[Direction, ...], tuple[Direction, ...]]:
     """Return the undetermined directions, and the directions that only the gains of the sensors determine, with sentences."""
-    undetermined = _sentences(found, found.undetermined, found.errors, " changes no reading by more than its noise", _ADVICE)
+    undetermined = _sentences(
+        information, information.undetermined, information.errors, " changes no reading by more than its noise", _ADVICE
+    )
     gains = []
-    for direction in _sentences(found, found.by_gain, found.by_gain_errors, "", ""):
+    for direction in _sentences(information, information.by_gain, information.by_gain_errors, "", ""):
         words = direction.sentence.rstrip(": ")
         gains.append(
             direction._replace(
@@ -230,17 +232,17 @@ def directions_of(found: Information) -> tuple[tuple[Direction, ...], tuple[Dire
     return tuple(undetermined), tuple(gains)
 
 
-def _sentences(found: Information, axes: np.ndarray, errors: np.ndarray, effect: str, advice: str) -> list[Direction]:
-    common = np.array([_in_common_factor(name) for name in found.names], float)
+def _sentences(information: Information, axes: np.ndarray, errors: np.ndarray, effect: str, advice: str) -> list[Direction]:
+    common = np.array([_in_common_factor(name) for name in information.names], float)
     sentences = []
     if axes.size and np.any(common):
         common /= np.linalg.norm(common)
         inside = axes @ (axes.T @ common)
         if np.linalg.norm(inside) > _MIN_COMMON_PART:
-            kinds = _kinds(found.names)
+            kinds = _kinds(information.names)
             text = f"multiplying all {kinds} by one number{effect}: {advice}"
             weights = (axes.T @ common) * errors
-            sentences.append(Direction(text, found.names, tuple(map(float, common)), float(np.linalg.norm(weights))))
+            sentences.append(Direction(text, information.names, tuple(map(float, common)), float(np.linalg.norm(weights))))
             spread = axes * errors
             axes = axes - np.outer(common, common @ axes)
             basis, size, _ = np.linalg.svd(axes, full_matrices=False)
@@ -249,12 +251,12 @@ def _sentences(found: Information, axes: np.ndarray, errors: np.ndarray, effect:
     for axis, error in zip(axes.T, errors, strict=True):
         axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
         largest = [k for k in np.argsort(-np.abs(axis)) if abs(axis[k]) > 0.2]
-        parts = ", ".join(f"{found.names[k]} by {axis[k]:+.2g}" for k in largest)
+        parts = ", ".join(f"{information.names[k]} by {axis[k]:+.2g}" for k in largest)
         advice_for_direction = (
             "give one of these numbers as known, add a sensor at another place, or record a run through all resonances"
         )
         text = f"changing {parts} (relative to one another){effect}: {advice_for_direction if advice else ''}"
-        sentences.append(Direction(text, found.names, tuple(map(float, axis)), float(error)))
+        sentences.append(Direction(text, information.names, tuple(map(float, axis)), float(error)))
     return sentences
 
 

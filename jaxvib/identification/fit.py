@@ -2,8 +2,8 @@
 
 At every trial the linear unknowns (first states, unbalances, offsets) are those of least squares. Only the other unknowns are
 damped. The noise of each channel follows from its residuals, and the fit is repeated with residuals filtered to white noise. If
-the residuals have outliers, these have little influence; a clipped reading is a bound. If the error of a
-rotor's angle is not small beside the noise, the angle is fitted with the machine.
+the residuals have outliers, these have little influence; a clipped reading is a bound. If the error of a rotor's angle is not
+small compared with the noise, the angle is fitted together with the machine.
 """
 
 from __future__ import annotations
@@ -134,15 +134,15 @@ def unbalance_prior(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, n
         size = float(np.hypot(*pair))
         row = np.zeros(linear.size)
         row[2 * k : 2 * k + 2] = pair / max(size, 1e-300)
-        left = (known.value - size) / known.error
+        deviation = (known.value - size) / known.error
         information += np.outer(row, row) / known.error**2
-        gradient += row * left / known.error
-        cost += left**2
+        gradient += row * deviation / known.error
+        cost += deviation**2
     return information, gradient, cost
 
 
 def project(problem: Problem, x: np.ndarray) -> _Trial:
-    """Return the best linear unknowns at `x`, and their cost; with loads those of the problem."""
+    """Return the best linear unknowns at `x`, and their cost; of a motion with loads the linear unknowns of the problem."""
     if problem.linear is not None:
         return _with_loads(problem, x, problem.linear)
     total = _linear_equations(problem, x)
@@ -170,7 +170,7 @@ def _with_loads(problem: Problem, x: np.ndarray, linear: np.ndarray) -> _Trial:
 
 def known_cost(problem: Problem, x: np.ndarray, linear: np.ndarray) -> float:
     """Return the cost of the known values."""
-    loads = 0.0 if problem.apart is None else float(linear @ problem.apart @ linear)
+    loads = 0.0 if problem.load_spread is None else float(linear @ problem.load_spread @ linear)
     return float(np.sum(problem.precisions * (x - problem.means) ** 2)) + unbalance_prior(problem, linear)[2] + loads
 
 
@@ -194,7 +194,7 @@ def linear_at(problem: Problem, x: np.ndarray, unbalance: np.ndarray | None) -> 
 
 def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
     """Return the normal equations (p + L + 1, p + L + 1) of each run: of all unknowns and the residuals."""
-    p, size, found = x.size, x.size + linear.size, []
+    p, size, of_runs = x.size, x.size + linear.size, []
     for samples, place in zip(problem.runs, linear_places(problem), strict=True):
         parts = problem.unknowns, samples, problem.scene
         if problem.has_loads:
@@ -203,8 +203,8 @@ def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[n
             equations = np.asarray(normal_equations(*parts, jnp.asarray(x), jnp.asarray(linear[place])))
         where, total = np.concatenate([np.arange(p), p + place, [size]]), np.zeros((size + 1, size + 1))
         total[np.ix_(where, where)] = equations
-        found.append(total)
-    return found
+        of_runs.append(total)
+    return of_runs
 
 
 def prior_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -214,9 +214,9 @@ def prior_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> tupl
     prior[np.arange(p), np.arange(p)] = problem.precisions
     gradient[:p] = -problem.precisions * (x - problem.means)
     prior[p:, p:], gradient[p:], _ = unbalance_prior(problem, linear)
-    if problem.apart is not None:
-        prior[p:, p:] += problem.apart
-        gradient[p:] -= problem.apart @ linear
+    if problem.load_spread is not None:
+        prior[p:, p:] += problem.load_spread
+        gradient[p:] -= problem.load_spread @ linear
     return prior, gradient
 
 
@@ -233,7 +233,7 @@ def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.nd
     def equations(trial: _Trial) -> Equations:
         return joint_equations(problem, trial.x, trial.linear)
 
-    def moved(trial: _Trial, step: np.ndarray) -> _Trial:
+    def stepped(trial: _Trial, step: np.ndarray) -> _Trial:
         step = limited_step(problem, step)
         if problem.has_loads:
             return _with_loads(problem, trial.x + step[: x.size], trial.linear + step[x.size :])
@@ -241,7 +241,7 @@ def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.nd
 
     start = project(problem, x)
     damped = x.size + start.linear.size * problem.has_loads
-    best, (information, prior, _), converged = descend(start, equations, moved, damped, positive_places(problem))
+    best, (information, prior, _), converged = descend(start, equations, stepped, damped, positive_places(problem))
     return best, information, prior, converged
 
 
@@ -253,7 +253,7 @@ def positive_places(problem: Problem) -> np.ndarray:
 def descend(
     best: Any,
     equations: Callable[[Any], Equations],
-    moved: Callable[[Any, np.ndarray], Any],
+    stepped: Callable[[Any, np.ndarray], Any],
     damped_count: int,
     positive: np.ndarray,
 ) -> tuple[Any, Equations, bool]:
@@ -262,42 +262,43 @@ def descend(
     A number that runs to 0 stays at a value that the data do not distinguish from 0. With its logarithm as the unknown, the
     expected reduction of the cost would remain the same at every smaller value, and the descent would never end.
 
-    **Arguments**: the first trial `best`, with its `cost`; `equations` of a trial; `moved`: the trial after a step;
-    `damped_count`: number of the first unknowns, whose steps are damped; places of the `positive` numbers.
+    **Arguments**: the first trial `best`, with its `cost`; `equations`: returns the equations of a trial; `stepped`: returns
+    the trial after a step; `damped_count`: number of the first unknowns, whose steps are damped; `positive`: places of the
+    positive numbers.
     """
     damping, places = 1e-2, np.arange(damped_count)
     for _ in range(_MAX_ITERATIONS):
-        found = equations(best)
-        matrix, gradient = _without_vanished(found, positive)
+        current = equations(best)
+        matrix, gradient = _without_vanished(current, positive)
         if not np.all(np.isfinite(matrix)):
-            return best, found, False
+            return best, current, False
         undamped = _undamped(matrix, gradient)
         if gradient @ undamped < _CONVERGED**2:
-            return best, found, True
+            return best, current, True
         if gradient @ undamped < _NEAR_REDUCTION * best.cost:
-            trial = _follow_valley(moved(best, undamped), equations, moved, positive)
+            trial = _follow_valley(stepped(best, undamped), equations, stepped, positive)
             if trial.cost < best.cost:
                 best = trial
                 continue
         while True:
             damped, size = matrix.copy(), np.diagonal(matrix)[places]
             damped[places, places] += damping * (size + 1e-12 * np.max(size))
-            trial = moved(best, solved(damped, gradient))
+            trial = stepped(best, solved(damped, gradient))
             if trial.cost < best.cost:
                 best, damping = trial, max(0.1 * damping, 1e-9)
                 break
             damping *= 8.0
             if damping > 1e6:
-                return best, found, bool(gradient @ undamped < 100.0 * _CONVERGED**2)
+                return best, current, bool(gradient @ undamped < 100.0 * _CONVERGED**2)
     return best, equations(best), False
 
 
-def _without_vanished(found: Equations, positive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _without_vanished(equations: Equations, positive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the matrix and the gradient in which positive numbers that are not distinguishable from 0 are not reduced."""
-    information, prior, gradient = found
+    information, prior, gradient = equations
     matrix, gradient = information + prior, gradient.copy()
-    still = positive[(gradient[positive] < 0.0) & (np.diagonal(matrix)[positive] < _VANISHED**-2)]
-    matrix[still], matrix[:, still], matrix[still, still], gradient[still] = 0.0, 0.0, 1.0, 0.0
+    frozen = positive[(gradient[positive] < 0.0) & (np.diagonal(matrix)[positive] < _VANISHED**-2)]
+    matrix[frozen], matrix[:, frozen], matrix[frozen, frozen], gradient[frozen] = 0.0, 0.0, 1.0, 0.0
     return matrix, gradient
 
 
@@ -312,7 +313,7 @@ def limited_step(problem: Problem, step: np.ndarray) -> np.ndarray:
 
 
 def _follow_valley(
-    trial: Any, equations: Callable[[Any], Equations], moved: Callable[[Any, np.ndarray], Any], positive: np.ndarray
+    trial: Any, equations: Callable[[Any], Equations], stepped: Callable[[Any, np.ndarray], Any], positive: np.ndarray
 ) -> Any:
     """Return the trial after up to 3 undamped steps. The cost may rise in between: the steps follow a curved valley of the
     cost, such as that of two dampings with very small noise. The damped method needs about ten times as many steps."""
@@ -321,13 +322,13 @@ def _follow_valley(
         step = _undamped(matrix, gradient)
         if not np.all(np.isfinite(step)) or gradient @ step < _CONVERGED**2:
             break
-        trial = moved(trial, step)
+        trial = stepped(trial, step)
     return trial
 
 
 def differences_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
     """Return readings minus model (n, C) of each run."""
-    found = []
+    differences = []
     for samples, place, raw in zip(problem.runs, linear_places(problem), problem.raw, strict=True):
         parts = problem.unknowns, samples, problem.scene
         if problem.has_loads:
@@ -338,8 +339,8 @@ def differences_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[
             [_delayed(model[:, k], channel.delay / float(samples.step)) for k, channel in enumerate(samples.channels)],
             axis=1,
         )
-        found.append(raw - shown[: len(raw)])
-    return found
+        differences.append(raw - shown[: len(raw)])
+    return differences
 
 
 def _delayed(values: np.ndarray, delay: float) -> np.ndarray:
@@ -355,33 +356,34 @@ def _delayed(values: np.ndarray, delay: float) -> np.ndarray:
 def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
     """Return the fit of a problem: the best one of those from the unknowns `starts`.
 
-    The first pass weighs each channel by its own size, the next by their residuals, the last with filters to white noise.
+    The first pass weights each channel by the size of its readings, the second pass by its residuals. All later passes use
+    filters that make the residuals white.
     """
     noise = [[Noise(np.ones(1), size) for size in of_run] for of_run in channel_sizes(problem)]
-    found = _pass(problem, noise, None, starts)
-    if _largest_change(noise, [[Noise(np.ones(1), each) for each in of_run] for of_run in found.noise]) < 0.3:
-        return found._replace(converged=False)  # the model does not resemble the records, and their noise is unknown
-    noise = [[Noise(np.ones(1), float(each)) for each in of_run] for of_run in found.noise]
-    found = _pass(found.problem, noise, None, [found.x])
+    fitted = _pass(problem, noise, None, starts)
+    if _largest_change(noise, [[Noise(np.ones(1), each) for each in of_run] for of_run in fitted.noise]) < 0.3:
+        return fitted._replace(converged=False)  # the model does not resemble the records, and their noise is unknown
+    noise = [[Noise(np.ones(1), float(each)) for each in of_run] for of_run in fitted.noise]
+    fitted = _pass(fitted.problem, noise, None, [fitted.x])
     is_final = not any(np.any(each) for each in problem.bounds)
-    matters = [bool(np.any(each > _ANGLE_MATTERS)) for each in angle_shares(found)]
+    matters = [bool(np.any(each > _ANGLE_MATTERS)) for each in angle_shares(fitted)]
     if any(matters):
-        problem, is_final = with_angle_errors(found.problem, matters), False
-        found = found._replace(x=np.concatenate([found.x, np.zeros(problem.unknowns.errors)]), problem=problem)
+        problem, is_final = with_angle_errors(fitted.problem, matters), False
+        fitted = fitted._replace(x=np.concatenate([fitted.x, np.zeros(problem.unknowns.errors)]), problem=problem)
     for _ in range(_MAX_PASSES):  # goes on after a pass that has not converged, since its weights were not final
-        new = [[noise_of(each[:, k]) for k in range(each.shape[1])] for each in found.residuals]
+        new = [[noise_of(each[:, k]) for k in range(each.shape[1])] for each in fitted.residuals]
         if is_final and _largest_change(noise, new) < _STEADY_NOISE:
             break
-        before, noise = found.x, new
-        found = _pass(found.problem, noise, found.differences, [before])
-        matrix = found.information + found.prior
-        change = np.concatenate([found.x - before, np.zeros(found.linear.size)])
+        before, noise = fitted.x, new
+        fitted = _pass(fitted.problem, noise, fitted.differences, [before])
+        matrix = fitted.information + fitted.prior
+        change = np.concatenate([fitted.x - before, np.zeros(fitted.linear.size)])
         is_final = bool(change @ matrix @ change < _STEADY_VALUES**2) or not _has_scores(problem, noise)
-    return found
+    return fitted
 
 
 def _has_scores(problem: Problem, noise: Sequence[Sequence[Noise]]) -> bool:
-    """Return True if the readings of a fit depend on the fit before: with outliers and with clipped readings."""
+    """Return True if the weights of the readings depend on the last fit, as they do with outliers and clipped readings."""
     heavy = any(each.outliers for of_run in noise for each in of_run)
     return heavy or any(np.any(each) for each in problem.bounds)
 
@@ -413,9 +415,9 @@ def _pass(
     minima = [minimize(problem, x) for x in starts]
     trial, information, prior, converged = min(minima, key=lambda each: each[0].cost)
     problem = problem._replace(linear=trial.linear) if problem.has_loads else problem
-    left = differences_of(problem, trial.x, trial.linear)
-    pairs = zip(left, problem.masks, noise, strict=True)
-    found = [
+    residuals = differences_of(problem, trial.x, trial.linear)
+    pairs = zip(residuals, problem.masks, noise, strict=True)
+    deviations = [
         np.array([max(float(np.std(each[mask[:, k], k])), 1e-12 * old.deviation) for k, old in enumerate(of_run)])
         for each, mask, of_run in pairs
     ]
@@ -425,8 +427,8 @@ def _pass(
         problem=problem,
         information=information,
         prior=prior,
-        differences=tuple(left),
-        noise=tuple(found),
+        differences=tuple(residuals),
+        noise=tuple(deviations),
         outliers=tuple(np.array([each.outliers for each in of_run]) for of_run in noise),
         converged=converged,
     )

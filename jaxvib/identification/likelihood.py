@@ -1,6 +1,6 @@
 """Profile likelihood: intervals of the numbers for which the cost of a fit is not a quadratic function.
 
-A number is held at a distance from its fitted value while all other unknowns are fitted again. The rise of the cost is
+A number is fixed at a distance from its fitted value while all other unknowns are fitted again. The rise of the cost is
 compared with the quadratic form, (distance/error)^2. If they differ by more than 10 % at two standard errors, the ends of the
 interval are the values at which the cost rises by 1.96^2.
 """
@@ -27,7 +27,7 @@ _MAX_DIFFERENCE = 0.1
 """Relative difference from the quadratic form above which an interval follows from the profile."""
 
 _TIGHT_ERROR = 1e-3
-"""Error of a held number, in standard errors."""
+"""Error of a fixed number, in standard errors."""
 
 _MAX_DISTANCE = 20.0
 """Distance in standard errors beyond which an interval counts as unbounded."""
@@ -60,15 +60,15 @@ class _Profile:
         """Return the rise of the cost at a `distance` in standard errors. If `is_exact`, all other unknowns are fitted;
         otherwise only the linear ones are fitted, and the others follow the quadratic form."""
         target = self.center + self.shift(distance)
-        problem, known_cost = self._held(target)
+        problem, known_cost = self._fixed(target)
         x = self.fitted.x + distance * self.spread * self.slopes
         if self.is_vanished:
             x[self.index] = target
         trial = minimize(problem, x)[0] if is_exact else project(problem, x)
         return trial.cost + known_cost - self.floor
 
-    def _held(self, target: float) -> tuple[Problem, float]:
-        """Return the problem with the number held at `target`, and the cost of the difference between
+    def _fixed(self, target: float) -> tuple[Problem, float]:
+        """Return the problem with the number fixed at `target`, and the cost of the difference between
         `target` and the known value of the number."""
         problem, relative_error = self.fitted.problem, _TIGHT_ERROR * min(self.spread, 1.0)
         if self.is_unbalance:

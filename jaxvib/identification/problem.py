@@ -37,7 +37,7 @@ MOTIONS = ("acceleration", "velocity", "displacement", "force")
 UNUSED = ("torque", "current")
 """Kinds of channels that a fit does not use."""
 
-_UNEVEN = 0.02
+_MAX_UNEVENNESS = 0.02
 """Largest deviation of a sample from the even grid, in steps."""
 
 EXACT = 1e-4
@@ -46,7 +46,7 @@ EXACT = 1e-4
 _FILTER_LENGTHS = (1, 9, 49, 129, 513)
 """Lengths to which filters are extended with zeros, so that filters of nearly equal length share a program."""
 
-_MARGIN, _TIMES = 1.5, 64
+_FREQUENCY_MARGIN, _SPEED_TIMES = 1.5, 64
 """Factor on the highest natural frequency, and number of times at which the speed of a drive is evaluated, for the choice of a
 sampling rate."""
 
@@ -89,8 +89,10 @@ class Problem(NamedTuple):
     - `unbalances`: for each exciter its known value, None if it is free
     - `angle_errors`, rad: standard error of the rotor's angle in each run, without the errors that are unknowns
     - `notes`: sentences for the reader
-    - `linear` (L,): first values of the unknowns in which the readings are linear without loads; None without loads
-    - `apart` (L, L): information that the loads of a run are near one another at the first sample, about these first values
+    - `linear` (L,): first values of the linear unknowns of a motion with loads, in which the readings are not linear; None
+      without loads
+    - `load_spread` (L, L): information from the assumption that all loads of a run have nearly the same angle and speed at the
+      first sample; None without loads
     """
 
     scene: Scene
@@ -109,7 +111,7 @@ class Problem(NamedTuple):
     angle_errors: tuple[float, ...]
     notes: tuple[str, ...]
     linear: np.ndarray | None = None
-    apart: np.ndarray | None = None
+    load_spread: np.ndarray | None = None
 
     @property
     def has_loads(self) -> bool:
@@ -153,25 +155,25 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     if isinstance(unknown, str) or not unknown:
         raise InputError("unknown", f"is {quoted(unknown)}; it must be a list of names, such as ['machine.stiffness']")
     numbers = _singles(scene, unknown)
-    found = {
+    known_numbers = {
         number.name: (number, read_known(text, number, f"known[{name!r}]"))
         for name, text in known.items()
         for number in _singles(scene, [name], "known")
     }
-    fixed = [(number, each) for number, each in found.values() if each.error == 0.0]
+    fixed = [(number, each) for number, each in known_numbers.values() if each.error == 0.0]
     if fixed:
         scene = put_numbers(scene, [number for number, _ in fixed], np.array([each.value for _, each in fixed]))
     exact = {number.name for number, _ in fixed}
     free = {number.name: number for number in numbers if number.name not in exact}
-    free |= {name: number for name, (number, each) in found.items() if each.error > 0.0}
+    free |= {name: number for name, (number, each) in known_numbers.items() if each.error > 0.0}
     _require_torque_balance(scene, free, runs)
-    moved = [number for number in free.values() if number.path[-1] != "unbalance"]
-    unbalances = tuple(_known_unbalance(scene, k, free, found) for k in range(len(scene.exciters)))
+    nonlinear = [number for number in free.values() if number.path[-1] != "unbalance"]
+    unbalances = tuple(_known_unbalance(scene, k, free, known_numbers) for k in range(len(scene.exciters)))
 
-    values = np.array([float(number.read(scene)[0]) for number in moved])
-    positive = (values > 0.0) & np.array([number.spec.bounds.low == 0.0 for number in moved], bool)
-    scale = np.where(values != 0.0, np.abs(values), [number.spec.typical or 1.0 for number in moved])
-    means, errors = _known_means(moved, found, values, positive, scale)
+    values = np.array([float(number.read(scene)[0]) for number in nonlinear])
+    positive = (values > 0.0) & np.array([number.spec.bounds.low == 0.0 for number in nonlinear], bool)
+    scale = np.where(values != 0.0, np.abs(values), [number.spec.typical or 1.0 for number in nonlinear])
+    means, errors = _known_means(nonlinear, known_numbers, values, positive, scale)
 
     runs = [_with_own_rate(scene, run) for run in runs]
     notes = [note for run in runs for note in run.notes]
@@ -182,7 +184,9 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     gains = {c.name: c.gain_error for run in runs for c in run.of_kind(*MOTIONS) if c.gain_error > 0.0}
     # With several exciters, each drive's schedule fixes its angle in every run.
     turns = [k for k, is_marked in enumerate(marked) if k and not (is_marked and marked[0]) and len(scene.exciters) == 1]
-    unknowns = Unknowns(tuple(moved), jnp.asarray(values), jnp.asarray(scale), jnp.asarray(positive), tuple(gains), len(turns))
+    unknowns = Unknowns(
+        tuple(nonlinear), jnp.asarray(values), jnp.asarray(scale), jnp.asarray(positive), tuple(gains), len(turns)
+    )
     cases = enumerate(zip(runs, angles, strict=True))
     prepared = [_samples(scene, run, angle, turns.index(k) if k in turns else None) for k, (run, angle) in cases]
     samples, masks, raw, bounds, times, turned = zip(*prepared, strict=True)
@@ -207,17 +211,17 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
 
 
 def _known_means(
-    moved: Sequence[NamedNumber],
-    found: Mapping[str, tuple[NamedNumber, Known]],
+    nonlinear: Sequence[NamedNumber],
+    known_numbers: Mapping[str, tuple[NamedNumber, Known]],
     values: np.ndarray,
     positive: np.ndarray,
     scale: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the means and standard errors of the unknowns whose values are known with an error; 0 and infinity for others."""
-    means, errors = np.zeros(len(moved)), np.full(len(moved), np.inf)
-    for k, number in enumerate(moved):
-        if number.name in found and found[number.name][1].error > 0.0:
-            each = found[number.name][1]
+    means, errors = np.zeros(len(nonlinear)), np.full(len(nonlinear), np.inf)
+    for k, number in enumerate(nonlinear):
+        if number.name in known_numbers and known_numbers[number.name][1].error > 0.0:
+            each = known_numbers[number.name][1]
             means[k] = math.log(each.value / values[k]) if positive[k] else (each.value - values[k]) / scale[k]
             errors[k] = each.error / each.value if positive[k] else each.error / scale[k]
     return means, errors
@@ -244,7 +248,7 @@ def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs:
 
 
 def _with_own_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
-    """Return the run, reduced to a sampling rate for the highest frequency of the motion if it is long.
+    """Return the run; the sampling rate of a long run is reduced to the rate that its highest frequency needs.
 
     The natural frequencies have a margin, because they are those of the first values.
     """
@@ -254,11 +258,11 @@ def _with_own_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
     if measured is not None:
         fastest = float(np.quantile(np.abs(measured[1]), 0.999))
     else:
-        times = jnp.linspace(*run.span, _TIMES)
+        times = jnp.linspace(*run.span, _SPEED_TIMES)
         drives = [exciter.drive for exciter in scene.exciters if exciter.drive.ideal]
         speeds = [jax.vmap(lambda t, drive=drive: drive.rotor_speed(t, None))(times) for drive in drives]
         fastest = float(np.max(np.abs(np.asarray(speeds)), initial=0.0))
-    return decimated(run, max(fastest, _MARGIN * float(np.max(natural(scene)[0], initial=0.0)), 1e-300))
+    return decimated(run, max(fastest, _FREQUENCY_MARGIN * float(np.max(natural(scene)[0], initial=0.0)), 1e-300))
 
 
 def has_loads(scene: Scene) -> bool:
@@ -295,21 +299,21 @@ def _require_linear(scene: Scene) -> None:
 def _singles(scene: Scene, names: Sequence[str], field: str = "unknown") -> list[NamedNumber]:
     """Return the named numbers, each entry of a named array as one number; zeros of arrays, which are absent parts, are left
     out."""
-    found: dict[str, NamedNumber] = {}
+    singles: dict[str, NamedNumber] = {}
     for name in names:
         for part in present_numbers(scene, find_number(scene, name, field), field):
-            found |= {each.name: each for each in part.single(scene)}
-    return list(found.values())
+            singles |= {each.name: each for each in part.single(scene)}
+    return list(singles.values())
 
 
 def _known_unbalance(
-    scene: Scene, k: int, free: Mapping[str, NamedNumber], found: Mapping[str, tuple[NamedNumber, Known]]
+    scene: Scene, k: int, free: Mapping[str, NamedNumber], known_numbers: Mapping[str, tuple[NamedNumber, Known]]
 ) -> Known | None:
     if scene.exciters[k].unbalance is None:
         return Known(1.0, EXACT)  # the components of an unbalance that acts on nothing
     number = find_number(scene, f"exciters[{k}].unbalance", "unknown")
-    if number.name in found and found[number.name][1].error > 0.0:
-        return found[number.name][1]
+    if number.name in known_numbers and known_numbers[number.name][1].error > 0.0:
+        return known_numbers[number.name][1]
     value = float(number.read(scene)[0])
     return None if number.name in free else Known(value, EXACT * value)
 
@@ -367,8 +371,8 @@ def _samples(
     begin = max([min(float(run.times[c.name][0]) for c in channels), *(angle.span[0] for angle in angles)])
     end = min([max(float(run.times[c.name][-1]) for c in channels), *(angle.span[1] for angle in angles)])
     origin = float(run.times[channels[0].name][0])
-    first = math.ceil((begin - origin) / step - _UNEVEN)
-    count = math.floor((end - origin) / step + _UNEVEN) - first + 1
+    first = math.ceil((begin - origin) / step - _MAX_UNEVENNESS)
+    count = math.floor((end - origin) / step + _MAX_UNEVENNESS) - first + 1
     if count < 4 * (state_count(scene, channels) + 2):
         raise InputError(
             run.source, f"has {max(count, 0)} samples while the angle of the rotor is known; record more, or check the times"
@@ -382,7 +386,7 @@ def _samples(
         values, clipped = run.values[channel.name], run.clipped[channel.name]
         place = (run.times[channel.name] - origin) / step - first
         index = np.rint(place).astype(int)
-        if np.max(np.abs(place - index)) > _UNEVEN:
+        if np.max(np.abs(place - index)) > _MAX_UNEVENNESS:
             raise InputError(
                 f"{run.source}: channel {channel.name!r}",
                 f"is not sampled on the even grid of the others ({1.0 / step:.6g} Hz); resample it to this grid",
@@ -420,7 +424,7 @@ def _stretches(scene: Scene, count: int, step: float) -> tuple[int, int, int]:
     if is_stiff:
         raise InputError(
             "scene",
-            "has loads whose drag makes their speeds decay much faster than the motion; reduce loads.drag or loads.radius",
+            "has loads whose drag makes their speeds settle much faster than the vibration; reduce loads.drag or loads.radius",
         )
     number = max(1, min(_MAX_STRETCHES, round(count * step * slowest / _STRETCH_ANGLE)))
     return number, -(-count // number), max(1, math.ceil(step / longest))
@@ -430,7 +434,7 @@ def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: 
     """Return the problem with readings and models filtered such that the noise of the readings is white.
 
     **Arguments**: `noise` of the channels of each run; `differences` (n, C) of each run: readings minus model at the last
-    values, from which the influence of outliers and of clipped readings follows; None if there are no last values.
+    values, from which the influence of outliers and of clipped readings follows; None in the first passes.
     """
     runs = []
     for r, (samples, mask, raw, own) in enumerate(zip(problem.runs, problem.masks, problem.raw, noise, strict=True)):
@@ -454,14 +458,14 @@ def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: 
                 continue
             if each.outliers:
                 white = np.convolve(differences[r][:, k], data)[:n] / each.deviation
-                moved, factor = limited(white, valid, each.outliers, each.width)
-                readings[:n, k] += np.where(valid, each.deviation * (moved - white), 0.0)
+                shifted, factor = limited(white, valid, each.outliers, each.width)
+                readings[:n, k] += np.where(valid, each.deviation * (shifted - white), 0.0)
                 weights[:n, k] /= factor
-            if longest == 1:  # the bound of a reading says little if the noise is coloured
+            if longest == 1:  # the bound of a reading contains little information if the noise is coloured
                 at = np.flatnonzero(problem.bounds[r][:, k])
                 side = problem.bounds[r][at, k]
-                moved, weight = bounded(side * differences[r][at, k] / each.deviation)
-                readings[at, k] += side * each.deviation * moved - differences[r][at, k]
+                shifted, weight = bounded(side * differences[r][at, k] / each.deviation)
+                readings[at, k] += side * each.deviation * shifted - differences[r][at, k]
                 weights[at, k] = weight / each.deviation
         padded = np.stack([np.pad(taps, (0, longest - len(taps))) for _, taps in filters], axis=1)
         runs.append(

@@ -5,12 +5,12 @@ predicted speed w and angle obey
 
     J w' = T(w) + c(t),      c = -Re[conj(i p) (a + i g)],      angle' = w
 
-p(t) is the position of the unbalance, kg m, a its acceleration (horizontal + i up), both at the recorded angle, and g
-gravity. The first angle and speed are unknowns, and the predicted angle is compared with the pulses (or with samples of an
-angle or a speed). No derivative of the record enters, the errors of the pulses are independent except for a common delay, and
-the steady torque of the motor keeps the prediction near the record. The numbers of the motor, those of the machine and the
-motion at the first sample are fitted together: a dip of the speed at a resonance measures the torque of the vibration. The
-rotation of a housing that turns with the machine is neglected in T.
+p(t), kg m, is the unbalance times the unit vector to it, a the acceleration of the rotor's axis (horizontal + i up), both at
+the recorded angle, and g gravity. The first angle and speed are unknowns, and the predicted angle is compared with the pulses
+(or with samples of an angle or a speed). No derivative of the record enters, the errors of the pulses are independent except
+for a common delay, and the steady torque of the motor keeps the prediction near the record. The numbers of the motor, those of
+the machine and the motion at the first sample are fitted together, because a dip of the speed at a resonance measures the
+torque of the vibration. The rotation of a housing that turns with the machine is neglected in T.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ _AXES = tuple(
 )
 
 MISFIT = 2.0
-"""Deviation of a rotor from its torque balance, relative to that from a smooth curve, above which the balance is wrong."""
+"""Deviation of a rotor from its torque balance, relative to that from a smooth curve, above which the balance does not describe
+the rotor."""
 
 _FINE_ANGLE = 0.2
 """Largest angle, rad, between the times at which the torque of the vibration is computed."""
@@ -78,27 +79,27 @@ def _deviations(
     **Arguments**: `samples` of the accelerations of the rotor; `x`; `part`: state at the first sample and components of the
     unbalance; `own`: first angle, first speed, common delay of the pulses in standard errors, offsets of the marks.
     """
-    moved_count = x.shape[0] - unknowns.errors
+    nonlinear_count = x.shape[0] - unknowns.errors
     delay_error = rotor.scatter if rotor.kind == "pulses" else 0.0
 
     def deviations(free: Array) -> Array:
-        values, linear, first = jnp.split(free, [moved_count, moved_count + part.shape[0]])
-        now = x.at[:moved_count].set(values)
+        values, linear, first = jnp.split(free, [nonlinear_count, nonlinear_count + part.shape[0]])
+        now = x.at[:nonlinear_count].set(values)
         at, angle, speed, _ = _predicted(unknowns, samples, scene, now, linear, first[:2])
         width = at[1] - at[0]
         time = rotor.time - delay_error * first[2]
         k = jnp.clip(jnp.floor((time - at[0]) / width).astype(int), 0, at.size - 2)
         u = (time - at[k]) / width
         rise, begin, end = angle[k + 1] - angle[k], speed[k] * width, speed[k + 1] * width
-        bend, twist = 3.0 * rise - 2.0 * begin - end, begin + end - 2.0 * rise
+        quadratic, cubic = 3.0 * rise - 2.0 * begin - end, begin + end - 2.0 * rise
         if rotor.kind == "speed":
-            found = (begin + u * (2.0 * bend + 3.0 * u * twist)) / width
+            predicted = (begin + u * (2.0 * quadratic + 3.0 * u * cubic)) / width
         else:
             offsets = jnp.concatenate([-jnp.sum(first[3:], keepdims=True), first[3:]])
-            found = angle[k] + u * (begin + u * (bend + u * twist)) + offsets[rotor.marks]
-        return (found - rotor.value) / rotor.spread
+            predicted = angle[k] + u * (begin + u * (quadratic + u * cubic)) + offsets[rotor.marks]
+        return (predicted - rotor.value) / rotor.spread
 
-    free = jnp.concatenate([x[:moved_count], part, own])
+    free = jnp.concatenate([x[:nonlinear_count], part, own])
     return deviations(free), jax.jacfwd(deviations)(free)
 
 
@@ -113,9 +114,9 @@ def _predicted(
     turned = jax.vmap(lambda t: samples.drives[0].rotor_angle(t, None))(jnp.minimum(times, samples.end))
     turn = 0.0 if samples.turn is None else x[unknowns.first.shape[0] + len(unknowns.gains) + samples.turn]
     turning = 1j * exciter.direction
-    place = (part[-2] + 1j * part[-1]) * jnp.exp(1j * turn + turning * turned)
+    unbalance = (part[-2] + 1j * part[-1]) * jnp.exp(1j * turn + turning * turned)
     weight = total_gravity((*scene.effects, *exciter.effects)).get(1, 0.0)
-    braking = jnp.real(jnp.conj(turning * place) * (accelerations[:, 0] + 1j * (accelerations[:, 1] + weight)))
+    braking = jnp.real(jnp.conj(turning * unbalance) * (accelerations[:, 0] + 1j * (accelerations[:, 1] + weight)))
 
     def rates(t: Array, speed: Array, brake: Array) -> Array:
         motor = exciter.drive.torque_and_inertia(t, speed)
@@ -137,8 +138,8 @@ def _predicted(
         return state, (angle, speed, rates(t, speed, brakes[0]))
 
     triples = jnp.stack([braking[:-2:2], braking[1:-1:2], braking[2::2]], axis=1)
-    _, found = jax.lax.scan(step, (first[0], first[1]), (times[:-2:2], triples))
-    return times[:-2:2], *found
+    _, motion = jax.lax.scan(step, (first[0], first[1]), (times[:-2:2], triples))
+    return times[:-2:2], *motion
 
 
 def _runge_kutta(
@@ -177,8 +178,8 @@ class _Trial(NamedTuple):
 
 
 def fit_with_torques(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
-    """Return the fit of a problem from the unknowns `starts`, of the vibrations and of the speed of the rotor together if a
-    number of a motor is unknown.
+    """Return the fit of a problem from the unknowns `starts`; if a number of a motor is unknown, the vibrations and the speed
+    of the rotor are fitted together.
 
     The fit is then repeated with the predicted angle of the rotor, which contains its ripple within each turn.
     """
@@ -203,12 +204,12 @@ def _with_torque_balance(fitted: Fitted, motor: list[int]) -> tuple[Fitted, list
     """
     problem, p, size = fitted.problem, fitted.x.size, fitted.x.size + fitted.linear.size
     runs, own = _runs(fitted)
-    y, everything = np.concatenate([fitted.x, fitted.linear, own]), np.arange(size + own.size)
-    y = _minimum(problem, runs, y, np.concatenate([motor, everything[size:]]).astype(int))[0].y
+    y, all_places = np.concatenate([fitted.x, fitted.linear, own]), np.arange(size + own.size)
+    y = _minimum(problem, runs, y, np.concatenate([motor, all_places[size:]]).astype(int))[0].y
     converged, information = False, np.zeros((size, size))
     for _ in range(_OWN_PASSES):
-        trial, converged = _minimum(problem, runs, y, everything)
-        y, information = trial.y, eliminate(trial.equations[0], everything[:size])
+        trial, converged = _minimum(problem, runs, y, all_places)
+        y, information = trial.y, eliminate(trial.equations[0], all_places[:size])
         runs = [run._replace(noise=_noise(run, _deviations_of(problem, run, y)[0])) for run in runs]
     x, linear = y[:p], y[p:size]
     fitted = fitted._replace(
@@ -224,16 +225,16 @@ def _with_torque_balance(fitted: Fitted, motor: list[int]) -> tuple[Fitted, list
 
 def _runs(fitted: Fitted) -> tuple[list[_Run], np.ndarray]:
     """Return the runs of a fit, and first values of their own unknowns."""
-    problem, runs, every = fitted.problem, [], []
-    moved_count, size = fitted.x.size - problem.unknowns.errors, fitted.x.size + fitted.linear.size
+    problem, runs, first_values = fitted.problem, [], []
+    nonlinear_count, size = fitted.x.size - problem.unknowns.errors, fitted.x.size + fitted.linear.size
     for samples, (angle,), place in zip(problem.runs, problem.rotors, linear_places(problem), strict=True):
         drive, rotor = samples.drives[0], angle.samples
         assert isinstance(drive, RecordedDrive) and rotor is not None
         factor = max(1, math.ceil(float(samples.step) * float(drive.speed) / _FINE_ANGLE))
         stretches, n, _ = samples.readings.shape
-        nothing = jnp.zeros((stretches * factor, n, 2))
+        empty = jnp.zeros((stretches * factor, n, 2))
         fine = dataclasses.replace(
-            samples, drives=(angle.without_errors(),), readings=nothing, weights=nothing, taps=jnp.ones((1, 2)),
+            samples, drives=(angle.without_errors(),), readings=empty, weights=empty, taps=jnp.ones((1, 2)),
             step=samples.step / factor, channels=_AXES, errors=(0, 0),
         )  # fmt: skip
         used = (rotor.time >= samples.begin) & (rotor.time <= samples.end)
@@ -243,10 +244,12 @@ def _runs(fitted: Fitted) -> tuple[list[_Run], np.ndarray]:
         own = [drive.angle_at(samples.begin), drive.speed_at(samples.begin), *np.zeros(1 + int(np.max(rotor.marks)))]
         states = 2 * len(problem.scene.machine.structure().coordinates)
         linear = np.concatenate([place[:states], place[-2 - len(samples.channels) : -len(samples.channels)]])
-        places = np.concatenate([np.arange(moved_count), fitted.x.size + linear, size + len(every) + np.arange(len(own))])
+        places = np.concatenate(
+            [np.arange(nonlinear_count), fitted.x.size + linear, size + len(first_values) + np.arange(len(own))]
+        )
         runs.append(_Run(fine, rotor, places, len(own), Noise(np.ones(1), float(scatter))))
-        every += map(float, own)
-    return runs, np.array(every)
+        first_values += map(float, own)
+    return runs, np.array(first_values)
 
 
 def _parts(problem: Problem, run: _Run, y: np.ndarray) -> list[Array]:
@@ -277,13 +280,13 @@ def _noise(run: _Run, deviations: np.ndarray) -> Noise:
 def _minimum(problem: Problem, runs: list[_Run], y: np.ndarray, free: np.ndarray) -> tuple[_Trial, bool]:
     """Return the minimum near `y` over the unknowns at the places `free`, and True if it was reached."""
 
-    def moved(trial: _Trial, step: np.ndarray) -> _Trial:
+    def stepped(trial: _Trial, step: np.ndarray) -> _Trial:
         whole = np.zeros(y.size)
         whole[free] = step
         return _trial(problem, runs, trial.y + limited_step(problem, whole), free)
 
     positive = np.flatnonzero(np.isin(free, positive_places(problem)))
-    best, _, converged = descend(_trial(problem, runs, y, free), lambda trial: trial.equations, moved, free.size, positive)
+    best, _, converged = descend(_trial(problem, runs, y, free), lambda trial: trial.equations, stepped, free.size, positive)
     return best, converged
 
 
@@ -298,14 +301,14 @@ def _trial(problem: Problem, runs: list[_Run], y: np.ndarray, free: np.ndarray) 
     prior[:size, :size], gradient[:size] = prior_equations(problem, x, linear)
     cost = known_cost(problem, x, linear)
     for run in runs:
-        found, slopes = _deviations_of(problem, run, y)
+        deviations, slopes = _deviations_of(problem, run, y)
         taps, places = run.noise.taps, np.append(run.places, y.size)
-        both = np.concatenate([slopes, -found[:, None]], axis=1) / run.noise.deviation
+        both = np.concatenate([slopes, -deviations[:, None]], axis=1) / run.noise.deviation
         white = np.stack([np.convolve(each, taps, mode="valid") for each in both.T], axis=1)
         total[np.ix_(places, places)] += white.T @ white
-        late = np.array([run.places[2 - run.own], y.size])  # the common delay, known as 0 with the standard error 1
-        row = np.array([1.0, -y[late[0]]])
-        total[np.ix_(late, late)] += np.outer(row, row)
+        delay_places = np.array([run.places[2 - run.own], y.size])  # the common delay, known as 0 with the standard error 1
+        row = np.array([1.0, -y[delay_places[0]]])
+        total[np.ix_(delay_places, delay_places)] += np.outer(row, row)
     own = np.ix_(free, free)
     equations = total[:-1, :-1][own], prior[own], (total[:-1, -1] + gradient)[free]
     return _Trial(y, total[-1, -1] + cost, equations)

@@ -176,5 +176,5 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, report: Cal
 def _point(states: _SearchState) -> Point:
     """Return the designs of all searches, without pieces of the objective."""
     z, values, slopes = (np.asarray(array) for array in states[:3])
-    nothing = np.zeros((len(z), 0))
-    return Point(z, values, slopes, states.speeds, states.speed_slopes, nothing, np.zeros((*nothing.shape, z.shape[1])))
+    empty = np.zeros((len(z), 0))
+    return Point(z, values, slopes, states.speeds, states.speed_slopes, empty, np.zeros((*empty.shape, z.shape[1])))

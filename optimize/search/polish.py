@@ -119,8 +119,8 @@ def _least_change(z: np.ndarray, slopes: np.ndarray, values: np.ndarray, max_cha
 
     **Arguments**: `slopes` (s, m, d): derivatives of the values; `max_change`: largest change of each entry of z.
     """
-    wanted = -least_norm(slopes, values)
-    stopped = ((z <= 0.0) & (wanted < 0.0)) | ((z >= 1.0) & (wanted > 0.0))
+    unlimited = -least_norm(slopes, values)
+    stopped = ((z <= 0.0) & (unlimited < 0.0)) | ((z >= 1.0) & (unlimited > 0.0))
     step = -least_norm(slopes * np.where(stopped, 0.0, 1.0)[:, None, :], values)
     return np.clip(z + np.clip(step, -max_change, max_change), 0.0, 1.0)
 

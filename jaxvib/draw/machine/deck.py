@@ -21,10 +21,10 @@ def ellipses(points: np.ndarray, amplitude: np.ndarray, magnify: float) -> list[
 
 
 def magnification(points: np.ndarray, amplitude: np.ndarray) -> float:
-    """Return the magnification, of one digit, at which neighbouring ellipses do not overlap."""
+    """Return the magnification at which neighbouring ellipses do not overlap, rounded to one digit."""
     size = max(float(np.max(np.abs(amplitude))), 1e-300)
-    away = np.linalg.norm(points[:, None] - points[None], axis=2)
-    nearest = float(np.min(away[away > 0.0], initial=np.inf))
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    nearest = float(np.min(distance[distance > 0.0], initial=np.inf))
     return float(f"{0.4 * (nearest if np.isfinite(nearest) else 1.0) / size:.1g}")
 
 

@@ -102,7 +102,7 @@ class Film(FuncAnimation):
         first.save(path, save_all=True, append_images=others, duration=pause, loop=0, optimize=True, disposal=1)
 
     def _few_colours(self) -> list[Image.Image]:
-        """Return all pictures with a common palette from a few of them, without dithering.
+        """Return all pictures with a common palette, which follows from a few of them, without dithering.
 
         Parts that do not move are therefore identical in all pictures.
         """
@@ -112,9 +112,9 @@ class Film(FuncAnimation):
         for k, each in enumerate(some):
             strip.paste(each, (0, k * each.height))
         # The most frequent colours, such as white, come first and are not changed.
-        colours, often = np.unique(np.asarray(strip).reshape(-1, 3), axis=0, return_counts=True)
+        colours, counts = np.unique(np.asarray(strip).reshape(-1, 3), axis=0, return_counts=True)
         chosen: list[np.ndarray] = []
-        for colour in colours[np.argsort(-often, kind="stable")].astype(int):
+        for colour in colours[np.argsort(-counts, kind="stable")].astype(int):
             # A colour that is close to one in the palette would only take the place of another colour.
             if len(chosen) < _COLORS and all(np.max(np.abs(colour - other)) > _MIN_COLOR_DIFFERENCE for other in chosen):
                 chosen.append(colour)

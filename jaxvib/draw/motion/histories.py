@@ -115,8 +115,8 @@ def time_histories(
     if whole[2].shape[1] == 0 or np.all(np.abs(part[3] - np.mean(ends)) < ends[1] - ends[0]):
         _draw_rotor_speeds(right, part[0], scale * part[3])
     low, high = right.get_ylim()
-    if high - low < (room := _LEAST_RANGE * max(abs(low), abs(high))):  # rounding errors of a constant speed
-        right.set_ylim(0.5 * (low + high - room), 0.5 * (low + high + room))
+    if high - low < (least := _MIN_SPEED_RANGE * max(abs(low), abs(high))):  # rounding errors of a constant speed
+        right.set_ylim(0.5 * (low + high - least), 0.5 * (low + high + least))
     left.set_ylabel(f"speed, {unit}")
     legend_above(left, 6)
     left, right = axes[-2:]
@@ -143,10 +143,10 @@ def _kinds(values: np.ndarray, units: Sequence[str], length: str, tilt: str) -> 
     return [kind for kind in kinds if kind[0] in units]
 
 
-_LEAST_RANGE = 1e-4
+_MIN_SPEED_RANGE = 1e-4
 """Smallest range of the axis of the last periods' speeds, relative to the speeds."""
 
-_EQUAL = 0.01
+_MAX_EQUAL_DIFFERENCE = 0.01
 """Difference of the speeds of two loads, relative to the range of an axis, below which they are drawn as one line."""
 
 
@@ -165,12 +165,13 @@ def _equal_loads(whole: np.ndarray, end: np.ndarray) -> list[tuple[int, str | No
     count, signals = whole.shape[1], (whole, end)
     if count == 0:
         return []
-    rooms = [_EQUAL * float(np.ptp(values)) + 1e-9 * float(np.max(np.abs(values), initial=0.0)) for values in signals]
+    largest = [float(np.max(np.abs(values), initial=0.0)) for values in signals]
+    limits = [_MAX_EQUAL_DIFFERENCE * float(np.ptp(values)) + 1e-9 * top for values, top in zip(signals, largest, strict=True)]
     groups: list[list[int]] = []
     for k in range(count):
 
         def is_equal(other: list[int], k: int = k) -> bool:
-            return all(np.max(np.abs(x[:, k] - x[:, other[0]])) <= room for x, room in zip(signals, rooms, strict=True))
+            return all(np.max(np.abs(x[:, k] - x[:, other[0]])) <= limit for x, limit in zip(signals, limits, strict=True))
 
         same = next((group for group in groups if is_equal(group)), None)
         if same is None:
@@ -204,8 +205,8 @@ def _band(
 def _smoothed_peaks(values: np.ndarray) -> np.ndarray:
     """Return a smooth curve that is not below the maxima of intervals.
 
-    An interval contains no whole number of periods, so that the maxima are a saw-tooth. The result is the mean of three
-    neighbouring maxima of three neighbours; each of them includes the interval itself.
+    An interval does not contain a whole number of periods; the maxima of successive intervals therefore form a saw-tooth. The
+    result is the mean of three running maxima, each over three neighbouring intervals that include the interval itself.
     """
     padded = np.pad(values, 2, mode="edge")
     largest = np.maximum(np.maximum(padded[:-2], padded[2:]), padded[1:-1])
@@ -256,9 +257,9 @@ def amplitude_histories(
     if load_speed.shape[1]:
         lines(axes[-2], scale * load_speed, range(load_speed.shape[1]), load_names(load_speed.shape[1]))
     _draw_rotor_speeds(axes[-2], time, scale * rotor_speed)
-    ways = [way for way in (1.0, -1.0) if np.any(way * rotor_speed > 0.0)]
+    signs = [sign for sign in (1.0, -1.0) if np.any(sign * rotor_speed > 0.0)]
     passed = [w for w in resonances if w < np.max(np.abs(rotor_speed), initial=0.0)]
-    for k, w in enumerate(np.outer(ways, passed).ravel().tolist()):
+    for k, w in enumerate(np.outer(signs, passed).ravel().tolist()):
         axes[-2].axhline(scale * w, color=GUIDE, ls=":", lw=0.9, label=None if k else "natural frequencies")
     axes[-2].set_ylabel(f"speed, {unit}")
     legend_above(axes[-2], 6)

@@ -36,7 +36,7 @@ from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.runtime.programs import cached
 
 
-class _Turned(IdealDrive):
+class _ShiftedDrive(IdealDrive):
     """Prescribed `drive` whose angle is larger by `phase`, rad; after the time `end` its angle, speed and acceleration keep
     their values at `end`."""
 
@@ -81,8 +81,8 @@ def _equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pai
         turn = 0.0 if samples.turn is None else x[unknowns.first.shape[0] + len(unknowns.gains) + samples.turn]
         phase = exciter.direction * (jnp.arctan2(pair[1], pair[0]) + turn)
         own = eqx.tree_at(lambda scene: scene.exciters[0].unbalance, own, jnp.hypot(pair[0], pair[1]))
-    turned = _Turned(drive=drive, phase=phase, end=samples.end, speed=drive.speed)
-    own: Any = eqx.tree_at(lambda scene: scene.exciters[0].drive, own, turned)
+    shifted = _ShiftedDrive(drive=drive, phase=phase, end=samples.end, speed=drive.speed)
+    own: Any = eqx.tree_at(lambda scene: scene.exciters[0].drive, own, shifted)
     model = assemble(own)
     gains = jnp.stack([jnp.asarray(unknowns.gain(x, channel.name)) for channel in samples.channels])
     corners = jnp.asarray([2.0 * np.pi * channel.high_pass for channel in samples.channels if channel.high_pass > 0.0])
@@ -94,11 +94,11 @@ def _rates(samples: Samples, t: Array, y: Array, equations: _Equations) -> tuple
     nd, filters = equations.rows.shape[2], equations.corners.shape[0]
     loads = (y.shape[0] - 2 * nd - filters) // 2
     q, v, angle, rate, slow = jnp.split(y, np.cumsum([nd, nd, loads, loads]))
-    found = equations.dynamics(t, State(q, v, (angle,), (rate,)))
-    readings = equations.rows[:, 0] @ q + equations.rows[:, 1] @ v + equations.rows[:, 2] @ found.velocity
+    derivative = equations.dynamics(t, State(q, v, (angle,), (rate,)))
+    readings = equations.rows[:, 0] @ q + equations.rows[:, 1] @ v + equations.rows[:, 2] @ derivative.velocity
     filtered = np.flatnonzero([channel.high_pass > 0.0 for channel in samples.channels])
-    follows = equations.corners * (readings[filtered] - slow)
-    rates = jnp.concatenate([found.displacement, found.velocity, *found.angle, *found.rate, follows])
+    filter_rates = equations.corners * (readings[filtered] - slow)
+    rates = jnp.concatenate([derivative.displacement, derivative.velocity, *derivative.angle, *derivative.rate, filter_rates])
     return rates, readings.at[filtered].add(-slow)
 
 
@@ -150,25 +150,27 @@ def _slopes(
     def of_stretch(start: Array, begin: Array) -> tuple[Any, Any]:
         return jax.jacfwd(motion, has_aux=True)(jnp.concatenate([x, pair, start]), begin)
 
-    slopes, found = jax.vmap(of_stretch)(starts, length * jnp.arange(starts.shape[0]))
-    return found, slopes
+    slopes, values = jax.vmap(of_stretch)(starts, length * jnp.arange(starts.shape[0]))
+    return values, slopes
 
 
 class Linearized(NamedTuple):
     """Linearized motion of a run.
 
     The f = p + ns + 2 + C unknowns are x, the state at the first sample, `pair` and the offsets of the channels, in this order.
-    The last axis of `columns` and `moves` has f + 1 entries: the derivatives with respect to the unknowns, and the change that
-    closes the gaps between the stretches.
+    The last axis of `columns` and `start_changes` has f + 1 entries: the derivatives with respect to the unknowns, and the
+    change that closes the gaps between the stretches.
 
-    **Attributes**: `model` (n, C): readings of the model after the filter; `columns` (n, C, f + 1): their changes; `moves`
-    (J, ns, f + 1): changes of the first states of the stretches; `gaps` (J - 1, ns): last state of each stretch minus the first
-    state of the next one.
+    **Attributes**
+
+    - `model` (n, C): readings of the model after the filter; `columns` (n, C, f + 1): their changes
+    - `start_changes` (J, ns, f + 1): changes of the first states of the stretches
+    - `gaps` (J - 1, ns): last state of each stretch minus the first state of the next one
     """
 
     model: np.ndarray
     columns: np.ndarray
-    moves: np.ndarray
+    start_changes: np.ndarray
     gaps: np.ndarray
 
 
@@ -180,28 +182,28 @@ def linearized(
     **Arguments**: `x` (p,); `own`: state at the first sample, pair, offsets; `starts` (J, ns): first states of the stretches.
     """
     p, count = x.size, starts.shape[1]
-    found, slopes = _slopes(unknowns, samples, scene, jnp.asarray(x), jnp.asarray(own[count : count + 2]), jnp.asarray(starts))
-    (readings, ends), (by_readings, by_ends) = jax.tree.map(np.asarray, (found, slopes))
+    values, slopes = _slopes(unknowns, samples, scene, jnp.asarray(x), jnp.asarray(own[count : count + 2]), jnp.asarray(starts))
+    (readings, ends), (by_readings, by_ends) = jax.tree.map(np.asarray, (values, slopes))
     gaps, width = ends[:-1] - starts[1:], p + count + 2 + len(samples.channels) + 1
     direct = np.concatenate([np.arange(p), p + count + np.arange(2)])  # places of x and pair
-    moved, moves, columns = np.zeros((count, width)), [], []
-    moved[:, p : p + count] = np.eye(count)
+    change, start_changes, columns = np.zeros((count, width)), [], []
+    change[:, p : p + count] = np.eye(count)
     for j in range(len(starts)):
-        moves.append(moved)
-        part = by_readings[j][:, :, p + 2 :] @ moved
+        start_changes.append(change)
+        part = by_readings[j][:, :, p + 2 :] @ change
         part[:, :, direct] += by_readings[j][:, :, : p + 2]
         columns.append(part)
-        moved = by_ends[j][:, p + 2 :] @ moved
-        moved[:, direct] += by_ends[j][:, : p + 2]
+        change = by_ends[j][:, p + 2 :] @ change
+        change[:, direct] += by_ends[j][:, : p + 2]
         if j < len(gaps):
-            moved[:, -1] += gaps[j]
+            change[:, -1] += gaps[j]
     n = samples.readings.shape[0] * samples.readings.shape[1]
     model, slopes = (np.concatenate(each)[:n] for each in (readings, columns))
     model, slopes = _filtered(samples, model), _filtered(samples, slopes)
     level = np.sum(np.asarray(samples.taps), axis=0)  # response of the filter to a constant offset
     offsets = np.arange(len(level))
     slopes[:, offsets, p + count + 2 + offsets] = level
-    return Linearized(model + level * own[count + 2 :], slopes, np.stack(moves), gaps)
+    return Linearized(model + level * own[count + 2 :], slopes, np.stack(start_changes), gaps)
 
 
 def _filtered(samples: Samples, values: np.ndarray) -> np.ndarray:
@@ -209,8 +211,8 @@ def _filtered(samples: Samples, values: np.ndarray) -> np.ndarray:
     from scipy.signal import lfilter  # slow to import
 
     taps = np.asarray(samples.taps)
-    found = np.stack([lfilter(taps[:, c], 1.0, values[:, c], axis=0) for c in range(taps.shape[1])], axis=1)
-    return np.asarray(found)
+    filtered = np.stack([lfilter(taps[:, c], 1.0, values[:, c], axis=0) for c in range(taps.shape[1])], axis=1)
+    return np.asarray(filtered)
 
 
 def weighted(samples: Samples, model: np.ndarray) -> np.ndarray:
@@ -232,8 +234,8 @@ def closed_motion(
     """
     count, (number, length, _) = own.size - 2 - len(samples.channels), samples.stretches
     pair, start = jnp.asarray(own[count : count + 2]), jnp.asarray(own[None, :count])
-    found = stretches(unknowns, samples, scene, jnp.asarray(x), pair, start, number * length)
-    readings, states = np.asarray(found[0]), np.asarray(found[1])
+    motion = stretches(unknowns, samples, scene, jnp.asarray(x), pair, start, number * length)
+    readings, states = np.asarray(motion[0]), np.asarray(motion[1])
     return readings[0] + own[count + 2 :], states[0, ::length]
 
 

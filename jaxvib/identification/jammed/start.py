@@ -1,9 +1,9 @@
 """First values of a motion with jammed loads, by multiple shooting.
 
-The vibration at the speed of the jam gives the angle of the loads, apart from a constant: this follows, together with the
+The vibration at the speed of the jam gives the angle of the loads up to a constant. This constant follows, together with the
 motion of the machine and the unbalance of the rotor, from a linear fit in which the loads are an unbalance that turns by that
 angle. The motion is then divided into stretches, whose first states are unknowns of a fit with all other unknowns. The gaps
-between the stretches have a cost and vanish. Within a stretch, errors of the first values change the angles of the loads by
+between the stretches are penalized and vanish. Within a stretch, errors of the first values change the angles of the loads by
 less than a radian, whereas over the whole record they would change them by many turns.
 """
 
@@ -39,33 +39,34 @@ from jaxvib.numerics.noise import Noise
 _BELOW_ROTOR = 0.95
 """Largest speed of a jam relative to the smallest speed of the rotor."""
 
-_BAND = 0.25
+_BAND_HALF_WIDTH = 0.25
 """Relative half-width of the band about the speed of a jam from which its angle follows."""
 
 _EDGE_TURNS = 3
 """Number of turns at each end of a record in which the angle is extrapolated with the mean speed."""
 
-_LINE, _STEEP = 5, 4.0
+_BINS_PER_LINE, _MIN_LINE_POWER = 5, 4.0
 """Number of bins of a spectrum that are averaged, and smallest power of the jam in them relative to the mean power below the
 speed of the rotor."""
 
 _MIN_TURNS = 8
 """Smallest number of turns of jammed loads in a record."""
 
-_TOGETHER, _APART = 1e-3, 0.2
+_COINCIDENT_SPREAD, _FREE_SPREAD = 1e-3, 0.2
 """Standard deviations of the angles of the loads of a run at the first sample about their mean, rad, and of their speeds about
-the mean, relative to it: for equal loads at one place, which come together in a jam, and for others. A small difference of two
-equal angles changes no reading."""
+the mean, relative to it. The first is for equal loads at one station, which gather in a jam: a small difference of their angles
+changes no reading. The second is for all other loads."""
 
-_GAP = 0.01
-"""Gap between two stretches, relative to the size of each state (angles: rad), with the cost of one reading."""
+_GAP_SIZE = 0.01
+"""Gap between two stretches, relative to the size of each state (angles: rad), that costs as much as a reading whose residual
+is one standard deviation."""
 
 _MAX_TURN = 0.7
 """Largest change of the angle of a load in one step, rad."""
 
 
 class _Jam(NamedTuple):
-    """Jam of a run: `drive` that turns as the loads, apart from a constant angle; its angle and speed (n,) at the samples."""
+    """Jam of a run: `drive` that turns like the loads, except for a constant angle; its angle and speed (n,) at the samples."""
 
     drive: RecordedDrive
     angle: np.ndarray
@@ -75,25 +76,26 @@ class _Jam(NamedTuple):
 class _Trial(NamedTuple):
     """Values of all unknowns, with their cost and `equations`.
 
-    **Attributes**: `x`, `linear`; of each run, `starts` (J, ns) of its stretches, and their `moves` (J, ns, f + 1), see
-    `Linearized`.
+    **Attributes**: `x`, `linear`; of each run, `starts` (J, ns) of its stretches, and their `start_changes`
+    (J, ns, f + 1), see `Linearized`.
     """
 
     x: np.ndarray
     linear: np.ndarray
     starts: tuple[np.ndarray, ...]
-    moves: tuple[np.ndarray, ...]
+    start_changes: tuple[np.ndarray, ...]
     cost: float
     equations: Equations
 
 
 def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
-    """Return the problem of a motion with loads with first values of its unknowns, and the first values of x.
+    """Return the problem of a motion with loads, in which the first values of the linear unknowns are set, and the first values
+    of x.
 
     **Raises** `InputError` for a run without a vibration below the speed of the rotor.
     """
     noise = [[Noise(np.ones(1), size) for size in of_run] for of_run in channel_sizes(problem)]
-    weighed, jams, places = (
+    weighted_problem, jams, places = (
         with_noise(problem, noise),
         [_jam_of(problem, r) for r in range(len(problem.runs))],
         linear_places(problem),
@@ -101,7 +103,7 @@ def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     x, linear = np.zeros(problem.unknowns.count), np.zeros(unknown_count(problem) - problem.unknowns.count)
     starts, pairs = [], []
     for r, (jam, place) in enumerate(zip(jams, places, strict=True)):
-        states, pair, offsets = _linear_motion(weighed, r, jam)
+        states, pair, offsets = _linear_motion(weighted_problem, r, jam)
         linear[place] = np.concatenate([states[0], pair, offsets])
         starts.append(states)
         pairs.append(pair)
@@ -110,10 +112,10 @@ def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
         if samples.turn is not None:
             turn = math.atan2(pair[1], pair[0]) - math.atan2(pairs[0][1], pairs[0][0])
             x[problem.unknowns.first.shape[0] + len(problem.unknowns.gains) + samples.turn] = turn
-    apart = _apart(problem, linear)
-    found = _shoot(weighed._replace(apart=apart), x, linear, starts)
+    load_spread = _load_spread(problem, linear)
+    fitted = _shoot(weighted_problem._replace(load_spread=load_spread), x, linear, starts)
     angles = tuple(np.column_stack([turned, jam.angle]) for turned, jam in zip(problem.angles, jams, strict=True))
-    return problem._replace(angles=angles, linear=found.linear, apart=apart), found.x
+    return problem._replace(angles=angles, linear=fitted.linear, load_spread=load_spread), fitted.x
 
 
 def _loads_of(scene: Scene) -> CircularLoads:
@@ -123,16 +125,17 @@ def _loads_of(scene: Scene) -> CircularLoads:
     return loads
 
 
-def _apart(problem: Problem, linear: np.ndarray) -> np.ndarray:
-    """Return the information (L, L) that the loads of each run have nearly one angle and one speed at the first sample."""
+def _load_spread(problem: Problem, linear: np.ndarray) -> np.ndarray:
+    """Return the information (L, L) from the assumption that the loads of each run have nearly one angle and one speed at the
+    first sample."""
     loads, mount = _loads_of(problem.scene), problem.scene.mounting
-    nd, found = len(problem.scene.machine.structure().coordinates), np.zeros((linear.size, linear.size))
-    spread = _TOGETHER if loads.alike and mount.at_one_point else _APART
+    nd, information = len(problem.scene.machine.structure().coordinates), np.zeros((linear.size, linear.size))
+    spread = _COINCIDENT_SPREAD if loads.alike and mount.at_one_point else _FREE_SPREAD
     for place in linear_places(problem):
         angles, rates = np.split(place[2 * nd : 2 * (nd + loads.count)], 2)
         for own, size in ((angles, 1.0), (rates, abs(float(linear[rates[0]])))):
-            found[np.ix_(own, own)] = (np.eye(loads.count) - 1.0 / loads.count) / (spread * size) ** 2
-    return found
+            information[np.ix_(own, own)] = (np.eye(loads.count) - 1.0 / loads.count) / (spread * size) ** 2
+    return information
 
 
 def _jam_of(problem: Problem, r: int) -> _Jam:
@@ -142,29 +145,29 @@ def _jam_of(problem: Problem, r: int) -> _Jam:
     speed = np.abs(np.gradient(problem.angles[r][:, 0], step))
     filled = [np.interp(time, time[each], values[each]) for values, each in zip(raw.T, mask.T, strict=True) if np.any(each)]
     frequency = 2.0 * np.pi * np.fft.rfftfreq(time.size, step)
-    moved = [np.fft.rfft(each - np.mean(each)) / np.std(each) for each in filled if np.std(each) > 0.0]
+    spectra = [np.fft.rfft(each - np.mean(each)) / np.std(each) for each in filled if np.std(each) > 0.0]
     low, high = 2.0 * np.pi * _MIN_TURNS / (time[-1] - time[0]), _BELOW_ROTOR * float(np.quantile(speed, 0.02))
-    below = (frequency > low) & (frequency < high)
-    power = np.zeros(frequency.size)
-    for each in moved:
-        power += np.convolve(np.where(below, np.abs(each) ** 2, 0.0), np.full(_LINE, 1.0 / _LINE), mode="same")
-    power[~below] = 0.0
-    if not np.max(power) > _STEEP * np.sum(power) / max(np.count_nonzero(below), 1):
+    in_range = (frequency > low) & (frequency < high)
+    power, mean = np.zeros(frequency.size), np.full(_BINS_PER_LINE, 1.0 / _BINS_PER_LINE)
+    for each in spectra:
+        power += np.convolve(np.where(in_range, np.abs(each) ** 2, 0.0), mean, mode="same")
+    power[~in_range] = 0.0
+    if not np.max(power) > _MIN_LINE_POWER * np.sum(power) / max(np.count_nonzero(in_range), 1):
         raise InputError(
             f"records[{r}]",
             f"has no vibration of jammed loads below the smallest speed of the rotor, {high:.3g} rad/s; identify needs "
             "records in which the loads of the scene are jammed from the first sample to the last, for at least 8 turns",
         )
     peak = float(frequency[np.argmax(power)])
-    band = below & (np.abs(frequency / peak - 1.0) < _BAND)
-    strongest = max(moved, key=lambda each: float(np.sum(np.abs(each[band]) ** 2)))
+    band = in_range & (np.abs(frequency / peak - 1.0) < _BAND_HALF_WIDTH)
+    strongest = max(spectra, key=lambda each: float(np.sum(np.abs(each[band]) ** 2)))
     analytic = np.fft.ifft(np.concatenate([np.where(band, strongest, 0.0), np.zeros(time.size - frequency.size)]))
     phase, edge = np.unwrap(np.angle(analytic)), math.ceil(2.0 * np.pi * _EDGE_TURNS / (peak * step))
     for part in (slice(edge, None, -1), slice(-edge - 1, None)):  # the filter continues the record periodically
         slope = (phase[part][0] - phase[::-1][part][0]) / (time[part][0] - time[::-1][part][0])
         phase[part] = phase[part][0] + slope * (time[part] - time[part][0])
-    kept = slice(None, None, max(1, int(1.0 / (peak * step))))
-    spline, _ = fit_spline(time[kept], phase[kept])
+    thinned = slice(None, None, max(1, int(1.0 / (peak * step))))
+    spline, _ = fit_spline(time[thinned], phase[thinned])
     knots = np.unique(spline.t)
     drive = recorded_drive(knots, [spline(knots, order)[:, :1] for order in range(3)])
     return _Jam(drive, spline(time)[:, 0], spline(time, 1)[:, 0])
@@ -181,11 +184,11 @@ def _linear_motion(problem: Problem, r: int, jam: _Jam) -> tuple[np.ndarray, np.
     rotors = [] if exciter.unbalance is None else [exciter.with_parts(None, samples.drives[0])]
     exciters, drives = [*rotors, jammed], (*samples.drives[: len(rotors)], jam.drive)
     own = Scene(own.machine, exciters=exciters, effects=own.effects)
-    none, no = jnp.zeros(0), ()
+    empty, no = jnp.zeros(0), ()
     samples = dataclasses.replace(
-        samples, drives=drives, amounts=none, changed=no, actions=no, turn=None, errors=(0, 0), stretches=(0, 0, 0)
+        samples, drives=drives, amounts=empty, changed=no, actions=no, turn=None, errors=(0, 0), stretches=(0, 0, 0)
     )
-    unknowns = Unknowns((), none, none, none, no, 0)
+    unknowns = Unknowns((), empty, empty, empty, no, 0)
     linear = project(
         problem._replace(
             scene=own, unknowns=unknowns, runs=(samples,), unbalances=(None,) * len(exciters), linear=None,
@@ -197,16 +200,16 @@ def _linear_motion(problem: Problem, r: int, jam: _Jam) -> tuple[np.ndarray, np.
     at = length * np.arange(number)
     pairs, channels = linear[: 2 * len(exciters)], len(samples.channels)
     ordered = np.concatenate([linear[2 * len(exciters) : -channels], pairs, linear[-channels:]])
-    moved = np.asarray(model_states(unknowns, samples, own, none, jnp.asarray(ordered)))[at]
+    motion = np.asarray(model_states(unknowns, samples, own, empty, jnp.asarray(ordered)))[at]
     angle = np.repeat(exciter.direction * jam.angle[at][:, None] + math.atan2(pairs[-1], pairs[-2]), loads.count, axis=1)
     rate = np.repeat(exciter.direction * jam.speed[at][:, None], loads.count, axis=1)
     filters = np.zeros((number, sum(channel.high_pass > 0.0 for channel in samples.channels)))
     pair = pairs[:2] if rotors else np.array([1.0, 0.0])
-    return np.concatenate([moved, angle, rate, filters], axis=1), pair, linear[-channels:]
+    return np.concatenate([motion, angle, rate, filters], axis=1), pair, linear[-channels:]
 
 
 def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.ndarray]) -> _Trial:
-    """Return the best motion near first values with gaps between the stretches."""
+    """Return the best motion near the first values `x`, `linear` and `starts`, which leave gaps between the stretches."""
     p, size, places = x.size, x.size + linear.size, linear_places(problem)
     whole = np.concatenate(starts)
     scale = np.maximum(np.sqrt(np.mean(whole**2, axis=0)), 1e-9 * np.max(np.abs(whole)))
@@ -215,25 +218,25 @@ def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.
 
     def trial(x: np.ndarray, linear: np.ndarray, starts: tuple[np.ndarray, ...]) -> _Trial:
         total, prior, gradient = np.zeros((size + 2, size + 2)), np.zeros((size + 1, size + 1)), np.zeros(size + 1)
-        moves = []
+        start_changes = []
         for samples, place, own in zip(problem.runs, places, starts, strict=True):
             at = linearized(problem.unknowns, samples, problem.scene, x, linear[place], own)
             where = np.concatenate([np.arange(p), p + place, [size, size + 1]])
             total[np.ix_(where, where)] += products(samples, at, at.columns)
-            total[size:, size:] += np.sum((at.gaps / (_GAP * scale)) ** 2)  # the last unknown is 1 for closed gaps
-            moves.append(at.moves)
+            total[size:, size:] += np.sum((at.gaps / (_GAP_SIZE * scale)) ** 2)  # the last unknown is 1 for closed gaps
+            start_changes.append(at.start_changes)
         prior[:size, :size], gradient[:size] = prior_equations(problem, x, linear)
         cost = float(total[-1, -1]) + known_cost(problem, x, linear)
         equations = total[:-1, :-1], prior, total[:-1, -1] + gradient
-        return _Trial(x, linear, starts, tuple(moves), cost if np.isfinite(cost) else np.inf, equations)
+        return _Trial(x, linear, starts, tuple(start_changes), cost if np.isfinite(cost) else np.inf, equations)
 
-    def moved(at: _Trial, step: np.ndarray) -> _Trial:
+    def stepped(at: _Trial, step: np.ndarray) -> _Trial:
         step = limited_step(problem, step)
         own = (np.concatenate([step[:p], step[p + place], step[size:]]) for place in places)
-        changes = [moves @ each for moves, each in zip(at.moves, own, strict=True)]
+        changes = [change @ each for change, each in zip(at.start_changes, own, strict=True)]
         factor = min(1.0, _MAX_TURN / max(float(np.max(np.abs(each[:, turns]))) for each in changes))
         new = tuple(each + factor * change for each, change in zip(at.starts, changes, strict=True))
         return trial(at.x + factor * step[:p], at.linear + factor * step[p:size], new)
 
     first = trial(x, linear, tuple(starts))
-    return descend(first, lambda at: at.equations, moved, size + 1, positive_places(problem))[0]
+    return descend(first, lambda at: at.equations, stepped, size + 1, positive_places(problem))[0]

@@ -46,7 +46,7 @@ class DragLimits(Result):
     **Attributes** (nd,), in the order of the resonances; NaN for a resonance above the rotor speed or without a jam of its own
 
     - `status`: a `DragStatus`
-    - `factor`: greatest factor by which the drag of the scene can be multiplied; with a larger one no jam exists there
+    - `factor`: greatest factor by which the drag of the scene can be multiplied; with a larger one this resonance has no jam
     - `drag`, N s/m: the drag of the first load times `factor`
     - `omega`, rad/s: load speed of the jam at the greatest drag
     - `resonances`, rad/s
@@ -86,9 +86,9 @@ def drag_limits(scene: Scene, *, phases: bool = False) -> DragLimits:
 
         factor(w) sum b_W R^2 (n - w) = braking torque of the vibration at w
 
-    The greatest drag of a resonance is the maximum of `factor` over the load speed w next to it. There two jams merge in a
-    fold; beyond it the loads pass this resonance. An imbalance of the rotor does not change the limits at this order, see
-    `jam_modes`.
+    The greatest drag of a resonance is the maximum of `factor` over the load speeds w near it. At this maximum two jams merge
+    in a fold; with a larger drag the loads pass this resonance. An imbalance of the rotor does not change the limits at this
+    order, see `jam_modes`.
 
     - For equal loads at one point of the machine no other arrangement needs a larger drag: the torques of all loads have the
       sum (w^4/2) |sum_j S_j exp(i a_j)|^2 Im h, which is largest for equal angles
@@ -117,11 +117,11 @@ def drag_limits(scene: Scene, *, phases: bool = False) -> DragLimits:
         loads_with_drag(scene)
         return outcome(_limits_of_phases(scene), scene)
     require_drag(turning_loads(scene, at_one_point=True))
-    return outcome(_limits_together(scene), scene)
+    return outcome(_limits_of_coincident_loads(scene), scene)
 
 
 @cached
-def _limits_together(scene: Scene) -> DragLimits:
+def _limits_of_coincident_loads(scene: Scene) -> DragLimits:
     model = jammed_model(scene)
     parts = {name: getattr(model, name) for name in DraggedModel.__dataclass_fields__}
     pieces = branch_pieces(DraggedModel(**parts).decomposed())
@@ -178,6 +178,6 @@ def _largest_factor(balance: TorqueBalance, around: Array, phase: Array) -> tupl
         return jnp.where(is_left, low, one), jnp.where(is_left, two, high)
 
     low, high = jax.lax.fori_loop(0, _GOLDEN_STEPS, narrowed, (around[0], around[2]))
-    tried = jnp.stack([0.5 * (low + high), around[1]])
-    values = jax.vmap(factor)(tried)
-    return tried[jnp.argmax(values)], jnp.max(values)
+    candidates = jnp.stack([0.5 * (low + high), around[1]])
+    values = jax.vmap(factor)(candidates)
+    return candidates[jnp.argmax(values)], jnp.max(values)

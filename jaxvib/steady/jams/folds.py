@@ -54,7 +54,7 @@ class DraggedModel(JammedModel):
 
     @property
     def highest_speed(self) -> Array:
-        """Rotor speed, up to a small distance: the factor has no bound there."""
+        """Speed just below the rotor speed, at which the factor has no bound."""
         return self.scene.drive.speed * (1.0 - float(jnp.finfo(self.mass.dtype).eps) ** 0.5)
 
 
@@ -89,10 +89,10 @@ def rotor_speed_at(model: ExcitedModel, omega: Array, speed: Array | None = None
     """Return `jam_rotor_speed` for an assembled scene.
 
     For a model with unbalances instead of loads (`UnbalancedModel`) the value returned is not a speed but the torque of the
-    vibration divided by that of the motors; for a `DraggedModel` it is the factor of the drag. At their folds, too, two motions
-    merge.
+    vibration divided by that of the motors; for a `DraggedModel` it is the factor of the drag. Two motions merge at the folds
+    of these functions too.
     """
-    return _balance(model, omega, speed)[0]
+    return _speed_and_amplitudes(model, omega, speed)[0]
 
 
 def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
@@ -114,13 +114,14 @@ def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
     return bracketed_root(residual, speeds[first - 1], speeds[first])
 
 
-def _balance(model: ExcitedModel, omega: Array, speed: Array | None = None) -> tuple[Array, Array]:
+def _speed_and_amplitudes(model: ExcitedModel, omega: Array, speed: Array | None = None) -> tuple[Array, Array]:
     """Return the value of `rotor_speed_at` and the amplitudes of the carrier."""
     displacement = model.displacement(omega, speed)
-    return _speed_for(model, omega, omega**2 * jnp.sum(jnp.conj(model.force_direction) * displacement)), displacement
+    acceleration = omega**2 * jnp.sum(jnp.conj(model.force_direction) * displacement)
+    return _speed_from_acceleration(model, omega, acceleration), displacement
 
 
-def _speed_for(model: ExcitedModel, omega: Array, acceleration: Array) -> Array:
+def _speed_from_acceleration(model: ExcitedModel, omega: Array, acceleration: Array) -> Array:
     """Return the value of `rotor_speed_at` at `omega`, from w^2 e^H B Y, m/s^2, see `ExcitedModel.forward_acceleration`."""
     # The torque of the drag is opposite to that of the acceleration -w^2 Y.
     torque = mean_torque(model.unbalance, acceleration)
@@ -142,12 +143,12 @@ def _speed_for(model: ExcitedModel, omega: Array, acceleration: Array) -> Array:
 
 def scanned_speed(model: ExcitedModel, omega: Array) -> Array:
     """Return `rotor_speed_at` in modal form, for a search: O(nd) operations, without derivatives with respect to parameters."""
-    return _speed_for(model, omega, model.forward_acceleration(omega))
+    return _speed_from_acceleration(model, omega, model.forward_acceleration(omega))
 
 
 def branch_tangent(model: ExcitedModel, omega: Array) -> tuple[Array, Array, Array]:
     """Return the rotor speed at a load speed, dn/dOmega along the branch, and the amplitudes (nd,) of the carrier."""
-    return jax.jvp(lambda w: _balance(model, w), (omega,), (jnp.ones_like(omega),), has_aux=True)
+    return jax.jvp(lambda w: _speed_and_amplitudes(model, w), (omega,), (jnp.ones_like(omega),), has_aux=True)
 
 
 def branch_slope(model: ExcitedModel, omega: Array) -> Array:
@@ -224,7 +225,7 @@ def branch_pieces(model: ExcitedModel) -> Pieces:
     grid, slopes = _with_close_folds(partial(scanned_slopes, frozen), grid, 2 * nd)
     falling = slopes < 0.0
     change = _first_places(falling[1:] != falling[:-1], 4 * nd, grid.shape[0] - 1)
-    found = change < grid.shape[0] - 1
+    exists = change < grid.shape[0] - 1
     change = jnp.minimum(change, grid.shape[0] - 2)
     ends = (grid[change], grid[change + 1], (slopes[change], slopes[change + 1]))
     omega = jax.vmap(partial(branch_root, model, branch_slope, scanned_slope))(*ends)
@@ -232,19 +233,19 @@ def branch_pieces(model: ExcitedModel) -> Pieces:
     speed = partial(rotor_speed_at, model) if model.modal is None else partial(scanned_speed, frozen)
     speeds = jax.vmap(speed)(jnp.concatenate([omega, end]))
     speeds, speed_end = speeds[:-1], jax.lax.stop_gradient(speeds[-1:])
-    main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
-    omega, speeds, found = omega[main], speeds[main], found[main]
+    main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(exists), 2 * nd)
+    omega, speeds, exists = omega[main], speeds[main], exists[main]
     if model.modal is not None:  # again, with derivatives with respect to parameters
         speeds = jax.vmap(partial(_fold_speed, model))(omega)
-    folds = Folds(omega=jnp.where(found, omega, jnp.nan), rotor_speed=jnp.where(found, speeds, jnp.nan), exists=found)
-    cuts, turns = jax.lax.stop_gradient((jnp.where(found, omega, end), jnp.where(found, speeds, speed_end)))
-    zero, mode = jnp.zeros_like(end), piece_modes(cuts, found, resonances)
+    folds = Folds(omega=jnp.where(exists, omega, jnp.nan), rotor_speed=jnp.where(exists, speeds, jnp.nan), exists=exists)
+    cuts, turns = jax.lax.stop_gradient((jnp.where(exists, omega, end), jnp.where(exists, speeds, speed_end)))
+    zero, mode = jnp.zeros_like(end), piece_modes(cuts, exists, resonances)
     low, high = jnp.concatenate([zero, cuts]), jnp.concatenate([cuts, end])
     return Pieces(low, high, jnp.concatenate([zero, turns]), jnp.concatenate([turns, speed_end]), mode, resonances, folds)
 
 
-def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
-    """Return mode numbers (2 nd + 1,) of the pieces of a branch; its folds are the load speeds `cuts` (2 nd,) with `found`
+def piece_modes(cuts: Array, exists: Array, resonances: Array) -> Array:
+    """Return mode numbers (2 nd + 1,) of the pieces of a branch; its folds are the load speeds `cuts` (2 nd,) with `exists`
     True.
 
     Each peak belongs to the nearest resonance, but no two peaks share a resonance, and every peak has one.
@@ -253,32 +254,32 @@ def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
     peak = np.arange(nd)
     nearest = 1 + jnp.argmin(jnp.abs(resonances[None, :] - cuts[0::2, None]), axis=1)
     # Numbers of resonances rise by at least 1 from peak to peak, and leave at least one for each later peak.
-    owner = peak + jnp.minimum(jax.lax.cummax(nearest - peak), nd + 1 - jnp.sum(found[1::2]))
+    owner = peak + jnp.minimum(jax.lax.cummax(nearest - peak), nd + 1 - jnp.sum(exists[1::2]))
     owner = jnp.minimum(owner, nd)
     last = 2 * nd + 1
-    rising, falling = (jnp.where(found[0::2], mode, last) for mode in (2 * owner - 1, 2 * owner))
+    rising, falling = (jnp.where(exists[0::2], mode, last) for mode in (2 * owner - 1, 2 * owner))
     return jnp.append(jnp.stack([rising, falling], axis=1).ravel(), last)
 
 
-def without_ripples(speeds: Array, count: Array, kept_count: int) -> Array:
-    """Return the indices of the `kept_count` most relevant of 2 `kept_count` folds; `speeds` are their rotor speeds, and the
+def without_ripples(speeds: Array, count: Array, count_left: int) -> Array:
+    """Return the indices of the `count_left` most relevant of 2 `count_left` folds; `speeds` are their rotor speeds, and the
     first `count` of them exist.
 
     A branch has one peak for each resonance. If it has additional ripples, the pairs of folds with the smallest ratio of rotor
     speeds are dropped.
     """
-    index = jnp.arange(2 * kept_count)
+    index = jnp.arange(2 * count_left)
 
-    def fewer(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+    def without_smallest(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         keep, count = carry
-        known = speeds[keep]
-        span = jnp.abs(jnp.log(known[1:] / known[:-1]))
+        values = speeds[keep]
+        span = jnp.abs(jnp.log(values[1:] / values[:-1]))
         least = jnp.argmin(jnp.where(index[1:] < count, span, jnp.inf))
-        skip = (count > kept_count) & (index >= least)
-        keep = keep[jnp.where(skip, jnp.minimum(index + 2, 2 * kept_count - 1), index)]
-        return keep, jnp.where(count > kept_count, count - 2, count)
+        skip = (count > count_left) & (index >= least)
+        keep = keep[jnp.where(skip, jnp.minimum(index + 2, 2 * count_left - 1), index)]
+        return keep, jnp.where(count > count_left, count - 2, count)
 
-    return jax.lax.fori_loop(0, kept_count // 2, fewer, (index, count))[0][:kept_count]
+    return jax.lax.fori_loop(0, count_left // 2, without_smallest, (index, count))[0][:count_left]
 
 
 def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
@@ -308,10 +309,10 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
 
 
 def spread_points(crowded: Array, points: int, top: Array) -> Array:
-    """Return a number of `points` along a grid of load speeds, ascending, up to `top`.
+    """Return a number of `points`, ascending load speeds up to `top`, with the density of the grid `crowded`.
 
-    They have equal distances in the index of the grid `crowded`. Points that would lie above `top` are replaced by evenly
-    spaced ones below it.
+    They are equally spaced in the index of this grid. Points that would lie above `top` are replaced by evenly spaced ones
+    below it.
     """
     inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)
     share = jnp.linspace(0.0, 1.0, points)

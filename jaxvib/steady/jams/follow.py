@@ -21,9 +21,9 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
     """Solve for the jam mode with number `mode` and a load speed near `near` (scalar, rad/s), at the scene's rotor speed n.
 
     Newton's method solves (n(w) - w)^(-1/2) = (n - w)^(-1/2), see `jam_rotor_speed`. Near a resonance w_r the left side is
-    almost proportional to |w - w_r|, therefore a few steps converge from far away. `jam_modes` computes the whole branch and
-    takes a hundred times as long. It determines the number of a mode; this function keeps the number, and does not detect that
-    modes exchange their numbers.
+    almost proportional to |w - w_r|, therefore a few steps converge from far away. `jam_modes` computes the whole branch,
+    which takes a hundred times as long, and determines the number of the mode. This function keeps the number, and does not
+    detect that modes exchange their numbers.
 
     **Returns** `Jam`, with NaN if the iteration has not converged or ended on a piece of the branch with the wrong sign of the
     slope. First derivatives are exact.
@@ -45,10 +45,10 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
         return jax.lax.rsqrt(jnp.maximum(torque, 1e-300)) - jax.lax.rsqrt(target - w)
 
     omega = _newton(gap, near, target)
-    ahead, slope = jax.jvp(lambda w: rotor_speed_at(frozen, w), (omega,), (jnp.ones_like(omega),))
+    reached, slope = jax.jvp(lambda w: rotor_speed_at(frozen, w), (omega,), (jnp.ones_like(omega),))
     # A Newton step from the root has length zero and the derivatives of the root.
     omega = omega - (rotor_speed_at(model, omega) - speed) / slope
-    converged = jnp.abs(ahead - target) < 1e-9 * (target + jnp.abs(slope) * omega)
+    converged = jnp.abs(reached - target) < 1e-9 * (target + jnp.abs(slope) * omega)
     is_valid = converged & (omega > 0.0) & (omega < target) & ((slope > 0.0) == (mode % 2 == 1))
     jam = jam_at(model, jnp.asarray(mode), jnp.where(is_valid, omega, jnp.nan), speed, jnp.asarray(False))
     return eqx.tree_at(lambda j: j.stable, jam, is_valid & jam.stable)
@@ -64,10 +64,10 @@ def follow_fold(model: JammedModel, near: Array) -> tuple[Array, Array]:
     """
     frozen = jax.lax.stop_gradient(model)
 
-    def flat(w: Array) -> Array:
+    def scaled_slope(w: Array) -> Array:
         return branch_slope(frozen, w) / jnp.maximum(rotor_speed_at(frozen, w) - w, 1e-300) ** 2
 
-    omega = _newton(flat, near, jnp.asarray(jnp.inf, near.dtype))
+    omega = _newton(scaled_slope, near, jnp.asarray(jnp.inf, near.dtype))
     slope, curvature = jax.jvp(lambda w: branch_slope(frozen, w), (omega,), (jnp.ones_like(omega),))
     omega = omega - branch_slope(model, omega) / curvature
     converged = jnp.abs(slope) < 1e-7 * jnp.abs(curvature * omega)
@@ -80,8 +80,8 @@ def _newton(f: Callable[[Array], Array], start: Array, most: Array) -> Array:
 
     def step(_: int, w: Array) -> Array:
         value, slope = jax.jvp(f, (w,), (jnp.ones_like(w),))
-        reach = 0.1 * w
-        new = w - jnp.clip(jnp.nan_to_num(value / slope), -reach, reach)
+        limit = 0.1 * w
+        new = w - jnp.clip(jnp.nan_to_num(value / slope), -limit, limit)
         return jnp.where(new < most, new, 0.5 * (w + most))
 
     return jax.lax.stop_gradient(jax.lax.fori_loop(0, _NEWTON_STEPS, step, jax.lax.stop_gradient(start)))

@@ -175,10 +175,10 @@ class JamModes(AbstractJam):
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
             raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {most}")
         if throw:
-            when_known(lambda *_: self._require(int(mode)), self.omega, self.status)
+            when_known(lambda *_: self._require_mode(int(mode)), self.omega, self.status)
         return int(mode) - 1
 
-    def _require(self, mode: int) -> None:
+    def _require_mode(self, mode: int) -> None:
         if status_names(self.status)[mode - 1] == "absent":
             there, rotor = ", ".join(map(str, self.mode_numbers())), speed_text(np.asarray(self.rotor_speed)[0], 6)
             why = f": {_UNRESOLVED} at resonance {(mode + 1) // 2}" if mode in self.unresolved else ""
@@ -199,7 +199,7 @@ class JamModes(AbstractJam):
     def summary(self) -> str:
         """Return the table of `jaxvib modes` in text; amplitudes and foundation force are zero to peak.
 
-        The command also computes if the loads stay together, which needs the scene.
+        The command also computes whether the loads stay together, for which it needs the scene.
         """
         rotor, resonances = (speed_text(speed) for speed in (np.asarray(self.rotor_speed)[0], self.resonances))
         lines = modes_table(self, {})
@@ -221,10 +221,10 @@ class JamModes(AbstractJam):
 def modes_table(jams: JamModes, growth: Mapping[int, float]) -> list[list[str]]:
     """Return the heads and the rows of the table of all jam modes that exist.
 
-    **Arguments**: `growth`: growth rates of disturbances that separate the loads, 1/s, by the mode; a missing one is unknown.
+    **Arguments**: `growth`: growth rates of disturbances that separate the loads, 1/s, by mode number; missing if unknown.
     """
     unit, scale = speed_unit()
-    known = [jams.select(k) for k in jams.mode_numbers()]
+    existing = [jams.select(k) for k in jams.mode_numbers()]
     shown = [shown_unit(each, _largest(jams, k)) for k, each in enumerate(jams.units)]
     heads = [f"{name}, {length}" for name, (length, _) in zip(jams.coordinates, shown, strict=True)]
     rows = [
@@ -235,7 +235,7 @@ def modes_table(jams: JamModes, growth: Mapping[int, float]) -> list[list[str]]:
             *(f"{factor * float(a):.4g}" for a, (_, factor) in zip(np.asarray(jam.amplitude), shown, strict=True)),
             f"{float(jam.foundation_force):.4g}",
         ]
-        for jam in known
+        for jam in existing
     ]
     return [["mode", unit, "stays", *heads, "force, N"], *rows]
 
@@ -272,8 +272,8 @@ def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit | 
     from jaxvib.draw.results import modes_chart  # slow import
 
     mode, omega, stable, amplitude = map(np.asarray, (jams.mode, jams.omega, jams.stable, jams.amplitude))
-    among = None if resonances is None else np.asarray(resonances)
-    return modes_chart(mode, omega, stable, amplitude, among, names=jams.coordinates, units=jams.units, unit=unit, ax=ax)
+    lines = None if resonances is None else np.asarray(resonances)
+    return modes_chart(mode, omega, stable, amplitude, lines, names=jams.coordinates, units=jams.units, unit=unit, ax=ax)
 
 
 @validated

@@ -17,25 +17,25 @@ from jaxvib.ode.scalar_programs import fenced
 from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, scalarized_program, scalars_of
 from jaxvib.runtime.compat import jaxpr_as_fun
 
-Given = TypeVar("Given", bound=PyTree[Array])
+Args = TypeVar("Args", bound=PyTree[Array])
 Auxiliary = TypeVar("Auxiliary", bound=PyTree[Array])
 _State: TypeAlias = tuple[Array, Auxiliary, Array, Array, Array, Array]
 """Best unknowns so far, auxiliary values, residuals, sum of the squared residuals, Jacobian and damping."""
 
 
 def damped_newton(
-    balance: Callable[[Array, Given], tuple[Array, Auxiliary]],
+    balance: Callable[[Array, Args], tuple[Array, Auxiliary]],
     start: Array,
-    given: Given,
+    args: Args,
     iterations: int = 40,
     *,
     on_scalars: bool = True,
 ) -> tuple[Array, Auxiliary]:
-    """Solve `balance(x, given) = 0` from `start` by Newton steps with the damping of Levenberg and Marquardt.
+    """Solve `balance(x, args) = 0` from `start` by Newton steps with the damping of Levenberg and Marquardt.
 
     **Arguments**
 
-    - `balance(x, given)`: returns the residuals, of size 1 or less far from a root, and auxiliary values
+    - `balance(x, args)`: returns the residuals, of size 1 or less far from a root, and auxiliary values
     - `iterations`: maximum number of steps; the iteration ends earlier if only rounding errors are left
     - `on_scalars`: evaluate on scalars, see `scalarize`, which reduces the time to a third for many starts
 
@@ -47,52 +47,53 @@ def damped_newton(
     """
     tiny = float(jnp.finfo(start.dtype).eps) ** 1.5
 
-    def step(state: _State, given: Given) -> _State:
+    def step(state: _State, args: Args) -> _State:
         x, auxiliary, value, size, slopes, damping = state
         normal = slopes.T @ slopes
         damped = normal + damping * one * (normal + jnp.finfo(x.dtype).tiny)
         trial = x - jnp.clip(solve_definite(damped, slopes.T @ value), -0.5, 0.5)
 
-        def along(way: ArrayLike) -> tuple[Array, Array, Auxiliary]:
-            return jax.jvp(lambda y: balance(y, given), (trial,), (way,), has_aux=True)
+        def derivative(direction: ArrayLike) -> tuple[Array, Array, Auxiliary]:
+            return jax.jvp(lambda y: balance(y, args), (trial,), (direction,), has_aux=True)
 
-        new, by, found = jax.vmap(along, out_axes=(None, 1, None))(one)
-        left = jnp.sum(new**2)
-        better = left < size  # and not NaN
+        new_value, new_slopes, new_auxiliary = jax.vmap(derivative, out_axes=(None, 1, None))(one)
+        new_size = jnp.sum(new_value**2)
+        is_better = new_size < size  # and not NaN
         # An infinite damping ends the iteration.
-        more = jnp.where(size < tiny, jnp.inf, jnp.minimum(8.0 * damping, 1e8))
-        then = trial, found, new, left, by, jnp.maximum(0.1 * damping, 1e-14)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, (x, auxiliary, value, size, slopes, more))
+        more_damping = jnp.where(size < tiny, jnp.inf, jnp.minimum(8.0 * damping, 1e8))
+        accepted = trial, new_auxiliary, new_value, new_size, new_slopes, jnp.maximum(0.1 * damping, 1e-14)
+        rejected = x, auxiliary, value, size, slopes, more_damping
+        return jax.tree.map(lambda a, b: jnp.where(is_better, a, b), accepted, rejected)
 
     one = np.eye(start.shape[0], dtype=start.dtype)
-    nothing = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), jax.eval_shape(balance, start, given)[1])
+    no_auxiliary = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), jax.eval_shape(balance, start, args)[1])
     # The first iteration only evaluates the residuals at the start, because the initial residual is infinite.
     inf, tenth = jnp.asarray(jnp.inf, start.dtype), jnp.asarray(0.1, start.dtype)
-    begin = start, nothing, jnp.zeros_like(start), inf, jnp.asarray(one), tenth
+    begin = start, no_auxiliary, jnp.zeros_like(start), inf, jnp.asarray(one), tenth
     leaves, structure = jax.tree.flatten(begin)
     small = on_scalars and sum(leaf.size for leaf in leaves) <= MAX_SCALARS
-    program = scalarized_program(step, begin, given) if small else None
+    program = scalarized_program(step, begin, args) if small else None
     if program is None:
-        return jax.tree.unflatten(structure, _iterate(_on_arrays(step, begin, given), leaves, iterations))[:2]
-    known = scalars_of(given)
-    numbers = iter(_iterate(lambda *now: fenced(program, [*now, *known]), scalars_of(begin), iterations))
+        return jax.tree.unflatten(structure, _iterate(_on_arrays(step, begin, args), leaves, iterations))[:2]
+    constants = scalars_of(args)
+    numbers = iter(_iterate(lambda *now: fenced(program, [*now, *constants]), scalars_of(begin), iterations))
     arrays = [jnp.stack([next(numbers) for _ in range(leaf.size)]).reshape(leaf.shape) for leaf in leaves]
     return jax.tree.unflatten(structure, arrays)[:2]
 
 
-def _on_arrays(step: Callable[[_State, Given], _State], begin: _State, given: Given) -> Callable[..., Sequence[Array]]:
+def _on_arrays(step: Callable[[_State, Args], _State], begin: _State, args: Args) -> Callable[..., Sequence[Array]]:
     """Return the step on the arrays of a state, with the sine and cosine of programs on scalars if JAX allows."""
-    program, structure, known = arrays_program(step, begin, given), jax.tree.structure(begin), jax.tree.leaves(given)
+    program, structure, constants = arrays_program(step, begin, args), jax.tree.structure(begin), jax.tree.leaves(args)
     if program is None:
-        return lambda *now: jax.tree.leaves(step(jax.tree.unflatten(structure, now), given))
-    return lambda *now: jaxpr_as_fun(program)(*now, *known)
+        return lambda *now: jax.tree.leaves(step(jax.tree.unflatten(structure, now), args))
+    return lambda *now: jaxpr_as_fun(program)(*now, *constants)
 
 
 def _iterate(step: Callable[..., Sequence[Array]], begin: Sequence[Array], times: int) -> Sequence[Array]:
     """Return the state after the first evaluation and `times` steps, or fewer steps if the damping, the last entry of the
     state, becomes infinite."""
 
-    def going(now: tuple[Array, list[Array]]) -> Array:
+    def is_unfinished(now: tuple[Array, list[Array]]) -> Array:
         return (now[0] <= times) & (now[1][-1] < jnp.inf)
 
-    return jax.lax.while_loop(going, lambda now: (now[0] + 1, list(step(*now[1]))), (jnp.asarray(0), list(begin)))[1]
+    return jax.lax.while_loop(is_unfinished, lambda now: (now[0] + 1, list(step(*now[1]))), (jnp.asarray(0), list(begin)))[1]

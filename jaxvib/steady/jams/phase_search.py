@@ -134,7 +134,7 @@ def phase_jams(
 
     - At each of many load speeds, closer together near resonances, the search finds phases at which all loads need the same
       multiple of their drag, from `starts` random sets of phases and some regular ones. If this multiple passes 1 between two
-      load speeds, the speed is solved for as well (`phase_jam`)
+      load speeds, a jam lies between them, and Newton's method solves for its speed and phases (`phase_jam`)
     - Jams that differ by a common rotation of all loads, or by an exchange of equal loads, count as one
     - Loads that turn with the rotor and balance it are left out
     - Loads count as points: their `ball_radius` is not used, so that loads at one angle have the unbalance N m R. `jam_modes`

@@ -46,12 +46,12 @@ def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generato
     """Return speeds (n,) and phases (n, count) of solutions of the torque balance, from `number` random sets of phases in
     total.
 
-        T_j = (w^4/2) S Im(e^{-i a_j} F),      F = sum_k S_k A_jk e^{i a_k}, equal for equal loads
+        T_j = (w^4/2) S_j Im(e^{-i a_j} F_j),      F_j = sum_k S_k H_jk e^{i a_k}
 
-    Equal loads need the same torque, therefore Im(e^{-i a_j} F) is the same for all of them, and at most two phases a_j are
-    possible. For this reason no jam is missed by a search over all divisions of the equal loads into two clusters, with one
-    load in place of each cluster. The unknowns are two phases for each group of equal loads, for any number of its loads. The
-    same solution may occur several times.
+    with the influence coefficients H (`influence_of`). F_j is the same for all equal loads. They need the same torque,
+    therefore Im(e^{-i a_j} F_j) is the same too, and at most two phases a_j are possible. For this reason no jam is missed by
+    a search over all divisions of the equal loads into two clusters, with one load in place of each cluster. The unknowns are
+    two phases for each group of equal loads, for any number of its loads. The same solution may occur several times.
     """
     divisions = _divisions(equal_loads(balance))
     each = max(number // len(divisions), min(number, _STARTS_OF_CLUSTERS))
@@ -151,8 +151,8 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
     source = np.tile(np.arange(row.size), 2)
     neighbour = np.clip(np.concatenate([row - 1, row + 1]), 0, speeds.size - 1)
     there, _, found = _follow_phases(balance, at_speeds, neighbour, angles[source])
-    passed = found & (size[source] * there < 0.0)
-    low, high, source = speeds[row[source[passed]]], speeds[neighbour[passed]], source[passed]
+    crossed = found & (size[source] * there < 0.0)
+    low, high, source = speeds[row[source[crossed]]], speeds[neighbour[crossed]], source[crossed]
     at, sign = angles[source], np.sign(size[source])
     for _ in range(_CUT_COUNT if source.size else 0):
         # All intermediate points are computed at once, which for few jams takes no longer than one of them.
@@ -162,9 +162,9 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
         there, turned, found = _follow_phases(balance, each, np.arange(between.size), np.repeat(at, _PARTS_PER_CUT - 1, axis=0))
         same = (found & (there * np.repeat(sign, _PARTS_PER_CUT - 1) > 0.0)).reshape(between.shape)
         cut = np.sum(np.logical_and.accumulate(same, axis=1), axis=1)
-        lane, ends = np.arange(source.size), np.concatenate([low[:, None], between, high[:, None]], axis=1)
+        index, ends = np.arange(source.size), np.concatenate([low[:, None], between, high[:, None]], axis=1)
         turned = np.concatenate([at[:, None], turned.reshape(*between.shape, -1)], axis=1)
-        low, high, at = ends[lane, cut], ends[lane, cut + 1], turned[lane, cut]
+        low, high, at = ends[index, cut], ends[index, cut + 1], turned[index, cut]
     every = np.concatenate([angles[near], at])
     return np.tile(np.concatenate([speeds[row[near]], low]), 2), np.concatenate([every, -every])
 
@@ -189,9 +189,9 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Rows are compared by one hash each, which is much faster than a comparison of all entries; the probability that two of 1e5
     rows share a hash is 3e-10.
     """
-    mixed = rows.astype(int) @ np.random.default_rng(0).integers(2**63, size=rows.shape[1])
-    order = np.argsort(mixed)
-    begins = np.diff(mixed[order], prepend=mixed[order[:1]] - 1) != 0
+    hashes = rows.astype(int) @ np.random.default_rng(0).integers(2**63, size=rows.shape[1])
+    order = np.argsort(hashes)
+    begins = np.diff(hashes[order], prepend=hashes[order[:1]] - 1) != 0
     first = np.minimum.reduceat(order, np.flatnonzero(begins))
     which = np.empty(order.size, dtype=int)
     which[order] = np.argsort(np.argsort(first))[np.cumsum(begins) - 1]
@@ -266,8 +266,8 @@ def load_speeds(balance: TorqueBalance) -> np.ndarray:
     poles = _poles(model, balance.speed) if model.modal is None else np.asarray(model.modal.poles)
     turning = np.abs(np.imag(poles))
     centres = np.unique(turning[turning > 0.0])
-    apart = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 30)])
-    crowd = [w * (1.0 + side * apart) for w in centres for side in (-1.0, 1.0)]
+    offsets = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 30)])
+    crowd = [w * (1.0 + side * offsets) for w in centres for side in (-1.0, 1.0)]
     top = speed * (1.0 - np.geomspace(1e-6, 0.1, 12))
     speeds = np.unique(np.concatenate([np.linspace(0.02, 0.98, LOAD_SPEEDS) * speed, top, *crowd]))
     return speeds[(speeds > 1e-3 * speed) & (speeds < speed)]
@@ -297,7 +297,7 @@ def phases_near(
     **Returns** the multiple, positive in a jam; the phases; and the remaining relative difference between the multiples.
     """
 
-    def differ(x: Array, given: tuple[Array, Array, AtSpeed]) -> tuple[Array, Array]:
+    def differences(x: Array, given: tuple[Array, Array, AtSpeed]) -> tuple[Array, Array]:
         unbalance, most, at = given
         angles = jnp.concatenate([jnp.zeros(1, x.dtype), x])
         torque = torques_at(unbalance, at.influence, at.omega, jax.lax.complex(jnp.cos(angles), jnp.sin(angles)))
@@ -306,5 +306,5 @@ def phases_near(
 
     given = balance.unbalance, balance.drag * (balance.speed - at.omega) * at.most, at
     x = start[1:] - start[0]
-    x, each = damped_newton(differ, x, given, steps) if x.size else (x, differ(x, given)[1])
+    x, each = damped_newton(differences, x, given, steps) if x.size else (x, differences(x, given)[1])
     return each[0] * at.most, jnp.concatenate([jnp.zeros(1, x.dtype), x]), jnp.max(jnp.abs(each - each[0]))

@@ -223,11 +223,11 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     force = balance.model.carrier.foundation_force(z, 1j * w * z)
     residual = jnp.max(jnp.abs(balance.drag * (balance.speed - w) + torque)) / jnp.max(balance.drag * balance.speed)
     tiny = jnp.sqrt(jnp.finfo(w.dtype).eps)
-    slip = (frozen.speed - w) / frozen.speed
-    good = (residual < tiny) & (w > 0.0) & (slip > -tiny)
-    at_rest = good & (slip < tiny)
+    lag = (frozen.speed - w) / frozen.speed
+    good = (residual < tiny) & (w > 0.0) & (lag > -tiny)
+    is_with_rotor = good & (lag < tiny)
     status = PhaseStatus.where(good, PhaseStatus.found, PhaseStatus.not_converged)
-    status = PhaseStatus.where(at_rest, PhaseStatus.with_rotor, status)
+    status = PhaseStatus.where(is_with_rotor, PhaseStatus.with_rotor, status)
     size = jnp.where(balance.unbalance > 0.0, balance.unbalance, 1.0) / jnp.min(jnp.diagonal(balance.model.mass))
     bounded = jnp.all(magnitude(z) * 100.0 * jnp.finfo(w.dtype).eps < jnp.max(size))
     status = PhaseStatus.where(bounded | ~good, status, PhaseStatus.unbounded)
@@ -235,21 +235,21 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     # Eigenvalues take as long as everything else; if there is no jam, the speed is NaN and they are skipped.
     growth = averaged_growth(frozen.averaged, *jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles, z)))
 
-    def kept(value: Array) -> Array:
+    def or_nan(value: Array) -> Array:
         return jnp.where(there, value, jnp.nan)
 
     return PhaseJam(
         status=status,
-        omega=kept(w),
+        omega=or_nan(w),
         rotor_speed=balance.speed,
-        phase=kept(angles),
+        phase=or_nan(angles),
         pattern=phase_pattern(angles),
-        growth=kept(growth),
+        growth=or_nan(growth),
         stable=there & (growth < 0.0),
-        displacement=kept(z),
-        amplitude=kept(magnitude(z)),
-        foundation_force=kept(peak_force(force)),
-        torque=kept(torque),
+        displacement=or_nan(z),
+        amplitude=or_nan(magnitude(z)),
+        foundation_force=or_nan(peak_force(force)),
+        torque=or_nan(torque),
         residual=residual,
     )
 
@@ -260,7 +260,7 @@ def growth_of_free_loads(scene: Scene, omega: Array) -> np.ndarray:
     **Arguments**: `omega` (n,) rad/s of the jams of light coincident loads.
 
     **Returns** the `growth` of `PhaseJam` for each; NaN if there is no such jam nearby, if `omega` is NaN, or if the loads
-    have a finite radius or dry friction, which this function does not include.
+    have a `ball_radius` or dry friction, which this function does not include.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
@@ -269,13 +269,13 @@ def growth_of_free_loads(scene: Scene, omega: Array) -> np.ndarray:
     [-0.4, 19.4, 23.3]
     """
     loads, speeds = turning_loads(scene, JAM_TERMS), np.asarray(omega)
-    known = np.isfinite(speeds)
+    is_finite = np.isfinite(speeds)
     if loads.ball_radius is not None or has_term(scene.all_effects, ContactFriction):
         return np.full(speeds.shape, np.nan)
-    starts = np.where(known, speeds, float(scene.drive.speed))
+    starts = np.where(is_finite, speeds, float(scene.drive.speed))
     found = _growths_of_jams(scene, jnp.asarray(starts))
     near = (
-        known
+        is_finite
         & (np.abs(found.omega - starts) < _SAME_JAM_DISTANCE * starts)
         & np.asarray(found.pattern == PhasePattern.together)
     )

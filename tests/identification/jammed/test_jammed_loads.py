@@ -83,7 +83,7 @@ def test_derivatives_against_differences_and_gaps_close():
     open_starts = closed_motion(problem.unknowns, samples, problem.scene, x, own)[1] + 1e-5 * rng.normal(size=(3, states))
     open_starts[0] = own[:states]
     gaps = linearized(problem.unknowns, samples, problem.scene, x, own, open_starts)
-    closed = open_starts + gaps.moves[:, :, -1]
+    closed = open_starts + gaps.start_changes[:, :, -1]
     assert np.max(np.abs(linearized(problem.unknowns, samples, problem.scene, x, own, closed).gaps)) < 1e-3 * np.max(
         np.abs(gaps.gaps)
     )
@@ -144,4 +144,4 @@ def test_loads_that_are_not_included_are_refused():
         jv.Scene(scene.machine, torus, exciter.drive), "scene.loads is of kind 'torus_ball'; identify needs loads on a circle"
     )
     refused(scene, "without loads can be unknown", unknown=["drive.inertia"])
-    refused(scene.replace(loads=jv.balls(count=1, mass=0.8, radius=RADIUS, drag=1e7)), "decay much faster than the motion")
+    refused(scene.replace(loads=jv.balls(count=1, mass=0.8, radius=RADIUS, drag=1e7)), "settle much faster than the vibration")

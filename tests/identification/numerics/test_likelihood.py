@@ -144,11 +144,11 @@ def test_known_values_count_in_the_rise():
     )
     fitted = SimpleNamespace(problem=problem)
     number = _Profile(fitted, 1, False, 0.0, 0.5, np.zeros(2), 0.0)
-    held, cost = number._held(0.7)
+    held, cost = number._fixed(0.7)
     assert cost == pytest.approx(16.0 * 0.4**2)
     np.testing.assert_allclose(held.means, [0.1, 0.7])
     np.testing.assert_allclose(held.precisions, [25.0, 1.0 / (1e-3 * 0.5) ** 2])
     assert problem.means[1] == 0.3
-    held, cost = _Profile(fitted, 0, True, 0.0, 0.5, np.zeros(2), 0.0)._held(math.log(0.08))
+    held, cost = _Profile(fitted, 0, True, 0.0, 0.5, np.zeros(2), 0.0)._fixed(math.log(0.08))
     assert cost == pytest.approx(9.0)
     np.testing.assert_allclose(held.unbalances[0], [0.08, 1e-3 * 0.5 * 0.08])
