@@ -186,7 +186,7 @@ def foundation_force(*, mode: int | None = None, harmonic: int | None = None, ti
     if mode is None:
         if harmonic is not None:
             raise InputError("harmonic", f"is {quoted(harmonic)} without a mode; give the jam mode")
-        return RegimeQuantity("foundation_force", "N", working_force, tier=tier, text="foundation force")
+        return RegimeQuantity("foundation_force", "N", working_force, tier=tier, text="foundation force of the settled motion")
     if harmonic is None:
         return jam_quantity(
             "foundation_force", "N", jam_force, mode, tier, "foundation force", settings=(None,), pieces_function=_peaks

@@ -9,12 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.display import speed_text
+from jaxvib.errors import InputError
 from jaxvib.machine.drives.drive import INERTIA, Motor, kloss_torque
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number, count
-from jaxvib.units.known import require_if_known
+from jaxvib.units.known import when_known
 
 _POSITIVE = {"low": 0.0, "open_low": True}
+
+_MAX_POLE_PAIRS = 48
+"""Largest number of pole pairs of a motor by its name plate; usual motors have 1 to 6."""
 
 
 class NamePlateMotor(Motor):
@@ -34,7 +39,8 @@ class NamePlateMotor(Motor):
     - `inertia` J of the whole rotor with its unbalance, kg m^2; typical: 0.005 to 0.5
     - `frequency` of the supply, rad/s; typical: "50 Hz" (the default) or "60 Hz"
 
-    **Raises** `InputError` for a wrong unit, a value out of bounds, and data with a breakdown slip of 1 or more.
+    **Raises** `InputError` for a wrong unit, a value out of bounds, and a rated speed that needs more than 48 pole pairs or a
+    breakdown slip of 1 or more.
 
     >>> import jaxvib as jv
     >>> motor = jv.NamePlateMotor("4 kW", "1440 rpm", breakdown_ratio=2.8, inertia="0.02 kg m^2")
@@ -66,12 +72,7 @@ class NamePlateMotor(Motor):
             frequency=frequency,
         ).values()
         self.kind = "name_plate_motor"
-        problem = "is {:g} rad/s; it must be below the supply's frequency, {:g} rad/s"
-        speeds = self.rated_speed, self.frequency
-        require_if_known(lambda rated, f: rated < f * (1.0 - 1e-6), *speeds, field="drive.rated_speed", problem=problem)
-        needed = "it must be less than 1; check the rated speed and the supply's frequency"
-        problem = "and the rated slip give a breakdown slip of {:.3g}; " + needed
-        require_if_known(lambda slip: slip < 1.0, self.breakdown_slip, field="drive.breakdown_ratio", problem=problem)
+        when_known(_require_plate, self.rated_speed, self.frequency, self.breakdown_ratio, self.speed, self.breakdown_slip)
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -94,6 +95,22 @@ class NamePlateMotor(Motor):
     def torque(self, speed: Array) -> Array:
         """Return the torque of Kloss's formula."""
         return kloss_torque(1.0 - speed / self.speed, self.breakdown_torque, self.breakdown_slip)
+
+
+def _require_plate(rated: float, frequency: float, ratio: float, synchronous: float, breakdown_slip: float) -> None:
+    """**Raises** `InputError` for a rated speed that no motor with this breakdown ratio has at this frequency of the supply."""
+    speed = f"is {speed_text(rated)}"
+    if not rated < frequency * (1.0 - 1e-6):
+        problem = f"{speed}; it must be below {speed_text(frequency)}, the synchronous speed of one pole pair"
+        raise InputError("drive.rated_speed", f"{problem}; a plain number is in rad/s, write for example '1440 rpm'")
+    if frequency / synchronous > _MAX_POLE_PAIRS + 0.5:
+        problem = f"{speed}, which needs {frequency / synchronous:.0f} pole pairs; motors have 1 to {_MAX_POLE_PAIRS}"
+        raise InputError("drive.rated_speed", f"{problem}; give the speed of the name plate, and the supply's frequency")
+    if not breakdown_slip < 1.0:
+        slip = f"{100.0 * (1.0 - rated / synchronous):.3g} % below the synchronous speed of {speed_text(synchronous)}"
+        problem = f"{speed}, {slip}; with the breakdown_ratio {ratio:.4g} the breakdown slip is {breakdown_slip:.3g}"
+        remedy = "give the speed at rated load, some percent below a synchronous speed, and the supply's frequency"
+        raise InputError("drive.rated_speed", f"{problem}, and must be less than 1; {remedy}")
 
 
 class DCMotorElectrical(Motor):

@@ -169,11 +169,20 @@ REFUSED = {
     "profile that ends": (lambda: jv.SpeedProfile([0.0, 1.0], [5.0, 0.0]).settled(), "drive.speeds end at 0, so there is no"),
     "rated at 3000 rpm": (
         lambda: jv.NamePlateMotor(4e3, "3000 rpm", 2.8, 0.02),
-        "drive.rated_speed is 314.159 rad/s; it must be below the supply's frequency, 314.159 rad/s",
+        "drive.rated_speed is 3000 rpm; it must be below 3000 rpm, the synchronous speed of one pole pair",
     ),
     "breakdown slip": (
         lambda: jv.NamePlateMotor(4e3, "1200 rpm", 3.0, 0.02),
-        "drive.breakdown_ratio and the rated slip give a breakdown slip of 1.17; it must be less than 1",
+        "drive.rated_speed is 1200 rpm, 20 % below the synchronous speed of 1500 rpm; with the breakdown_ratio 3 the breakdown "
+        "slip is 1.17, and must be less than 1; give the speed at rated load",
+    ),
+    "plain rated speed": (
+        lambda: jv.NamePlateMotor(4e3, 1440, 3.0, 0.02),
+        "drive.rated_speed is 13751 rpm; it must be below 3000",
+    ),
+    "pole pairs": (
+        lambda: jv.NamePlateMotor(4e3, "10 rpm", 3.0, 0.02),
+        "drive.rated_speed is 10 rpm, which needs 299 pole pairs",
     ),
     "converter of a converter": (
         lambda: jv.Converter(jv.Converter(MOTOR, jv.ConstantSpeed(5.0)), jv.ConstantSpeed(5.0)),

@@ -191,7 +191,7 @@ def test_speed_control_equals_scipy():
     ("build", "field"),
     [
         (lambda: jv.NamePlateMotor("4 kW", "3200 rpm", 2.8, 0.02), "drive.rated_speed"),
-        (lambda: jv.NamePlateMotor("4 kW", "1000 rpm", 2.8, 0.02), "drive.breakdown_ratio"),
+        (lambda: jv.NamePlateMotor("4 kW", "1000 rpm", 2.8, 0.02), "drive.rated_speed"),
         (lambda: jv.NamePlateMotor("4 kW", "1440 rpm", 0.9, 0.02), "drive.breakdown_ratio"),
         (lambda: jv.DCMotorElectrical("24 A", 0.6, 0.08, 0.002), "drive.voltage"),
         (lambda: jv.InductionMotorCircuit(**(KRAUSE | {"pole_pairs": 1.5})), "drive.pole_pairs"),
