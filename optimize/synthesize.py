@@ -427,11 +427,24 @@ def _table(
     return tuple(table + [Row(name, q.unit, float(b), float(a), e, t) for (name, q), b, a, e, t in entries])
 
 
+class _SettledEvaluation(Evaluation):
+    """Results of a scene in which each run of a jam mode has settled in this mode."""
+
+    def jam_run(self, mode: int) -> Run:
+        """Return the settled run of a jam mode. **Raises** `ComputationError` for an unstable mode."""
+        if ("jam", mode) not in self._runs:
+            run, reason = _jam_run(self.scene, mode)
+            if run is None:
+                raise ComputationError("unstable", reason)
+            self.keep_run(mode, run)
+        return super().jam_run(mode)
+
+
 def _other_tiers(
     scene: Scene, quantities: Sequence[Quantity], verify: bool, run: Run | None, motion: _Motion
 ) -> tuple[list[float], list[float]]:
-    """Return the values of the quantities by the exact motion, and by the run of the verification; NaN for a quantity that the
-    tier cannot compute."""
+    """Return the values of the quantities by the exact motion and by runs that have settled, such as `run` in `motion`; NaN for
+    a quantity that the tier cannot compute, and for the run of a mode that is unstable."""
 
     def value(quantity: Quantity, evaluation: Evaluation, tier: Tier) -> float:
         at_tier = quantity.at_tier(tier)
@@ -448,7 +461,7 @@ def _other_tiers(
     exact = [value(q, evaluation, "exact") if verify else math.nan for q in quantities]
     if run is None or motion is None:
         return exact, [math.nan] * len(exact)
-    measured = Evaluation(scene)
+    measured = _SettledEvaluation(scene)
     measured.keep_run(motion, run)
     return exact, [value(q, measured, "time") for q in quantities]
 

@@ -136,6 +136,14 @@ def test_unstable_modes_are_not_verified():
     assert absent is None and "does not exist" in why
 
 
+def test_other_modes_of_demands_are_verified_by_settled_runs():
+    fast = scene("two_mass", speed=120.0)
+    run, _ = _run(fast, 3, True)
+    exact, verified = _other_tiers(fast, [amplitude(mode=m) for m in (1, 3, 4)], True, run, 3)
+    np.testing.assert_allclose(verified[:2], exact[:2], rtol=1e-3)
+    assert math.isfinite(exact[2]) and math.isnan(verified[2])
+
+
 def test_weakly_damped_machines_are_verified_to_the_exact_motion():
     """Their free vibrations last for a hundred thousand periods; the integration begins beside the exact motion."""
     s = published(damping=1e-5, count=3).scene()
