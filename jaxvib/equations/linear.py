@@ -192,7 +192,9 @@ class ExcitedModel(LinearModel):
         return jax.lax.custom_linear_solve(product, self.force(omega), solve, symmetric=True)
 
     def forward_acceleration(self, omega: Array) -> Array:
-        """Return w^2 f^H Y (scalar, m/s^2) at the speed `omega`: minus the forward circular acceleration of the masses' point.
+        """Return w^2 f^H Y (complex scalar, m/s^2) at the speed `omega` of the masses.
+
+        It is minus the product of f^H and the complex amplitudes -w^2 Y of the accelerations.
 
         If the model has a modal form, the cost is O(nd), and there are no derivatives with respect to parameters of the scene.
         """
@@ -324,7 +326,7 @@ def circular_loads(scene: Scene) -> CircularLoads:
 
 
 def jammed_loads(scene: Scene) -> CircularLoads:
-    """Return the loads of a scene, for an analysis of jams, in which loads slip on the rotor with or without dry friction.
+    """Return the loads of a scene, for an analysis of jams, which may include dry friction of the loads.
 
     Otherwise the requirements are those of `circular_loads`.
     """

@@ -1,4 +1,4 @@
-"""Drag of a load from the oil, the rolling friction or the bearing that brakes it against the rotor."""
+"""Drag of a load from its cause: oil, rolling friction, or the friction of a bearing."""
 
 from __future__ import annotations
 
@@ -108,20 +108,20 @@ def drag_of(
     arm, (slow, fast) = read(radius, "m", "radius"), (read(speed, "rad/s", name) for name, speed in speeds.items())
     problem = "is {:.6g} rad/s; it must be less than the rotor_speed of {:.6g} rad/s"
     require_if_known(lambda slow, fast: slow < fast, slow, fast, field="load_speed", problem=problem)
-    slip, press = arm * (fast - slow), arm * slow**2
+    sliding_speed, acceleration = arm * (fast - slow), arm * slow**2
     if cause == "oil":
-        return _oil_drag(slip, value["ball_radius"], value["viscosity"], value["density"])
+        return _oil_drag(sliding_speed, value["ball_radius"], value["viscosity"], value["density"])
     if cause == "rolling":
         lever, problem = value["rolling_lever"], "is {:g} m; it must be at most a tenth of the ball_radius of {:g} m"
         require_if_known(lambda k, r: k <= 0.1 * r, lever, value["ball_radius"], field="rolling_lever", problem=problem)
-        return value["mass"] * press * lever / (value["ball_radius"] * slip)
+        return value["mass"] * acceleration * lever / (value["ball_radius"] * sliding_speed)
     problem = "is {:g} m; it must be at most the radius of {:g} m"
     require_if_known(lambda d, r: d <= r, value["diameter"], arm, field="diameter", problem=problem)
-    return 0.5 * value["friction"] * value["mass"] * press * value["diameter"] / (arm * slip)
+    return 0.5 * value["friction"] * value["mass"] * acceleration * value["diameter"] / (arm * sliding_speed)
 
 
-def _oil_drag(slip: Array, r: Array, viscosity: Array, density: Array) -> Array:
-    reynolds = 2.0 * density * r * slip / viscosity
+def _oil_drag(speed: Array, r: Array, viscosity: Array, density: Array) -> Array:
+    reynolds = 2.0 * density * r * speed / viscosity
     limit = f"the formula holds up to {_MAX_REYNOLDS:g}; give a thicker oil or speeds that are closer together"
     problem = "gives a Reynolds number of {:.3g}; " + limit
     require_if_known(lambda number: number <= _MAX_REYNOLDS, reynolds, field="viscosity", problem=problem)

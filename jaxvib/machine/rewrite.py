@@ -123,7 +123,7 @@ def _rewritten_line(line: str, entry: re.Match[str], read: Any, old: Any, new: A
 
 
 def _with_unit(read: Any, old: Any, new: Any) -> str:
-    """Return a value in SI as TOML, in the unit of the value that a file has: a list, a table, a text or a number."""
+    """Return the value `new`, SI, as TOML in the form and unit of the value `read` in a file, which is `old` in SI."""
     if isinstance(new, list):
         size = len(new)
         reads, olds = (each if isinstance(each, list) and len(each) == size else [each] * size for each in (read, old))

@@ -106,8 +106,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
       even if this motion is unstable. If such a motion settles, its stability is tested by the linearized equations; if
       slightly separated loads would leave it, the status is `would_separate`, and the run is not `settled`. Loads with a
       `ball_radius` that end inside each other have the status `overlapping`, which the effect `LoadContact` prevents
-    - `engine` of the integration: "scalar" if the equations are computed on scalars, which takes 2.5 to 50 times less time, or
-      "array", for states of more than 32 entries and for 4 loads and more
+    - `engine` of the integration: "scalar" if the equations are computed on scalars, which is faster for small states, or
+      "array", for states of more than 32 entries and for 4 loads or more
     - `evaluations` of the vector field (0 if the method does not count them), and `seconds` of the computation. Both include
       the run with larger steps for the error; `seconds` includes compilation if the program was new, and is NaN under a JAX
       transformation

@@ -41,8 +41,10 @@ collocation."""
 
 
 def _forms() -> np.ndarray:
-    """Return the coefficients (power of h, 2, stages, stages + 2) of the k_j of the stages, of x and of x' at the start in the
-    equations of x_i and x'_i."""
+    """Return the coefficients of the formulas of x_i and x'_i in `transition`, (3 powers of h, 2, stages, stages + 2).
+
+    The last axis contains the coefficients of all k_j, of x and of x'.
+    """
     forms, ones, stages = np.zeros((3, 2, _STAGES, _STAGES + 2)), np.ones(_STAGES), slice(0, _STAGES)
     forms[2, 0, :, stages], forms[0, 0, :, -2], forms[1, 0, :, -1] = _WEIGHTS @ _WEIGHTS, ones, NODES
     forms[1, 1, :, stages], forms[0, 1, :, -1] = _WEIGHTS, ones

@@ -160,7 +160,7 @@ class Wheel:
         return [self.scale * np.broadcast_to(x, (self.loads.count,)) for x in positions]
 
     def parts(self, centre: tuple[float, float], pose: RotorPose) -> list[Part]:
-        """Return the rim, the circle of the loads, two spokes and the unbalance, or a mark, of the rotor, and the loads."""
+        """Return the parts of the rotor (rim, circle of the loads, two spokes, and its unbalance or a mark), and the loads."""
         parts = [
             Part(circle(centre, self.rim), {"fc": "#f4f4f4", "ec": "black", "lw": 1.4, "zorder": 3}, True),
             Part(circle(centre, self.radius), {"color": GUIDE, "lw": 0.7, "ls": ":", "zorder": 3.1}),

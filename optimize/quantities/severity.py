@@ -149,8 +149,8 @@ def support_load(*, mode: int, of: int) -> Quantity:
     """Return the greatest force on a support in a jam mode, N: the weight on it plus the amplitude of the force of the
     vibration.
 
-    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `of`: the support, on platforms that of the platform with
-    this number; typical: 1 to 3.
+    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `of`: number of the support (of a machine with platforms:
+    number of the platform above it); typical: 1 to 3.
 
     **Returns** `Quantity`, NaN if the mode does not exist; typical: 200 N to 50 kN. A machine without this support raises
     `InputError` when the quantity is computed.

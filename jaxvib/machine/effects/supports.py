@@ -84,9 +84,9 @@ class CubicSupport(_Support):
         """
         carrier = machine.carrier()
         length = jnp.asarray([unit == "m" for unit in carrier.units])
-        moved = jnp.where(jnp.any(carrier.foundation_stiffness != 0.0, axis=0) & length, jnp.abs(amplitude), 0.0)
-        which = int(jnp.argmax(moved))
-        a = moved[which]
+        motion = jnp.where(jnp.any(carrier.foundation_stiffness != 0.0, axis=0) & length, jnp.abs(amplitude), 0.0)
+        which = int(jnp.argmax(motion))
+        a = motion[which]
         if not float(a) > 0.0:
             return None
         platform = which + 1 if machine.places == "platform" else None
@@ -115,7 +115,7 @@ class Stop(_Support):
     - `gap`, m, at least 0; typical: 0.001 to 0.02
     - `damping` c, N s/m, at least 0 (the default); typical: 0 to 5000
     - `side`: "above", "below" or "both" (the default); platforms only
-    - `platform` or `position` as `CubicSupport`; typical: platform 1
+    - `platform` or `position`: as for `CubicSupport`; typical: platform 1
 
     **Raises** `InputError` for values that are not allowed. A scene raises it for a place that the machine does not have.
 

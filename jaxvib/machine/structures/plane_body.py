@@ -58,8 +58,8 @@ def support(
 
     **Arguments** (SI, or strings with a unit)
 
-    - `at` (2,): the point of the body, (x, y) m from the centre of mass of the parts in the body's `mass`, with unbalances on
-      the axes of the exciters; typical: 0.2 to 3 m
+    - `at` (2,): the point of the body, (x, y) m from the centre of mass of all parts that the body's `mass` includes
+      (unbalances count as masses on the axes of their exciters); typical: 0.2 to 3 m
     - `stiffness` (k1, k2), N/m; typical: 1e4 to 1e6
     - `damping` (c1, c2), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(k m). Also a percentage of it, with the
       mass m that this support carries, "5 % of 250 kg", or a loss factor of rubber at a frequency of vibration, "loss factor

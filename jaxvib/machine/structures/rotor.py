@@ -97,7 +97,8 @@ class Rotor(Machine):
         return dataclasses.replace(carrier, **changed) if changed else carrier
 
     def mount(self, at: Place = None) -> Mount:
-        """Return the station of the exciter, or the centre of mass with a lever for each load, and the tilt of the axis."""
+        """Return the motion of the exciter's station; if the loads have stations of their own, the motion of the centre of mass
+        and the tilt of the axis, with the station of each load as its lever."""
         skew = np.zeros((4, 4))
         skew[2, 3], skew[3, 2] = 1.0, -1.0
         station = self.stations if at is None else jnp.asarray(at)
@@ -138,15 +139,15 @@ class Rotor(Machine):
         if self.stiffness_terms is not None or self.damping_terms is not None:
             return super().support_rows()
         translation, tilt = self._directions()
-        moved = translation[None] + self.position[:, None, None] * tilt[None]
+        rows_at_supports = translation[None] + self.position[:, None, None] * tilt[None]
 
         def rows(across: Array, up: Array | None) -> Array:
-            return jnp.stack([across, across if up is None else up], axis=1)[..., None] * moved
+            return jnp.stack([across, across if up is None else up], axis=1)[..., None] * rows_at_supports
 
         return rows(self.stiffness, self.stiffness_up), rows(self.damping, self.damping_up)
 
     def upward(self) -> np.ndarray:
-        """Return a translation of the axis, which is horizontal."""
+        """Return the coordinates of a translation of the rotor upward by 1 m; its axis is horizontal."""
         return np.array([0.0, 1.0, 0.0, 0.0])
 
     @property
@@ -322,7 +323,7 @@ class PlanarRotor(Machine):
         return self.stiffness_up is not None or self.damping_up is not None
 
     def upward(self) -> np.ndarray:
-        """Return a translation of the axis, which is horizontal."""
+        """Return the coordinates of a translation of the rotor upward by 1 m; its axis is horizontal."""
         return np.array([0.0, 1.0])
 
     def mount(self, at: Place = None) -> Mount:

@@ -231,10 +231,10 @@ def _turned_motors(scene: Scene) -> list[int]:
 
 def _peaks(run: Envelope) -> tuple[np.ndarray, float]:
     """Return the largest amplitudes and the largest force of a run."""
-    kept = run.trajectory
-    assert kept is not None
-    force = np.sqrt(np.sum(np.asarray(kept.foundation_force) ** 2, axis=1))
-    return np.max(np.asarray(kept.amplitude), axis=0), float(np.max(force))
+    trajectory = run.trajectory
+    assert trajectory is not None
+    force = np.sqrt(np.sum(np.asarray(trajectory.foundation_force) ** 2, axis=1))
+    return np.max(np.asarray(trajectory.amplitude), axis=0), float(np.max(force))
 
 
 def _judgement(scene: Scene, run: Envelope, resonances: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:

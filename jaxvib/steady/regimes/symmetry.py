@@ -36,20 +36,20 @@ def exchanges_of(influence: np.ndarray, numbers: np.ndarray) -> list[Exchange]:
     tolerance = np.sqrt(tolerance)
     orders = _orders(np.abs(influence) / np.where(size > 0.0, size, 1.0), same, tolerance)
     turned = influence[:, orders[:, :, None], orders[:, None, :]].transpose(1, 0, 2, 3)
-    found = []
-    for order, there in zip(orders, turned, strict=True):
-        shift = _shifts(influence, there, tolerance * size)
-        wanted = np.exp(1j * (shift[:, None] - shift[None, :])) * influence
-        if np.all(np.abs(there - wanted) <= 4.0 * tolerance * size):
-            found.append(Exchange(order, shift))
-    return found
+    exchanges = []
+    for order, exchanged in zip(orders, turned, strict=True):
+        shift = _shifts(influence, exchanged, tolerance * size)
+        expected = np.exp(1j * (shift[:, None] - shift[None, :])) * influence
+        if np.all(np.abs(exchanged - expected) <= 4.0 * tolerance * size):
+            exchanges.append(Exchange(order, shift))
+    return exchanges
 
 
 def _orders(size: np.ndarray, same: np.ndarray, tolerance: float) -> np.ndarray:
     """Return the orders (n, count) of the masses that leave `size` |H| (speeds, count, count) unchanged, first the identity.
 
-    `same` (count, count): True for masses with equal numbers. The orders grow by one mass at a time. At most `_MAX_EXCHANGES`
-    are kept.
+    `same` (count, count): True for masses with equal numbers. The orders are built up mass by mass; at most `_MAX_EXCHANGES` of
+    them are continued.
     """
     orders = np.zeros((1, 0), int)
     for i in range(len(same)):
@@ -63,7 +63,7 @@ def _orders(size: np.ndarray, same: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 def _shifts(influence: np.ndarray, turned: np.ndarray, small: np.ndarray) -> np.ndarray:
-    """Return the shift of each phase from masses that are coupled, one after the other."""
+    """Return the shifts of the phases (count,), rad: each shift follows from that of a coupled mass whose shift is known."""
     count = influence.shape[1]
     coupled, place = np.abs(influence) > small, np.argmax(np.abs(influence), axis=0)
     shift, known = np.zeros(count), np.zeros(count, dtype=bool)
@@ -89,17 +89,17 @@ def distinct_regimes(
     turn = np.exp(1j * phases)
     orders, shifts = (np.array(parts) for parts in zip(*exchanges, strict=True))
     places = np.argsort(orders)
-    kept: list[int] = []
+    distinct: list[int] = []
     for k in np.argsort(-speed, kind="stable"):
         # All exchanged forms of this regime, (exchanges, count).
         forms = np.take_along_axis(turn[k] * np.exp(1j * shifts), places, axis=1)
-        near = [i for i in kept if abs(speed[i] - speed[k]) <= tolerance[0] * speed[i]]
+        near = [i for i in distinct if abs(speed[i] - speed[k]) <= tolerance[0] * speed[i]]
         if not near:
-            kept.append(int(k))
+            distinct.append(int(k))
             continue
         others = turn[near]
         common = np.sum(others[:, None] * forms.conj()[None], axis=-1, keepdims=True)
         common = common / np.where(np.abs(common) > 0.0, np.abs(common), 1.0)
         if not np.any(np.max(np.abs(others[:, None] - common * forms[None]), axis=-1) < tolerance[1]):
-            kept.append(int(k))
-    return np.asarray(kept, dtype=int)
+            distinct.append(int(k))
+    return np.asarray(distinct, dtype=int)

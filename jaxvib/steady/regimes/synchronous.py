@@ -237,8 +237,11 @@ class SynchronousRegimes(AbstractSynchronousRegime):
 
 
 def _circle_options(scene: Scene) -> _CircleOptions:
-    """Return options of `phase_circles`: the number of the first mass, 1 if there are loads and otherwise that of exciter 0,
-    and whether the masses, which must turn in one direction, have a resultant."""
+    """Return options of `phase_circles`.
+
+    The masses are numbered from 1 if there are loads, otherwise from 0 like the exciters. They have a resultant if all of them
+    turn in one direction.
+    """
     first = int(any(exciter.loads is not None for exciter in scene.exciters))
     return {"first": first, "resultant": len({exciter.direction for exciter in scene.exciters}) == 1}
 
@@ -271,8 +274,8 @@ def synchronous_regimes(
     - Regimes that differ by the same shift of all phases or by an exchange of equal exciters, such as mirror images, are listed
       once; of a family of regimes one member is listed, with the status `degenerate`
     - Stability is the growth of small disturbances of amplitudes, speeds and phases together, see `averaged_field`
-    - The relative error of the torques is of the order S^2/(2 M I) with the inertia I of a rotor; phases are off by tenths of a
-      radian close to where two regimes exchange stability
+    - The relative error of the torques is of the order S^2/(2 M I) with the inertia I of a rotor; close to the parameters at
+      which two regimes exchange their stability, the error of the phases is some tenths of a radian
     - In this approximation exciters with different speeds do not act on each other. `masses` selects a group that turns at one
       speed; `regime_partitions` returns the motions of all divisions into such groups
     - With more than 6 masses the number of regimes, most of them unstable, is too large for a complete list. The starts then
@@ -375,7 +378,7 @@ def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: A
     """Return the fields of a regime, without the scene, with derivatives with respect to the scene.
 
     **Arguments**: unknowns `x` that solve the balance, and the `slopes` there, both without derivatives (None if there are no
-    unknowns); the `growth` of disturbances if it is known.
+    unknowns); the `growth` of disturbances if it has been computed.
     """
     frozen = jax.lax.stop_gradient(balance)
     neutral = jnp.asarray(0) if slopes is None else slopes.neutral
@@ -400,13 +403,13 @@ def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: A
     status = RegimeStatus.where(good, status, RegimeStatus.not_converged)
     status = RegimeStatus.where(bounded | ~jnp.isfinite(w), status, RegimeStatus.unbounded)
 
-    known, at = jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles))
-    growth = regime_growth(frozen, known, at, neutral) if growth is None else jnp.where(there, growth, jnp.nan)
+    speed, at = jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles))
+    growth = regime_growth(frozen, speed, at, neutral) if growth is None else jnp.where(there, growth, jnp.nan)
     numbers = {
         "speed": w,
         "phases": angles,
         "growth": growth,
-        "quasi_static": quasi_static_growth(frozen, known, at, neutral),
+        "quasi_static": quasi_static_growth(frozen, speed, at, neutral),
         "margin": margin_of(balance, x),
         "torque": driving,
         "vibrational_torque": vibration,
@@ -416,9 +419,9 @@ def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: A
         "foundation_force": force,
         "residual": residual,
     }
-    kept = {name: jnp.where(there, value, jnp.nan) for name, value in numbers.items()}
+    with_nan = {name: jnp.where(there, value, jnp.nan) for name, value in numbers.items()}
     stable = there & decays(growth, w)
-    return {"status": status, "stable": stable, "can_start": can_start(balance.model.scene), **kept}
+    return {"status": status, "stable": stable, "can_start": can_start(balance.model.scene), **with_nan}
 
 
 def _power(balance: TorqueBalance, omega: Array, driving: Array) -> Array:

@@ -15,7 +15,7 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 
-SLOW_PERIODS, MOST_PERIODS = 20.0, 2000.0
+WINDOW_PERIODS, MAX_RUN_PERIODS = 20.0, 2000.0
 """Measuring window at the end of a run, and longest run, in slow periods (see `slow_period`)."""
 
 
@@ -32,8 +32,8 @@ class ExactJam(NamedTuple):
         It is the time in which deviations of the start decay to the tolerance, plus the measuring window of 20 slow periods.
         """
         rate = -np.log(float(self.fine.multiplier)) * float(self.fine.omega) / (2.0 * np.pi)
-        window = slow_period(scene) * SLOW_PERIODS
-        return min(window + np.log(1.0 / tolerance) / rate, slow_period(scene) * MOST_PERIODS)
+        window = slow_period(scene) * WINDOW_PERIODS
+        return min(window + np.log(1.0 / tolerance) / rate, slow_period(scene) * MAX_RUN_PERIODS)
 
 
 def exact_jam(scene: Scene, mode: int | None) -> ExactJam:

@@ -31,7 +31,7 @@ from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.study.accuracy.cost import Cost, CostRow, relative, row_of
 from jaxvib.study.accuracy.exact_reference import (
-    SLOW_PERIODS,
+    WINDOW_PERIODS,
     ExactJam,
     collocation_points,
     exact_jam,
@@ -210,7 +210,7 @@ def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) 
 
 def _at_the_end(request: _Request, quantity: str, end: float | None, reason: str) -> Cost:
     """Return the cost of a quantity of a scene without an exact jam, measured at the end of a run from rest."""
-    end = SLOW_PERIODS * slow_period(request.scene) if end is None else end
+    end = WINDOW_PERIODS * slow_period(request.scene) if end is None else end
 
     def read(found: Result) -> Array:
         return getattr(found, quantity)
@@ -297,7 +297,7 @@ def _compiled(function: Callable[[Scene], Array], scene: Scene) -> Callable[[], 
 
 
 def _final_state(request: _Request, end: float | None) -> Cost:
-    end = SLOW_PERIODS * slow_period(request.scene) if end is None else end
+    end = WINDOW_PERIODS * slow_period(request.scene) if end is None else end
     reference_run = functools.cache(lambda: simulate(request.scene, end, save="window", stepsize_controller=Tolerance(1e-13)))
 
     @functools.cache

@@ -25,7 +25,7 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.describe import OrbitStatus
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.search import branch_at
-from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
+from jaxvib.study.accuracy.exact_reference import WINDOW_PERIODS, slow_period
 
 _MIN_UNCERTAINTY = 1e-9
 
@@ -170,7 +170,7 @@ class RunComparison(NamedTuple):
             start = with_spin(scene, start)  # raises an error for a wrong spin, which `state` would replace
         if until is None:
             jumps = [float(t) for t in scene.drive.jump_ts()]
-            until = 2.0 * max(jumps, default=0.0) + 5.0 * SLOW_PERIODS * slow_period(scene)
+            until = 2.0 * max(jumps, default=0.0) + 5.0 * WINDOW_PERIODS * slow_period(scene)
         return cls(until, start)
 
 

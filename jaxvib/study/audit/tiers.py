@@ -20,7 +20,7 @@ from jaxvib.results.status import status_name
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.study.accuracy.cost import timed
-from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
+from jaxvib.study.accuracy.exact_reference import WINDOW_PERIODS, slow_period
 from jaxvib.study.audit.comparisons import JamComparison, MotionValues, RunComparison
 
 
@@ -105,7 +105,7 @@ def _call(
     if isinstance(comparison, JamComparison):
         if not without_integration and "unstable" in reference.kind:
             return "the jam is unstable, and a run leaves it"
-        until = 10.0 * SLOW_PERIODS * slow_period(scene)
+        until = 10.0 * WINDOW_PERIODS * slow_period(scene)
         if tier.name == "full":
             return lambda: comparison.full(scene)
         return lambda: tier.jam(scene, comparison.mode, until)

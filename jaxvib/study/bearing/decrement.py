@@ -111,10 +111,8 @@ def turning_points(record: Record) -> TurningPoints:
     Source: this package.
     """
     t, f = record.time, record.angle
-    fourth_differences = np.diff(f, 4)
-    noise = (
-        float(np.median(np.abs(fourth_differences))) / 0.6745 / np.sqrt(70.0)
-    )  # fourth differences of a smooth signal are negligible
+    # Fourth differences of a smooth signal are negligible; those of white noise are sqrt(70) times as large as the noise.
+    noise = float(np.median(np.abs(np.diff(f, 4)))) / 0.6745 / np.sqrt(70.0)
     peaks = _longest_regular_sequence(t, _alternating_extrema(f, max(8.0 * noise, 1e-3 * float(np.ptp(f)))))
     if len(peaks) < 3:
         raise InputError(record.name, f"has {len(peaks)} turning points; at least 3 are needed, record more of the swing")
@@ -163,8 +161,8 @@ def turning_points(record: Record) -> TurningPoints:
 
 def _arcs(x: np.ndarray, square: float) -> np.ndarray:
     """Return 1, (1 - cos(v x))/v^2 and sin(v x)/v, (n, 3), for v^2 = `square`, positive or negative."""
-    turned = np.sqrt(complex(square)) * x / np.pi
-    return np.stack([np.ones_like(x), 0.5 * x**2 * (np.sinc(0.5 * turned) ** 2).real, x * np.sinc(turned).real], axis=1)
+    phase = np.sqrt(complex(square)) * x / np.pi
+    return np.stack([np.ones_like(x), 0.5 * x**2 * (np.sinc(0.5 * phase) ** 2).real, x * np.sinc(phase).real], axis=1)
 
 
 def period_stretch(amplitude: np.ndarray) -> np.ndarray:

@@ -140,7 +140,7 @@ CASES = (
     ),
     run_case(
         "one load",
-        hard="none: this is the standard for the next cases",
+        hard="none: the next cases are compared with this one",
         scene=lambda: published(eps=0.05),
         answer=_RUN,
         reference=_RUN_AGAIN,
