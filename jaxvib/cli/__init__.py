@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import gc
 import os
 import signal
 import sys
+import threading
 import warnings
 from types import FrameType
+
+
+_LATER = 0.05
+"""Time after which a discarded interrupt is repeated, s: outside the callback that discarded it."""
 
 
 def main() -> None:
@@ -21,6 +27,7 @@ def main() -> None:
         signal.default_int_handler(number, frame)
 
     signal.signal(signal.SIGINT, interrupt)
+    sys.unraisablehook = _repeat_lost_interrupt
     try:
         if sys.argv[1:] and not {"-h", "--help", "--version"} & set(sys.argv[1:]):
             prepare()
@@ -30,12 +37,33 @@ def main() -> None:
         gc.enable()
         code = run(sys.argv[1:])
     except KeyboardInterrupt:  # an interrupt before the command began, or a second interrupt while the first was handled
+        print("\njaxvib: interrupted", file=sys.stderr)
         code = 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()
     if interrupts:
         _exit_at_once(code)
     sys.exit(code)
+
+
+def _repeat_lost_interrupt(lost: sys.UnraisableHookArgs) -> None:
+    """Interrupt again a little later if Python discarded an interrupt, which it does in a callback of a weak reference or of C.
+
+    The default hook would print the interrupt, and the command would go on.
+    """
+    if not issubclass(lost.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    later = threading.Timer(_LATER, _interrupt_main_thread)
+    later.daemon = True
+    later.start()
+
+
+def _interrupt_main_thread() -> None:
+    if sys.platform == "win32":
+        _thread.interrupt_main()
+    else:  # also ends a sleep of the main thread
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
 
 def _exit_at_once(code: int) -> None:

@@ -472,7 +472,31 @@ main()
 def test_interrupts_end_a_command_whose_threads_compile():
     """An interrupted `join` marks its thread as finished, so that an orderly exit would crash in the compiler."""
     done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=600.0)
-    assert (done.returncode, done.stdout.strip(), done.stderr) == (1, "answered", "")
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (1, "answered", "\njaxvib: interrupted\n")
+
+
+LOST = """
+import signal, sys, time, weakref
+import jaxvib.cli.app
+from jaxvib.cli import main
+
+def lost(arguments):
+    machine = {0}
+    watch = weakref.ref(machine, lambda _: signal.raise_signal(signal.SIGINT))
+    del machine
+    print("goes on")
+    time.sleep(3600.0)
+
+jaxvib.cli.app.run = lost
+sys.argv = ["jaxvib", "-h"]
+main()
+"""
+
+
+def test_an_interrupt_that_python_discards_is_repeated():
+    """An exception of a callback of a weak reference goes to `sys.unraisablehook`; JAX has such callbacks in its caches."""
+    done = subprocess.run([sys.executable, "-c", LOST], capture_output=True, text=True, timeout=600.0)
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (1, "goes on", "\njaxvib: interrupted\n")
 
 
 def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
