@@ -10,11 +10,11 @@ import signal
 import sys
 import threading
 import warnings
+from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 
-
 _LATER = 0.05
-"""Time after which a discarded interrupt is repeated, s: outside the callback that discarded it."""
+"""Time after which an interrupt is repeated, s, if its moment was not suitable."""
 
 
 def main() -> None:
@@ -24,7 +24,10 @@ def main() -> None:
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         interrupts.append(number)
-        signal.default_int_handler(number, frame)
+        if _is_loading_extension(frame):
+            _interrupt_later()
+        else:
+            signal.default_int_handler(number, frame)
 
     signal.signal(signal.SIGINT, interrupt)
     sys.unraisablehook = _repeat_lost_interrupt
@@ -46,14 +49,27 @@ def main() -> None:
     sys.exit(code)
 
 
+def _is_loading_extension(frame: FrameType | None) -> bool:
+    """Return True while an extension module is imported: XLA's, for example, crashes if its start raises an exception."""
+    while frame is not None:
+        if isinstance(frame.f_locals.get("self"), ExtensionFileLoader):
+            return True
+        frame = frame.f_back
+    return False
+
+
 def _repeat_lost_interrupt(lost: sys.UnraisableHookArgs) -> None:
-    """Interrupt again a little later if Python discarded an interrupt, which it does in a callback of a weak reference or of C.
+    """Interrupt again if Python discarded an interrupt, which it does in a callback of a weak reference or of C.
 
     The default hook would print the interrupt, and the command would go on.
     """
-    if not issubclass(lost.exc_type, KeyboardInterrupt):
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        _interrupt_later()
+    else:
         sys.__unraisablehook__(lost)
-        return
+
+
+def _interrupt_later() -> None:
     later = threading.Timer(_LATER, _interrupt_main_thread)
     later.daemon = True
     later.start()
