@@ -56,7 +56,7 @@ _SAME_MOTION = 1e-2
 
 Progress = Callable[[str, float], None]
 
-_SEARCH_SHARE = 0.25
+_SEARCH_SHARE = 0.43
 """Share of the search in the time of a search with verification, measured for the antiphase machine."""
 
 

@@ -138,7 +138,7 @@ def _find(problem: Problem, options: Options, report: Progress) -> SearchResult 
             problem,
             options.starts * options.iterations,
             options.seed,
-            lambda share, least: report(f"evolving, best {least:.4g}", 0.05 + 0.45 * share),
+            lambda share, least: report(f"evolving, best {least:.4g}", 0.05 + 0.65 * share),
         )
         point, drawn, existing, interrupted = evolved.point, evolved.drawn, evolved.existing, evolved.interrupted
         history.append(evolved.history)
@@ -168,10 +168,10 @@ def _find(problem: Problem, options: Options, report: Progress) -> SearchResult 
 
     try:
         if options.iterations:
-            descended = descend(problem, point, options.iterations, options.rate, progress_of("descending", 0.1, 0.5))
+            descended = descend(problem, point, options.iterations, options.rate, progress_of("descending", 0.55, 0.7))
             history.append(descended.history)
             point = descended.point
-        polished = polish(problem, point, options.polishing, progress_of("polishing", 0.5, 0.9))
+        polished = polish(problem, point, options.polishing, progress_of("polishing", 0.7, 0.9))
     except KeyboardInterrupt:
         interrupted = True
         polished = polish(problem, last, 0, lambda *_: None)

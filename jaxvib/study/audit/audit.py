@@ -28,8 +28,8 @@ from jaxvib.study.audit.tiers import TierRow, tier_rows
 from jaxvib.study.audit.variants import possible_variants, present_variants
 from jaxvib.units import Number, count, number
 
-_TIER_STEPS = 3
-"""Assumed time of the comparison of all tiers, in units of the time of one effect, for the share that `progress` reports."""
+_TIER_STEPS = 1
+"""Measured time of the comparison of all tiers, in units of the time of one effect, for the share that `progress` reports."""
 
 
 class AuditStatus(eqx.Enumeration):
