@@ -121,7 +121,7 @@ def _operating_line(axis: Axes, at: float, crossed: list[tuple[int, float, str, 
         numbered(axis, at, *zip(*points, strict=True))
 
 
-_SPEED_TITLE = "speed of the loads"
+_SPEED_TITLE = "load speed"
 
 
 def _branch_rows(
@@ -177,7 +177,7 @@ def _speed_lines(
     """Draw resonances, the line of equal rotor and load speeds, and marks in the panel of load speeds."""
     for k, w in enumerate(resonances):
         axis.axhline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "resonance")
-    axis.plot([0.0, high], [0.0, high], color=GUIDE, lw=0.8, label="speed of the rotor", zorder=1.0)
+    axis.plot([0.0, high], [0.0, high], color=GUIDE, lw=0.8, label="rotor speed", zorder=1.0)
     for (label, x, y), shape in zip(marks, itertools.cycle("osD^vPX"), strict=False):
         axis.plot(scale * x, scale * y, shape, ms=5.0, mfc="white", mec=COLORS[1], mew=1.2, label=label, ls="", zorder=3)
     axis.set_ylim(0.0, 1.06 * high)
@@ -352,7 +352,7 @@ def regime_chart(
         label="loads, each start",
     )
     bottom.axhline(scale * rotor_speed, color="black", lw=1.0, ls="--", label="rotor")
-    bottom.set(ylabel=f"speed of loads, {unit}", xlabel="drag, N s/m", xscale="log")
+    bottom.set(ylabel=f"load speed, {unit}", xlabel="drag, N s/m", xscale="log")
     log_ticks(bottom, "x")
     legend_above(bottom)
     return figure if ax is None else ax

@@ -156,7 +156,7 @@ def stability_chart(
         look: Look = {"mec": COLORS[k % len(COLORS)], "mfc": "none", "mew": 1.4, "ms": max(9.0 - 2.0 * k, 3.0), "ls": ""}
         axes.plot(scale * points[:, 0], points[:, 1], "os^D"[k % 4], label=kind, **look)
     axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
-    axes.set(xlabel=f"speed of loads, {unit}", ylabel=label)
+    axes.set(xlabel=f"load speed, {unit}", ylabel=label)
     legend_above(axes, 1)
     return figure if ax is None else ax
 

@@ -72,7 +72,7 @@ def modes_chart(
     top.plot([], [], "o", color="black", label="stable by slope")
     top.plot([], [], "o", color="black", mfc="white", label="unstable")
     legend_above(top)
-    top.set_ylabel(f"speed of loads, {unit}")
+    top.set_ylabel(f"load speed, {unit}")
     bottom.set(ylabel=f"amplitude, {', '.join(dict.fromkeys(labels))}, zero to peak", xlabel="number of the jam mode")
     shown = amplitude * np.where(tilts, 1e3, factor)
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
@@ -353,7 +353,7 @@ def drag_diagram(
     >>> drag, speed = np.array([1.0, 2.0, 1.5]), np.array([5.0, 6.0, 7.0])
     >>> figure = drag_diagram([("together", drag, speed, drag < 1.8)], 8.0, label="drag, N s/m", at=1.2)
     >>> figure.axes[0].get_ylabel()
-    'speed of loads, rpm'
+    'load speed, rpm'
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.6), ax=ax)
@@ -367,7 +367,7 @@ def drag_diagram(
         axis.plot([], [], color=color, lw=_WIDTHS[0], marker=marks.get(name, ""), ms=4.0, mfc="white", label=name)
     axis.plot([], [], color="black", lw=_WIDTHS[0], label="stable")
     axis.plot([], [], color="black", ls=UNSTABLE, lw=_WIDTHS[1], label="unstable")
-    axis.axhline(scale * rotor_speed, color=GUIDE, lw=1.2, label="speed of the rotor")
+    axis.axhline(scale * rotor_speed, color=GUIDE, lw=1.2, label="rotor speed")
     axis.axvline(at, label="the scene's drag; points: its jams", **OPERATING)
     if jams is not None:
         speed, stable = jams
@@ -377,7 +377,7 @@ def drag_diagram(
     if within is not None:
         axis.set_xlim(at / within, at * within)
     log_ticks(axis, "x")
-    axis.set(ylim=(0.0, 1.05 * scale * rotor_speed), xlabel=label, ylabel="speed of loads, " + unit)
+    axis.set(ylim=(0.0, 1.05 * scale * rotor_speed), xlabel=label, ylabel="load speed, " + unit)
     legend_above(axis, 3)
     return figure if ax is None else ax
 
@@ -399,6 +399,6 @@ def drag_limits_chart(
     for k, w in enumerate(resonances):
         axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "natural frequency")
     axis.plot(scale * omega[there], drag[there], "o", color=COLORS[0], label="no jam above")
-    axis.set(xlabel=f"speed of the loads, {unit}", ylabel="greatest drag, N s/m", yscale="log" if there.any() else "linear")
+    axis.set(xlabel=f"load speed, {unit}", ylabel="greatest drag, N s/m", yscale="log" if there.any() else "linear")
     legend_above(axis)
     return figure if ax is None else ax

@@ -22,7 +22,7 @@ _LEGEND = {
     "stable": {**_STABLE, "color": "black"},
     "unstable": {**_UNSTABLE, "color": "black"},
     "resonance": _RESONANCE,
-    "speed of the rotor": ROTOR,
+    "rotor speed": ROTOR,
     "operating speed; numbers: jam modes": OPERATING,
 }
 """Styles of lines by kind."""
@@ -47,7 +47,7 @@ def chart(result: Branches, max_speed: float) -> str:
     rotor_speed, resonances = np.asarray(result.rotor_speed), np.asarray(result.resonances)
     rotor_speed = np.where(rotor_speed <= max_speed, rotor_speed, np.nan)
     high = scale * float(np.nanmax(rotor_speed))
-    speeds = Panel(FIRST, "speed of loads, rpm", (0.0, high), (0.0, 1.06 * high))
+    speeds = Panel(FIRST, "load speed, rpm", (0.0, high), (0.0, 1.06 * high))
     limits = log_limits([force], rotor_speed, omega, resonances)
     forces = Panel(FIRST + WIDE + APART, "foundation force, N, zero to peak", (0.0, high), limits, log=True)
     parts, texts = [*speeds.frame(), *forces.frame()], [*speeds.texts(), *forces.texts()]

@@ -149,7 +149,7 @@ class Ensemble(Result):
 
         unit, scale = speed_unit(unit)
         speeds = scale * np.asarray(self.load_speed)
-        return points_chart(speeds, x_label="run", y_label=f"speed of loads, {unit}", ax=ax)
+        return points_chart(speeds, x_label="run", y_label=f"load speed, {unit}", ax=ax)
 
 
 @validated

@@ -41,7 +41,7 @@ def test_recording_is_described(typed, tmp_path, source):
 def test_recording_is_described_by_a_text(typed):
     code, out, err = typed("record", "run.csv", "--pulses", "tacho")
     assert (code, err) == (0, "")
-    assert "rate, Hz" in out and "speed of the rotor" in out and "rpm" in out and "has 1 gap" in out
+    assert "rate, Hz" in out and "rotor speed" in out and "rpm" in out and "has 1 gap" in out
 
 
 @pytest.mark.parametrize(

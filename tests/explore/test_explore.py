@@ -198,7 +198,7 @@ def test_the_charts_lines_are_the_branches(kind):
     spans = _texts(drawn)
     wide, tall = float(drawn.get("width")), float(drawn.get("height"))
     assert all(0.0 <= x < wide and 0.0 < y < tall for x, y, _, _ in spans)  # the legend too
-    titles = {text: x for x, _, text, _ in spans if text in ("speed of loads, rpm", "foundation force, N, zero to peak")}
+    titles = {text: x for x, _, text, _ in spans if text in ("load speed, rpm", "foundation force, N, zero to peak")}
     middle = titles["foundation force, N, zero to peak"]
     for right, values, log in ((False, RPM * found.omega, False), (True, found.foundation_force, True)):
         across, up = _axes([span for span in spans if (span[0] > middle - 1.0) == right], log)

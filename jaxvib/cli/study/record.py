@@ -16,7 +16,7 @@ _SHOWN_TIMES = 9
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--pulses", help="Name of the channel with the pulses of a tachometer.")
 @click.option("--per-turn", type=click.IntRange(min=1), default=1, show_default=True, help="Pulses per turn of the rotor.")
-@click.option("--speed", help="Name of the channel with the speed of the rotor [the first in rpm or rad/s].")
+@click.option("--speed", help="Name of the channel with the rotor speed [the first in rpm or rad/s].")
 @click.option("--rate", help="Sampling rate in place of the times in the file, such as '2 kHz'.")
 @shared
 def record(recording: Path, pulses: str | None, per_turn: int, speed: str | None, rate: str | None, output: Output) -> None:
@@ -70,7 +70,7 @@ def record(recording: Path, pulses: str | None, per_turn: int, speed: str | None
         heads = ["channel", "unit", "rate, Hz", "readings", "time, s", "values", "missing", "clipped"]
         lines = [table(str(recording), heads, rows)]
         if rows_of_speed:
-            lines.append(table("speed of the rotor", ["time, s", "speed"], rows_of_speed))
+            lines.append(table("rotor speed", ["time, s", "speed"], rows_of_speed))
         return "\n".join([*lines, *notes])
 
     output.done(document, text, "recording")

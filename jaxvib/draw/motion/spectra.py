@@ -39,7 +39,7 @@ def spectrum_chart(
         axis.plot(scale * frequency, values, label=name, **look)
     for k, w in enumerate(resonances):
         axis.axvline(scale * w, color=GUIDE, lw=0.9, ls=":", label=None if k else "resonances")
-    marks = (("speed of the loads", load_speeds, (0, (5, 3))), ("speed of the rotor", rotor_speeds, "-."))
+    marks = (("load speed", load_speeds, (0, (5, 3))), ("rotor speed", rotor_speeds, "-."))
     for name, speeds, stroke in marks:
         for k, speed in enumerate(np.abs(speeds[0])):
             axis.axvline(scale * float(speed), color="black", lw=0.9, ls=stroke, label=None if k else name)
@@ -87,7 +87,7 @@ def waterfall_chart(
     axis.grid(False)
     for k, w in enumerate(resonances):
         axis.axhline(scale * w, color=COLORS[0], lw=1.0, ls=":", label=None if k else "resonances")
-    marks = (("speed of the loads", load_speeds, COLORS[1], (0, (5, 3))), ("speed of the rotor", rotor_speeds, COLORS[2], "-."))
+    marks = (("load speed", load_speeds, COLORS[1], (0, (5, 3))), ("rotor speed", rotor_speeds, COLORS[2], "-."))
     for name, speeds, color, stroke in marks:
         for k, speed in enumerate(np.abs(speeds).T):
             axis.plot(time, scale * speed, color=color, lw=1.4, ls=stroke, label=None if k else name)

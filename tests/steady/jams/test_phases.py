@@ -179,16 +179,16 @@ def test_figure_of_a_branch_is_solid_where_it_is_stable():
     omega = np.linspace(140.0, 190.0, 53)
     branch = phase_branch(scene, phase_jam(scene, 169.6, jnp.zeros(4)), omega)
     (axis,) = branch.plot(unit="rpm").axes
-    assert axis.get_xlabel() == "drag, N s/m" and axis.get_ylabel() == "speed of loads, rpm"
+    assert axis.get_xlabel() == "drag, N s/m" and axis.get_ylabel() == "load speed, rpm"
     expected = np.stack([np.asarray(branch.drag_factor) * 9.2e-4 / 0.08**2, 30.0 / np.pi * omega], axis=1)
     lines = [line for line in axis.lines if len(line.get_xdata()) > 2]
     assert [line.get_linestyle() for line in lines] == ["--", "-", "--"]  # patterns part below 151 and above 170 rad/s
     changes = np.flatnonzero(np.diff(np.asarray(branch.stable).astype(int)) != 0) + 1
     for line, start, stop in zip(lines, [0, *changes], [*(changes + 1), 53], strict=True):
         np.testing.assert_allclose(line.get_xydata(), expected[start:stop], rtol=1e-12)
-    assert {"speed of the rotor", "the scene's drag; points: its jams", "unstable"} <= {line.get_label() for line in axis.lines}
+    assert {"rotor speed", "the scene's drag; points: its jams", "unstable"} <= {line.get_label() for line in axis.lines}
     np.testing.assert_allclose(
-        [line.get_ydata()[0] for line in axis.lines if line.get_label() == "speed of the rotor"], 460.0 * 30.0 / np.pi
+        [line.get_ydata()[0] for line in axis.lines if line.get_label() == "rotor speed"], 460.0 * 30.0 / np.pi
     )
     with pytest.raises(jv.InputError, match="unit is 'mph'; it must be one of 'rad/s', 'rpm', 'Hz'"):
         branch.plot(unit="mph")
