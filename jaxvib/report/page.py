@@ -186,13 +186,13 @@ th { font-weight: 600; }
 td.n, th.n { text-align: right; white-space: nowrap; }
 td.unit { color: #555; white-space: nowrap; }
 td.below { color: #555; padding-left: 1.5rem; }
-figure { margin: 1rem 0; break-inside: avoid; overflow-x: auto; }
+figure { margin: 1rem 0; break-inside: avoid; }
 figure img { max-width: 100%; height: auto; }
 figcaption { color: #555; font-size: 0.9rem; }
-pre { overflow-x: auto; font-size: 0.75rem; line-height: 1.25; }
+pre { overflow-x: auto; font-size: 0.75rem; line-height: 1.25; white-space: pre-wrap; }
 details { margin-top: 2rem; }
 summary { cursor: pointer; }
-@media screen and (max-width: 40rem) { figure img { max-width: none; width: 44rem; } }
+@media screen and (max-width: 45rem) { pre { font-size: min(0.75rem, 1.9vw); } }
 @page { margin: 18mm; }
 @media print {
   body { font-size: 10pt; max-width: none; padding: 0; }

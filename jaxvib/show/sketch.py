@@ -58,6 +58,8 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
     """
     view = view_of(drawable_scene(scene))
     pose, title = at_rest(scene), caption(scene)
+    if deck is None and any(exciter.unbalance is None for exciter in scene.exciters):
+        title += "\ngrey dot: mark on the rotor"
     parts, texts = view.parts(pose, 0.0), view.texts(pose, 0.0)
     limits = left, right, bottom, top = _limits(parts, texts)
     wide = max(_INCHES_PER_UNIT * (right - left), _LETTER_WIDTH * max(map(len, title.splitlines())))
@@ -70,8 +72,6 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
         axis.text(text.x, text.y, text.text, zorder=6, **text.look)
     if deck is not None:
         _draw_deck(axis, view, deck, limits)
-    elif any(exciter.unbalance is None for exciter in scene.exciters):
-        axis.text(right, bottom, "grey dot: mark on the rotor", ha="right", va="bottom", fontsize="x-small", color="#555555")
     axis.set_title(title, loc="left", fontsize="small", y=1.0)  # a fixed y is faster than automatic placement
     return figure if ax is None else ax
 
