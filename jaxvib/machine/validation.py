@@ -176,8 +176,15 @@ def implausible_numbers(scene: Scene) -> list[str]:
     return notes
 
 
+_SWING_SHARE = 0.7246113537767085
+"""Largest value of (1 - cos x)/x."""
+
+
 def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
-    """Return S g, the largest torque of the weight of the unbalance, and L(0), the torque of the motor at rest, N m.
+    """Return 0.7246 S g, the least constant torque that turns a hanging unbalance over the top, and L(0), the torque of the
+    motor at rest, N m.
+
+    The unbalance swings past the height at which the torque would hold it: torque x > S g (1 - cos x) for every angle x.
 
     The list has an entry for each exciter, which is None if the exciter has no motor or no unbalance, or without gravity.
     """
@@ -189,20 +196,20 @@ def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
         if exciter.unbalance is None or motor is None or 1 not in gravity:
             found.append(None)
         else:
-            found.append((exciter.unbalance * jnp.abs(gravity[1]), motor[0]))
+            found.append((_SWING_SHARE * exciter.unbalance * jnp.abs(gravity[1]), motor[0]))
     return found
 
 
 def start_notes(scene: Scene) -> list[str]:
-    """Return a sentence for each motor that cannot lift its unbalance against gravity.
+    """Return a sentence for each motor that cannot turn its hanging unbalance over the top.
 
     Motors whose torque at rest changes over time, such as those of converters, are not judged.
 
     >>> import jaxvib as jv
-    >>> motor = jv.DCMotor(100.0, stall_torque=3.0, inertia=0.5)
+    >>> motor = jv.DCMotor(100.0, stall_torque=2.5, inertia=0.5)
     >>> start_notes(jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0),
     ...                      exciters=[jv.Exciter(drive=motor, unbalance=0.4)], effects=jv.Gravity()))
-    ['the motor cannot start: the weight of its unbalance needs 3.92 N m, its starting torque is 3 N m']
+    ['the motor cannot start: the weight of its unbalance needs 2.84 N m, its starting torque is 2.5 N m']
     """
     notes = []
     for k, (exciter, torques) in enumerate(zip(scene.exciters, lifting_torques(scene), strict=True)):

@@ -18,7 +18,7 @@ from jaxvib.equations.sliding import dot, kinematics
 from jaxvib.equations.state import ExciterState, Spin, State
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.drives.drive import SpinUp
-from jaxvib.machine.effects.base import has_term, terms_of
+from jaxvib.machine.effects.base import has_term, terms_of, total_gravity
 from jaxvib.machine.effects.terms import DrillingSpinRelease, LoadInteraction, SlipRelease
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Exciter, Scene
@@ -55,7 +55,8 @@ def initial_state(
     **Arguments**
 
     - `scene` of the state
-    - `start`: "rest" (platforms in equilibrium, loads at rest near the bottom of their track), "spin_up" (the same state; in
+    - `start`: "rest" (platforms in equilibrium, loads at rest near the bottom of their track, unbalances of motors hanging down
+      if gravity acts on them), "spin_up" (the same state; in
       `simulate` the rotor speed then rises smoothly), or "jam" (on the leading-order motion of a jam mode)
     - `mode`: number of the jam mode, for "jam"; typical: 1, 3, 5, the modes that are stable for light loads
     - `angles` (count,): the angles of the loads about the axis of the rotor, rad; or one value for the middle of all loads
@@ -68,7 +69,8 @@ def initial_state(
     - `throw`: True to raise `ComputationError` if the mode does not exist; otherwise, and under a JAX transformation, the state
       is NaN
 
-    The rotor of a motor starts at rest, at the angle 0, without currents.
+    The rotor of a motor starts at rest, without currents. Its angle is -pi/2 if gravity acts on its unbalance, otherwise 0. An
+    ideal drive prescribes the angle of its rotor, which begins at 0.
 
     **Returns** `State`. **Raises** `InputError` for an unknown name or a missing mode, `ComputationError` for a mode that does
     not exist at the rotor speed of the scene.
@@ -95,7 +97,9 @@ def initial_state(
         return middle + _places(exciter, loads, start, separation, one_each=one_each)
 
     def at_rest(exciter: Exciter) -> ExciterState:
-        rotor = None if exciter.drive.ideal else (zero[0],) * (2 + len(exciter.drive.state_units()))
+        hangs = exciter.unbalance is not None and 1 in total_gravity((*scene.effects, *exciter.effects))
+        turned = cast(Array, np.full_like(zero[0], -0.5 * np.pi if hangs else 0.0))
+        rotor = None if exciter.drive.ideal else (turned, *(zero[0],) * (1 + len(exciter.drive.state_units())))
         if exciter.loads is None:
             return ExciterState(rotor=rotor)
         first, *others = exciter.loads.rest()

@@ -321,10 +321,10 @@ def test_run_up_command_gives_the_result_of_python(typed, tmp_path):
 
 def test_a_motor_that_cannot_start_is_named(tmp_path, capsys):
     path = tmp_path / "screen.toml"
-    path.write_text(SCREENS["linear_screen"].replace("breakdown_torque = 80.0", "breakdown_torque = 40.0", 1))
+    path.write_text(SCREENS["linear_screen"].replace("breakdown_torque = 80.0", "breakdown_torque = 25.0", 1))
     loaded_scene(path)
     scene = jv.load_scene(path)
-    weight = 9.80665 * float(scene.exciters[0].unbalance)
+    weight = 0.7246113537767085 * 9.80665 * float(scene.exciters[0].unbalance)
     start = float(scene.exciters[0].drive.torque(0.0))
     note = f"note: the motor of exciter 0 cannot start: the weight of its unbalance needs {weight:.3g} N m"
     assert capsys.readouterr().err == f"{note}, its starting torque is {start:.3g} N m\n" and start < weight

@@ -8,6 +8,7 @@ from scenes import published, scene
 from small_machine import small_machine
 
 import jaxvib as jv
+from jaxvib.machine.validation import start_notes
 
 
 def test_a_mode_that_is_not_there_is_no_start():
@@ -90,3 +91,26 @@ def test_angles_without_digits_in_a_turn_are_refused(angle):
 def test_the_motion_at_an_angle_takes_one_angle():
     with pytest.raises(jv.InputError, match=r"^theta has shape \(2,\); one number in rad is needed"):
         jv.jam_orbit(scene(), mode=3, points=16).at([0.0, 1.0])
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_unbalances_of_motors_hang_where_gravity_acts(direction):
+    motor, ideal = jv.DCMotor(100.0, stall_torque=30.0, inertia=0.5), jv.ConstantSpeed(100.0)
+    exciters = [jv.Exciter(drive=drive, unbalance=0.4, direction=direction) for drive in (motor, ideal)]
+    machine = jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0)
+    hanging = jv.initial_state(jv.Scene(machine, exciters=exciters, effects=jv.Gravity()))
+    assert [own.rotor and float(own.rotor[0]) for own in hanging.exciters] == [-0.5 * np.pi, None]
+    rates = jv.vector_field(jv.Scene(machine, exciters=exciters, effects=jv.Gravity()))(0.0, hanging)
+    np.testing.assert_allclose(rates.exciters[0].rotor[1], direction * 30.0 / 0.5, rtol=1e-12)
+    assert float(jv.initial_state(jv.Scene(machine, exciters=exciters)).exciters[0].rotor[0]) == 0.0
+
+
+@pytest.mark.parametrize(("share", "passes"), [(0.72, False), (0.73, True)])
+def test_motor_of_constant_torque_passes_the_top_above_a_limit(share, passes):
+    """The work of the torque from the lowest point is S g (1 - cos x) at the limit: max (1 - cos x)/x = 0.72461."""
+    motor = jv.DCMotor(1e4, stall_torque=share * 0.4 * 9.80665, inertia=0.5)
+    machine = jv.one_mass(mass=1e7, stiffness=1e10, damping=1e6)
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=motor, unbalance=0.4)], effects=jv.Gravity())
+    run = jv.simulate(scene, "10 s", estimate=False)
+    assert (float(jnp.max(run.trajectory.rotor_angle)) > 1.5 * np.pi) == passes
+    assert bool(start_notes(scene)) != passes

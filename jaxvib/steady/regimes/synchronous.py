@@ -114,7 +114,8 @@ class AbstractSynchronousRegime(Result):
     - `torque` (mass,), N m: driving torque, by the motor or by the drag; for an ideal drive the torque that it must exert
     - `vibrational_torque` (mass,), N m: mean torque of the vibration on each mass; it balances `torque`
     - `power` (exciter,), W: mean power of each drive
-    - `can_start` (exciter,): False if the motor cannot lift its unbalance from rest: S g > L(0), with the starting torque L(0)
+    - `can_start` (exciter,): False if the motor cannot turn its hanging unbalance over the top: L(0) < 0.7246 S g, with the
+      starting torque L(0)
     - `displacement` (nd,): complex amplitudes, in m, or in rad for rotations; `amplitude` (nd,): their moduli, zero to peak
     - `foundation_force`, N, zero to peak (for two directions the root of the summed squares of their peaks)
     - `residual` of the balance, relative to the largest vibrational torque that is possible

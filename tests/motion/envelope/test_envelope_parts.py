@@ -240,13 +240,13 @@ def test_loads_turn_above_the_speed_that_passes_the_top():
 
 
 def test_unbalance_turns_above_the_speed_that_passes_the_top():
-    """J w^2/2 > S g; the motor lifts it if its torque at rest is above S g = 3.92 N m."""
+    """J w^2/2 > S g; the motor lifts it if its torque at rest is above 0.7246 S g = 2.84 N m."""
     pass_top = np.sqrt(2.0 * 0.4 * G / 0.05)
     for torque, first, last, expected in (
-        (3.93, 0.0, 1.01, 1),
-        (3.93, 0.0, 0.99, 0),
-        (3.91, 1.01, 1.01, 1),
-        (3.91, 0.99, 1.01, 0),
+        (2.85, 0.0, 1.01, 1),
+        (2.85, 0.0, 0.99, 0),
+        (2.83, 1.01, 1.01, 1),
+        (2.83, 0.99, 1.01, 0),
     ):
         scene = mixed((jv.Gravity(),), (motor(torque=torque), jv.ConstantSpeed(80.0)))
         ends = window_of([[-last * pass_top, 80.0, 80.0]] * 2, [[-50.0] * 2, [80.0] * 2])

@@ -23,7 +23,7 @@ SCENE = jv.Scene(MACHINE, exciters=[motor(0), motor(1)], effects=jv.Gravity())
 
 
 def by_hand(stall=STALL, end=END):
-    """States (y, theta_1, theta_2, and their rates) at the end; both motors start from rest at the angle 0."""
+    """States (y, theta_1, theta_2, and their rates) at the end; both unbalances hang at the start."""
 
     def rates(_, x):
         y, v = x[0], x[3]
@@ -37,7 +37,7 @@ def by_hand(stall=STALL, end=END):
             force[1 + k] += torque - UNBALANCE[k] * G * c
         return np.concatenate([x[3:], np.linalg.solve(mass, force)])
 
-    return solve_ivp(rates, (0.0, end), np.zeros(6), method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    return solve_ivp(rates, (0.0, end), [0.0, -0.5 * np.pi, -0.5 * np.pi, 0.0, 0.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
 
 
 def flat(state, at=()):
