@@ -27,6 +27,7 @@ from jaxvib.equations.model import Group, Model, assemble, grouped, stack_member
 from jaxvib.equations.sliding import ContactSolution
 from jaxvib.equations.state import State
 from jaxvib.machine.carrier import Mount
+from jaxvib.machine.drives.drive import Directed
 from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import RotorImbalance, SupportForce
 from jaxvib.machine.scene import Exciter, Scene
@@ -241,7 +242,7 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
     """Return `vector_field` of a scene that is already assembled. `solve` returns x of a x = b, where a is the mass matrix."""
     scene, carrier, gyroscopic = model.scene, model.carrier, model.mounts[0].gyroscopic
     exciters = [_exciter_dynamics(*each, scene.effects) for each in zip(scene.exciters, model.mounts, strict=True)]
-    groups, moving = grouped(exciters), []
+    groups, moving = _groups_of_directions(exciters, [exciter.direction for exciter in scene.exciters]), []
     for k in itertools.chain.from_iterable(group.members for group in groups):
         turn = exciters[k].turn
         moving += [*model.mounts[k].rows[: exciters[k].row_count], *([] if turn is None else [turn])]
@@ -261,6 +262,23 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
         mass=carrier.mass if rows.shape[0] > rows.shape[1] else None,
         groups=groups,
         supports=tuple(map(_Support, model.supports, rest)),
+    )
+
+
+def _groups_of_directions(exciters: Sequence[RotorDynamics], directions: Sequence[int]) -> tuple[Group[RotorDynamics], ...]:
+    """Return the exciters in groups. Groups with both directions have them as an array; others have no operations for it."""
+
+    def directed(part: RotorDynamics, direction: int) -> RotorDynamics:
+        drive = part.drive.drive if isinstance(part.drive, Directed) else part.drive
+        return dataclasses.replace(part, drive=Directed(drive, jnp.asarray(direction, drive.speed.dtype)))
+
+    if len(set(directions)) == 1:
+        return grouped(exciters)
+    groups = grouped([directed(*each) for each in zip(exciters, directions, strict=True)])
+    has_both = (len({directions[k] for k in group.members}) == 2 for group in groups)
+    return tuple(
+        group if both else Group(stack_members(group.members, exciters), group.members)
+        for group, both in zip(groups, has_both, strict=True)
     )
 
 

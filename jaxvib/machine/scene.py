@@ -13,7 +13,7 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine, Mount, Place, on_body, read_place, shapes_of
-from jaxvib.machine.drives.drive import Clockwise, Drive
+from jaxvib.machine.drives.drive import Directed, Drive
 from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, GravityField, RotorImbalance, SlipRelease, SupportForce
 from jaxvib.machine.loads import Loads
@@ -121,7 +121,7 @@ class Exciter(Part):
     @property
     def turning_drive(self) -> Drive:
         """Drive that turns the rotor in its direction."""
-        return self.drive if self.direction == 1 else Clockwise(self.drive)
+        return self.drive if self.direction == 1 else Directed(self.drive)
 
     @property
     def at(self) -> int | Array | None:

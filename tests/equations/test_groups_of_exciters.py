@@ -10,6 +10,7 @@ import jaxvib as jv
 from jaxvib.equations import model
 from jaxvib.equations.linear import linear_model
 from jaxvib.equations.torque_balance import resultant_of
+from jaxvib.machine.drives.drive import Directed
 
 SUPPORTS = [jv.support(at=(x, -0.2), stiffness=(4e5, 7e5), damping=(2e3, 3e3)) for x in (-1.0, 1.1)]
 BODY = jv.plane_body(mass=2000.0, inertia=600.0, supports=SUPPORTS)
@@ -57,10 +58,12 @@ IDEAL = [jv.Exciter(loads(k), jv.SpinUp(90.0 + k, 1.0), at=(0.1 * k, 0.4), direc
 DRY = [jv.Exciter(loads(k, jv.pendulums), jv.ConstantSpeed(80.0 + k), effects=[jv.DryFriction(0.002, 0.02)]) for k in range(8)]
 ROLLS = (jv.RollingFriction(3e-5), jv.FreeSpin(), jv.Sliding(0.2))
 SLIDING = [jv.Exciter(torus(k), jv.ConstantSpeed(60.0 + k), effects=ROLLS) for k in range(8)]
+MIXED = [jv.Exciter(loads(k), dc(k), unbalance=0.1 + 0.01 * k, direction=(1, -1)[k % 2]) for k in range(8)]
 SCENES = {
     "unbalances": jv.Scene(BODY, exciters=motors(8, direction=clockwise), effects=jv.Gravity()),
     "two kinds": jv.Scene(BODY, exciters=[*motors(8, direction=clockwise), *motors(1, electrical)]),
     "both directions": jv.Scene(BODY, exciters=motors(64)),
+    "mixed loads": jv.Scene(PLANAR, exciters=MIXED, effects=jv.Gravity()),
     "currents": jv.Scene(BODY, exciters=motors(8, electrical, clockwise)),
     "ideal drives": jv.Scene(BODY, exciters=[*IDEAL, *motors(8, lambda k: jv.ConstantSpeed(60.0 + k), clockwise)][::-1]),
     "more coordinates than rows": jv.Scene(TWELVE, exciters=LOADED, effects=[jv.Gravity(), jv.Stop(1e5, gap=0.01)]),
@@ -93,6 +96,14 @@ def test_groups_have_the_rates_of_single_exciters(name, monkeypatch):
     monkeypatch.setattr(model, "_MIN_GROUP_SIZE", 1000)
     assert all(len(group.members) == 1 for group in jv.vector_field(scene).groups)
     close(found, jax.jit(lambda y: rate(scene, y))(state))
+
+
+def test_directions_do_not_divide_a_group():
+    for name in ("both directions", "mixed loads"):
+        (group,) = jv.vector_field(SCENES[name]).groups
+        assert isinstance(group.part.drive, Directed) and group.part.drive.direction.tolist()[:3] == [1.0, -1.0, 1.0]
+    kinds = jv.vector_field(jv.Scene(BODY, exciters=[*motors(8, direction=clockwise), *motors(1, electrical)])).groups
+    assert [isinstance(group.part.drive, Directed) and group.part.drive.direction for group in kinds] == [None, False]
 
 
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("more coordinates than rows", "dry friction")]

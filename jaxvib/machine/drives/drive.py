@@ -89,49 +89,56 @@ class Drive(Part):
         return self
 
 
-class Clockwise(Drive):
-    """Drive that turns its rotor clockwise: angles, speeds and torques are those of `drive` with the opposite sign."""
+class Directed(Drive):
+    """Drive that turns its rotor in a direction: angles, speeds and torques are those of `drive` times `direction`.
+
+    `direction` is 1 or -1 as an array, so that drives of both directions have an equal structure; None for clockwise.
+    """
 
     drive: Drive
+    direction: Array | None
     speed: Array
     kind: str = eqx.field(static=True)
 
-    def __init__(self, drive: Drive):
-        self.drive, self.speed, self.kind = drive, drive.speed, drive.kind
+    def __init__(self, drive: Drive, direction: Array | None = None):
+        self.drive, self.direction, self.speed, self.kind = drive, direction, drive.speed, drive.kind
+
+    def _directed(self, value: Array) -> Array:
+        return -value if self.direction is None else self.direction * value
+
+    def _own(self, rotor: Rotor) -> Rotor:
+        """Return the states of the rotor as `drive` sees them."""
+        return None if rotor is None else (self._directed(rotor[0]), self._directed(rotor[1]), *rotor[2:])
 
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
-        """Return the speed of the drive with the opposite sign."""
-        return -self.drive.rotor_speed(t, _mirrored(rotor))
+        """Return the speed of the drive in the direction."""
+        return self._directed(self.drive.rotor_speed(t, self._own(rotor)))
 
     def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
-        """Return the angle of the drive with the opposite sign."""
-        return -self.drive.rotor_angle(t, _mirrored(rotor))
+        """Return the angle of the drive in the direction."""
+        return self._directed(self.drive.rotor_angle(t, self._own(rotor)))
 
     def rotor_acceleration(self, t: Array) -> Array | None:
-        """Return the acceleration of the drive with the opposite sign."""
+        """Return the acceleration of the drive in the direction."""
         acceleration = self.drive.rotor_acceleration(t)
-        return None if acceleration is None else -acceleration
+        return None if acceleration is None else self._directed(acceleration)
 
     def torque_and_inertia(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> tuple[Array, Array] | None:
-        """Return the torque of the drive at the opposite speed with the opposite sign, and its inertia."""
-        motor = self.drive.torque_and_inertia(t, -speed, states)
-        return None if motor is None else (-motor[0], motor[1])
+        """Return the torque of the drive in the direction, and its inertia."""
+        motor = self.drive.torque_and_inertia(t, self._directed(speed), states)
+        return None if motor is None else (self._directed(motor[0]), motor[1])
 
     def state_units(self) -> tuple[Array, ...]:
         """Return the typical magnitudes of the states of the drive."""
         return self.drive.state_units()
 
     def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
-        """Return the time derivatives of the states of the drive at the opposite speed."""
-        return self.drive.state_rates(t, -speed, states)
+        """Return the time derivatives of the states of the drive."""
+        return self.drive.state_rates(t, self._directed(speed), states)
 
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the times of the jumps of the drive."""
         return self.drive.jump_ts()
-
-
-def _mirrored(rotor: Rotor) -> Rotor:
-    return None if rotor is None else (-rotor[0], -rotor[1], *rotor[2:])
 
 
 class IdealDrive(Drive):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.machine.drives.drive import Clockwise, kloss_torque
+from jaxvib.machine.drives.drive import Directed, kloss_torque
 from jaxvib.machine.numbers import number_specs
 
 POSITIVE, NOT_NEGATIVE = "greater than 0", "at least 0"
@@ -218,7 +218,7 @@ def test_wrong_drive_is_one_sentence(case):
 
 def test_clockwise_drive_is_the_mirror_image():
     drive = jv.SwitchedOff(jv.DCMotorElectrical(24.0, 0.6, 0.08, 0.002, 0.02), at=3.0, bearing=0.01)
-    mirrored = Clockwise(drive)
+    mirrored = Directed(drive)
     rotor, states = (jnp.asarray(0.7), jnp.asarray(-50.0), jnp.asarray(2.0)), (jnp.asarray(2.0),)
     assert float(mirrored.rotor_angle(1.0, rotor)) == 0.7 and float(mirrored.rotor_speed(1.0, rotor)) == -50.0
     assert mirrored.rotor_acceleration(1.0) is None and mirrored.kind == "switched_off" and float(mirrored.speed) == 300.0
@@ -226,7 +226,7 @@ def test_clockwise_drive_is_the_mirror_image():
     assert [float(x) for x in mirrored.torque_and_inertia(4.0, -50.0, states)] == [0.5, 0.002]
     np.testing.assert_allclose(mirrored.state_rates(1.0, -50.0, states), [(24.0 - 1.2 - 4.0) / 0.02], rtol=1e-14)
     assert float(mirrored.state_units()[0]) == 40.0 and [float(t) for t in mirrored.jump_ts()] == [3.0]
-    ideal = Clockwise(jv.RunUp(60.0, acceleration=20.0))
+    ideal = Directed(jv.RunUp(60.0, acceleration=20.0))
     assert [float(f(1.0, None)) for f in (ideal.rotor_angle, ideal.rotor_speed)] == [-10.0, -20.0]
     assert float(ideal.rotor_acceleration(1.0)) == -20.0 and ideal.torque_and_inertia(1.0, 5.0) is None
     assert [float(t) for t in ideal.jump_ts()] == [3.0] and ideal.state_units() == ()
