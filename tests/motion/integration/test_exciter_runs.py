@@ -37,7 +37,9 @@ def by_hand(stall=STALL, end=END):
             force[1 + k] += torque - UNBALANCE[k] * G * c
         return np.concatenate([x[3:], np.linalg.solve(mass, force)])
 
-    return solve_ivp(rates, (0.0, end), [0.0, -0.5 * np.pi, -0.5 * np.pi, 0.0, 0.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    return solve_ivp(
+        rates, (0.0, end), [0.0, -0.5 * np.pi, -0.5 * np.pi, 0.0, 0.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-13
+    ).y[:, -1]
 
 
 def flat(state, at=()):
