@@ -222,10 +222,8 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, rotation: Rotation
             across, up = (x - own * y / loads.mass for x, y in zip(loads.position(*u), normal_force.normal, strict=False))
             along = jax.jvp(loads.position, u, rate)[1]
             relative = (along[0] + w * up, along[1] - w * across, *along[2:])
-            shapes_found = kinematics(loads, u, rate)
-            slip = tuple(
-                dot(column, relative) / size for column, size in zip(shapes_found.columns, shapes_found.sizes, strict=True)
-            )
+            motion = kinematics(loads, u, rate)
+            slip = tuple(dot(column, relative) / size for column, size in zip(motion.columns, motion.sizes, strict=True))
     spin = Spin(drilling if has_drilling else None, slip if has_slip else None)
     return ExciterState(state.angle, state.rate, state.rotor, spin)
 

@@ -189,9 +189,10 @@ def test_a_spectrum_has_the_height_of_the_vibration(run):
     fall = run.spectrum(6)
     assert fall.amplitude.shape[0] == 6 and np.all(np.diff(fall.time) > 0.0)
     data = fall.to_xarray()
-    assert data["amplitude"].dims == ("piece", "frequency", "coordinate") and data["force"].dims[:2] == ("piece", "frequency")
+    assert data["amplitude"].dims == ("segment", "frequency", "coordinate")
+    assert data["force"].dims[:2] == ("segment", "frequency")
     for name, unit in (("time", "s"), ("rotor_speeds", "rad/s"), ("load_speeds", "rad/s")):
-        assert data[name].dims[0] == "piece" and data[name].attrs["units"] == unit
+        assert data[name].dims[0] == "segment" and data[name].attrs["units"] == unit
     labels = [axes.get_ylabel() for axes in fall.plot(unit="rpm").axes]
     assert labels == ["frequency, rpm", "y1, mm, zero to peak"]
     axis = Figure().subplots()

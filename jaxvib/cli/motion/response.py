@@ -45,13 +45,13 @@ def response(
 
     loaded = loaded_scene(scene, without)
     angles, origin = _phases(loaded, phases)
-    found = jax.device_get(jv.response(loaded, phases=angles, points=points, most=most))
-    output.picture("response.png", found.plot)
-    output.csv(csv, found, "speed")
-    operating = np.flatnonzero(found.operating.exists).tolist()
-    folds = np.flatnonzero(found.folds.exists).tolist()
-    stays = found.operating.stable
-    sizes = [measures_of(loaded, found.operating.vibration(k)) if stays[k] else None for k in operating]
+    result = jax.device_get(jv.response(loaded, phases=angles, points=points, most=most))
+    output.picture("response.png", result.plot)
+    output.csv(csv, result, "speed")
+    operating = np.flatnonzero(result.operating.exists).tolist()
+    folds = np.flatnonzero(result.folds.exists).tolist()
+    is_stable = result.operating.stable
+    vibration_measures = [measures_of(loaded, result.operating.vibration(k)) if is_stable[k] else None for k in operating]
     measures = ("speed", "amplitude", "phase", "acceleration", "velocity", "exciter_force", "foundation_force")
     rest = ("transmissibility", "torque", "motor_torque", "power")
 
@@ -59,17 +59,19 @@ def response(
         return [{name: getattr(of, name)[k] for name in names} for k in places]
 
     document = {
-        "resonances": found.resonances,
+        "resonances": result.resonances,
         "phases": angles,
         "phases_from": origin,
         "operating_points": [
             row | ({} if own is None else {"measures": own.document()})
-            for row, own in zip(rows_of(found.operating, operating, *measures, *rest, "growth", "stable"), sizes, strict=True)
+            for row, own in zip(
+                rows_of(result.operating, operating, *measures, *rest, "growth", "stable"), vibration_measures, strict=True
+            )
         ],
-        "peaks": rows_of(found, found.peaks(), *measures, *rest),
-        "folds": rows_of(found.folds, folds, "speed", "factor", "torque", "lands_at"),
+        "peaks": rows_of(result, result.peaks(), *measures, *rest),
+        "folds": rows_of(result.folds, folds, "speed", "factor", "torque", "lands_at"),
     }
-    output.done(document, lambda: _text(found, (angles, origin), sizes, operating, folds), "response", found)
+    output.done(document, lambda: _text(result, (angles, origin), vibration_measures, operating, folds), "response", result)
 
 
 def _phases(scene: jv.Scene, given: str | None) -> tuple[np.ndarray, str]:
@@ -91,34 +93,34 @@ def _phases(scene: jv.Scene, given: str | None) -> tuple[np.ndarray, str]:
 
 
 def _text(
-    found: jv.Response,
+    result: jv.Response,
     phases: tuple[np.ndarray, str],
-    sizes: list[jv.VibrationMeasures | None],
+    vibration_measures: list[jv.VibrationMeasures | None],
     operating: list[int],
     folds: list[int],
 ) -> str:
-    """Return the operating points, peaks and folds as tables; `sizes`: measures at the stable operating points."""
+    """Return the operating points, peaks and folds as tables; `vibration_measures`: those at the stable operating points."""
     import numpy as np  # slow import, which --help does not need
 
     from jaxvib.display import shown_unit, speed_text, speed_unit
 
     unit, scale = speed_unit()
-    structure = found.scene.machine.structure()
-    kinds = [shown_unit(each, float(np.max(found.amplitude[:, k]))) for k, each in enumerate(structure.units)]
+    structure = result.scene.machine.structure()
+    kinds = [shown_unit(each, float(np.max(result.amplitude[:, k]))) for k, each in enumerate(structure.units)]
     moves = [f"{name}, {shown}" for name, (shown, _) in zip(structure.coordinates, kinds, strict=True)]
 
     def motion(of: AbstractResponse, k: int, *texts: str) -> list[str]:
-        moved = [f"{factor * a:.4g}" for a, (_, factor) in zip(of.amplitude[k], kinds, strict=True)]
+        amplitudes = [f"{factor * a:.4g}" for a, (_, factor) in zip(of.amplitude[k], kinds, strict=True)]
         last = [f"{of.foundation_force[k]:.4g}", f"{np.sum(of.torque[k]):.4g}"]
-        return [f"{scale * of.speed[k]:.5g}", *texts, *moved, *last]
+        return [f"{scale * of.speed[k]:.5g}", *texts, *amplitudes, *last]
 
-    lines, several = [f"natural frequencies {speed_text(found.resonances)}"], len(found.scene.exciters) > 1
+    lines, several = [f"natural frequencies {speed_text(result.resonances)}"], len(result.scene.exciters) > 1
     if several:
         written = ", ".join(f"{a:.4g}" for a in np.rad2deg(phases[0]))
         lines.append(f"phases of the unbalances {written} deg ({phases[1]}), at all speeds")
     end = ["force, N", "torque, N m"]
     if operating:
-        points = found.operating
+        points = result.operating
         rows = [motion(points, k, "yes" if points.stable[k] else "no") for k in operating]
         lines.append(table("operating points (zero to peak)", [unit, "stays", *moves, *end], rows))
         if several:
@@ -129,19 +131,19 @@ def _text(
             ]
             head = [unit, "exciter", "torque of its vibration, N m", "of its motor, N m", "power of its motor, W"]
             lines.append(table("torques at the operating points", head, rows))
-        stable = [(k, own) for k, own in zip(operating, sizes, strict=True) if own is not None]
+        stable = [(k, own) for k, own in zip(operating, vibration_measures, strict=True) if own is not None]
         lines += [indented(f"at {speed_text(points.speed[k])}:", own) for k, own in stable]
     else:
         lines.append("the motor supplies the torque that the vibration needs at no speed")
-    if peaks := found.peaks():
-        lines.append(table("peaks of the foundation force", [unit, *moves, *end], [motion(found, k) for k in peaks]))
+    if peaks := result.peaks():
+        lines.append(table("peaks of the foundation force", [unit, *moves, *end], [motion(result, k) for k in peaks]))
     if folds:
         rows = [
             [
-                f"{scale * found.folds.speed[k]:.5g}",
-                f"{found.folds.torque[k]:.4g}",
-                f"{found.folds.factor[k]:.4g}",
-                f"{scale * found.folds.lands_at[k]:.5g}" if np.isfinite(found.folds.lands_at[k]) else "-",
+                f"{scale * result.folds.speed[k]:.5g}",
+                f"{result.folds.torque[k]:.4g}",
+                f"{result.folds.factor[k]:.4g}",
+                f"{scale * result.folds.lands_at[k]:.5g}" if np.isfinite(result.folds.lands_at[k]) else "-",
             ]
             for k in folds
         ]

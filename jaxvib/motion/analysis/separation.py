@@ -83,14 +83,11 @@ def nearly_coincident_pairs(scene: Scene, k: int, angle: np.ndarray) -> list[tup
 def would_separate(scene: Scene, stretch: Trajectory) -> bool:
     """Return True if several loads of a track have nearly one angle, and small differences of their angles grow."""
     duration = float(np.ptp(np.asarray(stretch.time)))
-    angles = [
-        None if not exciter_angle.angle else np.asarray(exciter_angle.angle[0]) for exciter_angle in stretch.state.exciters
-    ]
     pairs = [
         (k, pair)
-        for k, exciter_angle in enumerate(angles)
-        if exciter_angle is not None
-        for pair in nearly_coincident_pairs(scene, k, exciter_angle)
+        for k, exciter in enumerate(stretch.state.exciters)
+        if exciter.angle
+        for pair in nearly_coincident_pairs(scene, k, np.asarray(exciter.angle[0]))
     ]
     return any(separation_rate(scene, stretch, k, pair) * duration > MIN_SEPARATION_GROWTH for k, pair in pairs)
 

@@ -48,12 +48,12 @@ class Spectrum(Result):
 
     status = Computed.done
 
-    time: np.ndarray = eqx.field(metadata=in_unit("s", "piece"))
+    time: np.ndarray = eqx.field(metadata=in_unit("s", "segment"))
     frequency: np.ndarray = eqx.field(metadata=in_unit("rad/s", "frequency"))
-    amplitude: np.ndarray = eqx.field(metadata=in_unit("m or rad", "piece", "frequency", "coordinate"))
-    force: np.ndarray = eqx.field(metadata=in_unit("N", "piece", "frequency", "direction"))
-    rotor_speeds: np.ndarray = eqx.field(metadata=in_unit("rad/s", "piece", "exciter"))
-    load_speeds: np.ndarray = eqx.field(metadata=in_unit("rad/s", "piece", "exciter_with_loads"))
+    amplitude: np.ndarray = eqx.field(metadata=in_unit("m or rad", "segment", "frequency", "coordinate"))
+    force: np.ndarray = eqx.field(metadata=in_unit("N", "segment", "frequency", "direction"))
+    rotor_speeds: np.ndarray = eqx.field(metadata=in_unit("rad/s", "segment", "exciter"))
+    load_speeds: np.ndarray = eqx.field(metadata=in_unit("rad/s", "segment", "exciter_with_loads"))
     resonances: np.ndarray = eqx.field(metadata=in_unit("rad/s", "resonance"))
     coordinates: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="unit"))
@@ -141,9 +141,9 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     weight = np.hanning(size)
 
     def amplitudes(values: np.ndarray) -> np.ndarray:
-        pieces = np.stack([values[s : s + size] for s in starts])
-        pieces = (pieces - np.mean(pieces, axis=1, keepdims=True)) * weight[:, None]
-        return 2.0 / np.sum(weight) * np.abs(np.fft.rfft(pieces, points, axis=1))[:, is_shown]
+        segments = np.stack([values[s : s + size] for s in starts])
+        segments = (segments - np.mean(segments, axis=1, keepdims=True)) * weight[:, None]
+        return 2.0 / np.sum(weight) * np.abs(np.fft.rfft(segments, points, axis=1))[:, is_shown]
 
     def means(values: np.ndarray) -> np.ndarray:
         return np.array([np.mean(values[s : s + size], axis=0) for s in starts])

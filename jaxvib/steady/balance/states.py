@@ -92,7 +92,7 @@ class BalancedStates(Result):
         """Return the growth rate of deviations from an arrangement at rotor speeds, 1/s: stable if negative, see
         `balanced_growth`.
 
-        **Arguments**: `speeds`, rad/s; `arrangement`: its number, counted from 0; `steps` as `stability`.
+        **Arguments**: `speeds`, rad/s; `arrangement`: its number, counted from 0; `steps`: as for `stability`.
         """
         return balanced_growth(self.scene, speeds, self._angles_of(arrangement), steps=steps)
 
@@ -108,7 +108,7 @@ class BalancedStates(Result):
         - `arrangement`: its number, counted from 0
         - `points`: number of speeds that are computed in the range; typical: 200 (the default). An interval narrower than
           their spacing can be missed; the time is proportional to this number
-        - `steps` as `stability`
+        - `steps`: as for `stability`
         """
         return balanced_intervals(self.scene, low, high, self._angles_of(arrangement), points=points, steps=steps)
 
@@ -409,7 +409,7 @@ def balanced_growth(
 
     - `scene`; its own speed is not used
     - `speeds`, rad/s, an array of any shape; or a list, also of strings with a unit
-    - `angles` and `steps` as `balanced_stability`
+    - `angles` and `steps`: as for `balanced_stability`
 
     **Returns** an array of the shape of `speeds`. **Raises** as `balanced_stability`.
 
@@ -421,12 +421,12 @@ def balanced_growth(
     """
     angles, neutral = _arrangement(scene, angles)
     named = isinstance(speeds, str) or (isinstance(speeds, (list, tuple)) and any(isinstance(each, str) for each in speeds))
-    given = numbers(cast(Numbers, speeds), "rad/s", "speeds", None) if named else cast(ArrayLike, speeds)
-    flat = np.ravel(np.asarray(given, dtype=float))
+    values = numbers(cast(Numbers, speeds), "rad/s", "speeds", None) if named else cast(ArrayLike, speeds)
+    flat = np.ravel(np.asarray(values, dtype=float))
     # Speeds are padded to whole batches, so that few shapes are compiled.
     padded = np.pad(flat, (0, -flat.size % BATCH), mode="edge")
     flows = monodromies(at_constant_speed(scene), angles, padded, validate_steps(scene, flat, steps))[: flat.size]
-    return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(given))
+    return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(values))
 
 
 def balanced_intervals(
@@ -437,7 +437,7 @@ def balanced_intervals(
 
     The intervals are searched for on `points` speeds (typical: 200, the default), and their ends are refined by bisection to
     1e-7 of the speed. An interval narrower than the spacing of the points can be missed. The intervals of the criterion for
-    the same range are `criterion(scene).balancing`. `angles` and `steps` as `balanced_stability`.
+    the same range are `criterion(scene).balancing`. `angles` and `steps`: as for `balanced_stability`.
 
     **Returns** a list of pairs, rad/s. **Raises** as `balanced_stability`, and `InputError` for an empty range.
 
@@ -501,9 +501,9 @@ def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, in
     static, moment, distances = _imbalances(scene)
     tilting, arms = moment - distances[0] * static, distances - distances[0]
     forces = sides * np.exp(1j * angles)
-    left = abs(np.sum(forces) + static) > _rounding() * sides.sum()
+    is_unbalanced = abs(np.sum(forces) + static) > _rounding() * sides.sum()
     tilts = abs(np.sum(arms * forces) + tilting) > _rounding() * max(float(np.sum(np.abs(arms) * sides)), abs(moment))
-    if left or tilts:
+    if is_unbalanced or tilts:
         raise InputError("angles", "leave an unbalance; use angles from balanced_states(scene).angles")
     _require_undisturbed(scene, angles)
     length = np.max(np.abs(arms))

@@ -112,10 +112,10 @@ def _jacobian(
         + (balance.vibration_stiffness - by_angle / unit)[:, :, None] * np.eye(m)[None]
         - (omega * by_rate / unit)[:, :, None] * grid.first[None]
     )
-    shake = model.unbalance[None, :, None] * balance.moving
+    force_change = model.unbalance[None, :, None] * balance.moving
     # Dry friction also depends on the acceleration that the other bodies cause.
-    torque_response = (shake if by_acceleration is None else shake - by_acceleration) / unit[None]
-    coupling = jnp.einsum("agi,abij,bhj->gihj", torque_response, _feedback(grid, port_response), shake)
+    torque_response = (force_change if by_acceleration is None else force_change - by_acceleration) / unit[None]
+    coupling = jnp.einsum("agi,abij,bhj->gihj", torque_response, _feedback(grid, port_response), force_change)
     return (own[:, :, None, :] * np.eye(g)[:, None, :, None] + coupling).reshape(g * m, g * m)
 
 
@@ -182,23 +182,23 @@ def _newton(
 ) -> tuple[Array, Array]:
     if is_known:
         return deviation, start
-    on = grid_of(*grid)
-    # At a given load speed the response of the carrier is known, unless it depends on the rotor speed.
+    points = grid_of(*grid)
+    # At a given load speed the response of the carrier is fixed, unless it depends on the rotor speed.
     fixed = given == "omega" and model.linear.mount.gyroscopic is None
-    known = _port_response(model, on, value, start) if fixed else None
+    fixed_response = _port_response(model, points, value, start) if fixed else None
 
     def move(unknowns: tuple[Array, Array], change: Array, length: Array) -> tuple[Array, Array]:
         deviation, x = unknowns
         # A step changes deviations by at most 1 rad and the load speed by at most half, because the linear model is not valid
         # beyond.
-        most = 1.0 / jnp.maximum(jnp.max(jnp.abs(change[:-1])), 1e-300)
+        largest = 1.0 / jnp.maximum(jnp.max(jnp.abs(change[:-1])), 1e-300)
         if given == "rotor_speed":
-            most = jnp.minimum(most, 0.5 * jnp.abs(x / change[-1]))
-        change = jnp.minimum(length, most) * change
+            largest = jnp.minimum(largest, 0.5 * jnp.abs(x / change[-1]))
+        change = jnp.minimum(length, largest) * change
         return deviation + change[:-1].reshape(deviation.shape), x + change[-1]
 
     def linearize(deviation: Array, x: Array) -> Linearized:
-        residual, matrix, scale = _linearize(model, on, given, value, deviation, x, known)
+        residual, matrix, scale = _linearize(model, points, given, value, deviation, x, fixed_response)
         norm = jnp.sqrt(jnp.mean(residual[:-1] ** 2))
         return Linearized(norm, scale, lambda: -solve_in_turn(matrix, residual))
 
@@ -210,28 +210,28 @@ def _newton(
 def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter, is_known: bool):
     model, value, start, deviation = primals
     deviation, x = _newton(model, value, start, deviation, grid=grid, given=given, is_known=is_known)
-    on = grid_of(*grid)
+    points = grid_of(*grid)
 
     def equations(model: JammedBodies, value: Array) -> Array:
         omega, speed = _speed_pair(given, value, x)
-        residual = _balance(model, on, _port_response(model, on, omega, speed), deviation, omega, speed).residual
+        residual = _balance(model, points, _port_response(model, points, omega, speed), deviation, omega, speed).residual
         return _append_mean_condition(residual.ravel())
 
     change = eqx.filter_jvp(equations, (model, value), tangents[:2])[1]
-    change = -jnp.linalg.solve(_linearize(model, on, given, value, deviation, x, None)[1], change)
+    change = -jnp.linalg.solve(_linearize(model, points, given, value, deviation, x, None)[1], change)
     return (deviation, x), (change[:-1].reshape(deviation.shape), change[-1])
 
 
 def _linearize(
-    model: JammedBodies, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
+    model: JammedBodies, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, fixed_response: Array | None
 ) -> tuple[Array, Array, Array]:
     """Return residuals (G M + 1,), their Jacobian, and the scale of the torques in them."""
-    if known is None:
+    if fixed_response is None:
         port_response, by_x = jax.jvp(
             lambda z: _port_response(model, grid, *_speed_pair(given, value, z)), (x,), (jnp.ones_like(x),)
         )
     else:
-        port_response, by_x = known, jnp.zeros_like(known)
+        port_response, by_x = fixed_response, jnp.zeros_like(fixed_response)
 
     def residual(z: Array, port_response: Array) -> tuple[Array, _Balance]:
         balance = _balance(model, grid, port_response, deviation, *_speed_pair(given, value, z))
@@ -386,21 +386,25 @@ def newton(
     """Return the root of the equations that `linearize` evaluates at the unknowns, or the unknowns with the smallest residuals
     if the iteration does not converge.
 
-    **Arguments**: `move(unknowns, change, length)`: the unknowns after at most the fraction `length` of a Newton step; `start`
-    of the unknowns; a `change` of zeros; `one`: the number 1 in the precision of the unknowns.
+    **Arguments**
+
+    - `move(unknowns, change, length)`: returns the unknowns after at most the fraction `length` of the Newton step `change`
+    - `start`: initial unknowns
+    - `change`: zeros with the shape of a Newton step
+    - `one`: the number 1 in the precision of the unknowns
     """
     tiny = 128.0 * jnp.finfo(change.dtype).eps
     no = jnp.asarray(False)
 
     def step(now: _NewtonState) -> _NewtonState:
-        moved = move(now.unknowns, now.change, now.length)
-        norm, scale, solve = linearize(*moved)
+        unknowns = move(now.unknowns, now.change, now.length)
+        norm, scale, solve = linearize(*unknowns)
         # Newton's method squares the reduction of the residuals: if the next step will end below rounding, the residuals after
         # it need no evaluation. The reduction by the first step, from the start, allows no such prediction.
         predicted_converged = (norm * (norm / now.norm) ** 2 < tiny / 16.0 * scale) & (now.steps > 0)
         change = solve()
         done = (norm < tiny * scale) | predicted_converged
-        accepted = _NewtonState(now.steps + 1, moved, norm, scale, change, jnp.minimum(2.0 * now.length, 1.0), done, no)
+        accepted = _NewtonState(now.steps + 1, unknowns, norm, scale, change, jnp.minimum(2.0 * now.length, 1.0), done, no)
         stalled = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(now.change)) | (now.norm < 16.0 * tiny * now.scale)
         rejected = now._replace(steps=now.steps + 1, length=now.length / 4.0, done=stalled, stalled=stalled)
         return jax.tree.map(lambda a, b: jnp.where(norm < now.norm, a, b), accepted, rejected)
