@@ -16,6 +16,10 @@ _BINS = 300
 _MAX_PLAIN_PERIODS = 40
 """Maximum number of periods of a run that is drawn without bands."""
 
+_MAX_BEATS, _SAMPLES_PER_BAND, _MIN_SAMPLES = 20, 10, 1000
+"""Maximum number of beats of an averaged history that is drawn as a curve. A history with more beats is a band between the
+minimum and the maximum of `_SAMPLES_PER_BAND` samples, if it has at least `_MIN_SAMPLES`."""
+
 _SHOWN_PERIODS = 3
 """Number of periods at the end that are drawn as curves."""
 
@@ -246,16 +250,19 @@ def amplitude_histories(
     figure, axes = panels(len(kinds) + 2, size=(7.0, 2.2), share_x="col", ax=ax)
 
     def lines(axis: Axes, values: np.ndarray, places: Sequence[int], labels: Sequence[str | None]) -> None:
+        depth = np.argsort(np.argsort(-np.ptp(values, axis=0)))  # as in `time_histories`
         for k, name in zip(places, labels, strict=True):
-            axis.plot(time, values[:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], label=name)
+            beats = np.count_nonzero(np.diff(np.sign(np.diff(values[:, k])))) / 2.0
+            bins = time.size // _SAMPLES_PER_BAND if beats > _MAX_BEATS and time.size >= _MIN_SAMPLES else time.size
+            _band(axis, time, values[:, k], k, name, bins, depth[k])
 
     for axis, (kind, label, factor) in zip(axes, kinds, strict=False):
         own = [k for k in range(len(names)) if units[k] == kind]
         lines(axis, factor * amplitude, own, [names[k] for k in own])
         axis.set_ylabel(label)
         legend_above(axis, 6)
-    if load_speed.shape[1]:
-        lines(axes[-2], scale * load_speed, range(load_speed.shape[1]), load_names(load_speed.shape[1]))
+    for k, name in _equal_loads(load_speed, load_speed[-(load_speed.shape[0] // 4) :]):
+        lines(axes[-2], scale * load_speed, [k], [name])
     _draw_rotor_speeds(axes[-2], time, scale * rotor_speed)
     signs = [sign for sign in (1.0, -1.0) if np.any(sign * rotor_speed > 0.0)]
     passed = [w for w in resonances if w < np.max(np.abs(rotor_speed), initial=0.0)]
