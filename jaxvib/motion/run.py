@@ -365,13 +365,16 @@ def _histories(trajectory: Trajectory) -> list[np.ndarray]:
     ]
 
 
-def with_separation_status(run: Run) -> Run:
+def with_separation_status(run: Run, *, is_settled: bool = True) -> Run:
     """Return the run with the status `overlapping` if loads with a size are inside each other at its end, with the status
-    `would_separate` if loads stay at nearly one angle although this motion is unstable, otherwise unchanged."""
+    `would_separate` if loads stay at nearly one angle although this motion is unstable, otherwise unchanged.
+
+    The end of a settled run is its measuring window. The end of another run is its last state, which only `overlapping` tests.
+    """
     if status_name(run.status) not in ENDS:
         return run
-    if overlap(run.scene, run.window):
+    if overlap(run.scene, run.window if is_settled else jax.tree.map(lambda leaf: leaf[-1:], run.window)):
         return dataclasses.replace(run, status=member(RunStatus, "overlapping"))
-    if would_separate(run.scene, run.window):
+    if is_settled and would_separate(run.scene, run.window):
         return dataclasses.replace(run, status=member(RunStatus, "would_separate"))
     return run

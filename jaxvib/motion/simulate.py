@@ -136,7 +136,7 @@ def simulate(
         prepare_run(plan_from(start="rest", mode=None, separation=None))
     plan = plan_from(start=start, mode=mode, separation=separation)
     run = run_planned(plan, throw=throw)
-    return with_separation_status(run) if plan.is_known and float(run.drift) < SETTLED_DRIFT else run
+    return with_separation_status(run, is_settled=float(run.drift) < SETTLED_DRIFT) if plan.is_known else run
 
 
 def run_planned(plan: RunPlan, *, throw: bool) -> Run:

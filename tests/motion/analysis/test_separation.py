@@ -51,6 +51,13 @@ def test_sized_loads_inside_each_other_need_contact():
     assert bool(jv.settle(at_speed(s), separation=0.0).status == jv.RunStatus.overlapping)
 
 
+def test_unsettled_runs_that_end_inside_each_other_say_so():
+    """The loads start in contact, gather while the rotor runs up, and still move to balance it after 10 s."""
+    run = jv.simulate(three_balls(ball_radius=0.011), 10.0, save="window", estimate=False)
+    assert float(run.drift) > 0.1 and run.status_name == "overlapping" and bool(run.finished) and not bool(run.settled)
+    assert run.summary().startswith("not settled: loads are inside each other") and "run longer" not in run.summary()
+
+
 def test_loads_that_passed_each_other_are_in_the_summary():
     angle = np.zeros((3, 3)) + np.array([[0.0, 1.0, 2.0], [0.0, 2.0, 1.9], [2.0 * np.pi, 2.0, 1.0]])
     s = three_balls(ball_radius=0.011)
