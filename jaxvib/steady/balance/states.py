@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -88,7 +88,7 @@ class BalancedStates(Result):
         return balanced_stability(self.scene, self._angles_of(arrangement), steps=steps)
 
     @validated
-    def growth(self, speeds: Numbers | ArrayLike, arrangement: int = 0, *, steps: int | None = None) -> np.ndarray:
+    def growth(self, speeds: Numbers, arrangement: int = 0, *, steps: int | None = None) -> np.ndarray:
         """Return the growth rate of deviations from an arrangement at rotor speeds, 1/s: stable if negative, see
         `balanced_growth`.
 
@@ -400,9 +400,7 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     return BalancedStability(is_decided and growth < 0.0, is_decided, growth, fine[order], neutral, error)
 
 
-def balanced_growth(
-    scene: Scene, speeds: Numbers | ArrayLike, angles: ArrayLike | None = None, *, steps: int | None = None
-) -> np.ndarray:
+def balanced_growth(scene: Scene, speeds: Numbers, angles: ArrayLike | None = None, *, steps: int | None = None) -> np.ndarray:
     """Return the growth rate of deviations from the balanced motion at many rotor speeds, 1/s: stable if negative.
 
     **Arguments**
@@ -420,13 +418,15 @@ def balanced_growth(
     array([False,  True])
     """
     angles, neutral = _arrangement(scene, angles)
-    named = isinstance(speeds, str) or (isinstance(speeds, (list, tuple)) and any(isinstance(each, str) for each in speeds))
-    values = numbers(cast(Numbers, speeds), "rad/s", "speeds", None) if named else cast(ArrayLike, speeds)
-    flat = np.ravel(np.asarray(values, dtype=float))
+    shape = np.shape(speeds) if isinstance(speeds, (np.ndarray, jax.Array)) else None
+    if shape is not None and 0 in shape:
+        return np.zeros(shape)
+    values = np.asarray(numbers(speeds if shape is None else np.ravel(speeds), "rad/s", "speeds", None), dtype=float)
+    flat = np.ravel(values)
     # Speeds are padded to whole batches, so that few shapes are compiled.
     padded = np.pad(flat, (0, -flat.size % BATCH), mode="edge")
     flows = monodromies(at_constant_speed(scene), angles, padded, validate_steps(scene, flat, steps))[: flat.size]
-    return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(values))
+    return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(values.shape if shape is None else shape)
 
 
 def balanced_intervals(

@@ -76,3 +76,31 @@ def test_balance_of_a_machine_free_to_drift_is_refused():
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.2, radius=0.1, drag=0.2), jv.ConstantSpeed(60.0))
     with pytest.raises(jv.InputError, match=r"^machine\.stiffness lets the machine drift"):
         states.balanced_stability(scene)
+
+
+@pytest.mark.parametrize(
+    "speeds",
+    [
+        None,
+        set(),
+        [True],
+        [1j],
+        b"12",
+        "x",
+        ["x"],
+        [[20.0]],
+        [10**400],
+        range(10**9),
+        np.array(["x"]),
+        np.ma.array([1.0], mask=[True]),
+    ],
+    ids=lambda speeds: str(speeds)[:20],
+)
+def test_speeds_of_growth_rates_are_numbers(speeds):
+    scene = jv.Scene(
+        jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+        jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0),
+        jv.ConstantSpeed(40.0),
+    )
+    with pytest.raises(jv.InputError, match=r"^speeds"):
+        jv.balanced_states(scene).growth(speeds)
