@@ -138,7 +138,7 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
     """Yield sentences about vibrations that are not at the speed of the rotor: in the residuals, or in the readings if there is
     no fit."""
     problem = fitted.problem
-    if len(problem.unbalances) > 1:
+    if len(problem.unbalances) > 1 or (problem.has_loads and not has_fit):  # readings of jammed loads are never at that speed
         return
     for k, (samples, raw, mask, residuals) in enumerate(
         zip(problem.runs, problem.raw, problem.masks, fitted.residuals, strict=True)

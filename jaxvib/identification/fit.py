@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.identification.jammed.motion import closed_motion, motion_cost, motion_equations
+from jaxvib.identification.jammed.motion import closed_motion, motion_columns, motion_differences
 from jaxvib.identification.problem import Problem, channel_sizes, with_angle_errors, with_noise
 from jaxvib.identification.response import linear_equations, model_readings, normal_equations, state_count
 from jaxvib.numerics.noise import Noise, noise_of
@@ -28,6 +28,10 @@ _NEAR_REDUCTION = 0.1
 
 _VALLEY_STEPS = 3
 """Number of undamped steps after the first one."""
+
+_PROBE, _LONGEST_CORRECTION = 0.1, 0.75
+"""Share of a step for the difference that gives the second derivative of the model, and the largest length of the correction
+relative to the step."""
 
 _CONVERGED = 1e-2
 """Length of the next undamped step, in standard errors, below which the fit has converged."""
@@ -162,9 +166,7 @@ def _with_loads(problem: Problem, x: np.ndarray, linear: np.ndarray) -> _Trial:
     """Return the unknowns of a motion with loads, and their cost."""
     cost = known_cost(problem, x, linear)
     for samples, place in zip(problem.runs, linear_places(problem), strict=True):
-        own = linear[place]
-        readings, _ = closed_motion(problem.unknowns, samples, problem.scene, x, own)
-        cost += motion_cost(samples, readings, own[-len(samples.channels) :])
+        cost += float(np.sum(motion_differences(problem.unknowns, samples, problem.scene, x, linear[place]) ** 2))
     return _Trial(x, linear, cost if np.isfinite(cost) else np.inf)
 
 
@@ -194,15 +196,24 @@ def linear_at(problem: Problem, x: np.ndarray, unbalance: np.ndarray | None) -> 
 
 def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
     """Return the normal equations (p + L + 1, p + L + 1) of each run: of all unknowns and the residuals."""
+    if problem.has_loads:
+        return [columns.T @ columns for columns in _columns_with_loads(problem, x, linear)]
     p, size, of_runs = x.size, x.size + linear.size, []
     for samples, place in zip(problem.runs, linear_places(problem), strict=True):
         parts = problem.unknowns, samples, problem.scene
-        if problem.has_loads:
-            equations = motion_equations(*parts, x, linear[place])
-        else:
-            equations = np.asarray(normal_equations(*parts, jnp.asarray(x), jnp.asarray(linear[place])))
         where, total = np.concatenate([np.arange(p), p + place, [size]]), np.zeros((size + 1, size + 1))
-        total[np.ix_(where, where)] = equations
+        total[np.ix_(where, where)] = normal_equations(*parts, jnp.asarray(x), jnp.asarray(linear[place]))
+        of_runs.append(total)
+    return of_runs
+
+
+def _columns_with_loads(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
+    """Return the columns (n C, p + L + 1) of each run: derivatives with respect to all unknowns, and the residuals."""
+    p, size, of_runs = x.size, x.size + linear.size, []
+    for samples, place in zip(problem.runs, linear_places(problem), strict=True):
+        columns = motion_columns(problem.unknowns, samples, problem.scene, x, linear[place])
+        total = np.zeros((len(columns), size + 1))
+        total[:, np.concatenate([np.arange(p), p + place, [size]])] = columns
         of_runs.append(total)
     return of_runs
 
@@ -222,26 +233,56 @@ def prior_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> tupl
 
 def joint_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> Equations:
     """Return the information of the data, that of known values, both (p + L, p + L), and the gradient (p + L,)."""
-    total = np.sum(run_equations(problem, x, linear), axis=0)
+    return _joined(problem, x, linear, np.sum(run_equations(problem, x, linear), axis=0))
+
+
+def _joined(problem: Problem, x: np.ndarray, linear: np.ndarray, total: np.ndarray) -> Equations:
+    """Return the normal equations `total` of all runs with those of the known values, as `joint_equations`."""
     prior, gradient = prior_equations(problem, x, linear)
     return total[:-1, :-1], prior, total[:-1, -1] + gradient
 
 
 def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
     """Return the minimum near `x`, the information of data and of known values there, and True if it was reached."""
+    if problem.has_loads:
+        return _minimize_with_loads(problem, x)
 
     def equations(trial: _Trial) -> Equations:
         return joint_equations(problem, trial.x, trial.linear)
 
     def stepped(trial: _Trial, step: np.ndarray) -> _Trial:
-        step = limited_step(problem, step)
-        if problem.has_loads:
-            return _with_loads(problem, trial.x + step[: x.size], trial.linear + step[x.size :])
-        return project(problem, trial.x + step[: x.size])
+        return project(problem, trial.x + limited_step(problem, step)[: x.size])
 
     start = project(problem, x)
-    damped = x.size + start.linear.size * problem.has_loads
-    best, (information, prior, _), converged = descend(start, equations, stepped, damped, positive_places(problem))
+    best, (information, prior, _), converged = descend(start, equations, stepped, x.size, positive_places(problem))
+    return best, information, prior, converged
+
+
+def _minimize_with_loads(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
+    """Return the same as `minimize` for a motion with loads, in which no unknown is linear."""
+    p, columns = x.size, np.zeros((0, 0))
+
+    def equations(trial: _Trial) -> Equations:
+        nonlocal columns
+        columns = np.concatenate(_columns_with_loads(problem, trial.x, trial.linear))
+        return _joined(problem, trial.x, trial.linear, columns.T @ columns)
+
+    def stepped(trial: _Trial, step: np.ndarray) -> _Trial:
+        step = limited_step(problem, step)
+        return _with_loads(problem, trial.x + step[:p], trial.linear + step[p:])
+
+    def bend(trial: _Trial, step: np.ndarray) -> np.ndarray:
+        new, linear = trial.x + step[:p], trial.linear + step[p:]
+        left = [
+            motion_differences(problem.unknowns, samples, problem.scene, new, linear[place])
+            for samples, place in zip(problem.runs, linear_places(problem), strict=True)
+        ]
+        slopes = columns[:, :-1]
+        return slopes.T @ (np.concatenate(left) - columns[:, -1] + slopes @ step)
+
+    start = project(problem, x)
+    count = p + start.linear.size
+    best, (information, prior, _), converged = descend(start, equations, stepped, count, positive_places(problem), bend)
     return best, information, prior, converged
 
 
@@ -256,15 +297,22 @@ def descend(
     stepped: Callable[[Any, np.ndarray], Any],
     damped_count: int,
     positive: np.ndarray,
+    bend: Callable[[Any, np.ndarray], np.ndarray] | None = None,
 ) -> tuple[Any, Equations, bool]:
     """Return the minimum near a trial, its equations, and True if it was reached.
+
+    With `bend`, each damped step is corrected for the second derivative of the model along it. In a curved valley of the cost,
+    such steps are much longer than those of the linearized model.
 
     A number that runs to 0 stays at a value that the data do not distinguish from 0. With its logarithm as the unknown, the
     expected reduction of the cost would remain the same at every smaller value, and the descent would never end.
 
     **Arguments**: the first trial `best`, with its `cost`; `equations`: returns the equations of a trial; `stepped`: returns
     the trial after a step; `damped_count`: number of the first unknowns, whose steps are damped; `positive`: places of the
-    positive numbers.
+    positive numbers; `bend`: returns for a trial and a step the product J^T (differences after the step - differences
+    + J step), where J are the derivatives of the model at the trial whose `equations` were computed last.
+
+    Source of the correction: Transtrum, Sethna 2012, arXiv 1201.5885 (geodesic acceleration).
     """
     damping, places = 1e-2, np.arange(damped_count)
     for _ in range(_MAX_ITERATIONS):
@@ -275,7 +323,7 @@ def descend(
         undamped = _undamped(matrix, gradient)
         if gradient @ undamped < _CONVERGED**2:
             return best, current, True
-        if gradient @ undamped < _NEAR_REDUCTION * best.cost:
+        if bend is None and gradient @ undamped < _NEAR_REDUCTION * best.cost:
             trial = _follow_valley(stepped(best, undamped), equations, stepped, positive)
             if trial.cost < best.cost:
                 best = trial
@@ -283,14 +331,29 @@ def descend(
         while True:
             damped, size = matrix.copy(), np.diagonal(matrix)[places]
             damped[places, places] += damping * (size + 1e-12 * np.max(size))
-            trial = stepped(best, solved(damped, gradient))
+            step = _damped_step(best, damped, gradient, bend)
+            trial = best if step is None else stepped(best, step)
             if trial.cost < best.cost:
-                best, damping = trial, max(0.1 * damping, 1e-9)
+                best, damping = trial, max(0.1 * damping, 1e-12)
                 break
             damping *= 8.0
             if damping > 1e6:
                 return best, current, bool(gradient @ undamped < 100.0 * _CONVERGED**2)
     return best, equations(best), False
+
+
+def _damped_step(
+    best: Any, damped: np.ndarray, gradient: np.ndarray, bend: Callable[[Any, np.ndarray], np.ndarray] | None
+) -> np.ndarray | None:
+    """Return a damped step with its second-order correction; None if the correction is longer than three quarters of the step,
+    in multiples of the scale of each unknown."""
+    step = solved(damped, gradient)
+    if bend is None:
+        return step
+    correction = solved(damped, bend(best, _PROBE * step)) / _PROBE**2
+    size = np.sqrt(np.diagonal(damped))
+    is_short = np.linalg.norm(size * correction) < _LONGEST_CORRECTION * np.linalg.norm(size * step)
+    return step + correction if is_short else None
 
 
 def _without_vanished(equations: Equations, positive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -243,6 +243,9 @@ def test_foreign_vibration_in_words(monkeypatch, fits, share, order, size, words
     assert (found == []) == (words == "") and all(words in each for each in found)
     problem.unbalances = (None, None)
     assert list(checks._foreign_vibrations(fitted, fits)) == []
+    problem.unbalances, problem.has_loads = (None,), True  # loads vibrate at other speeds than the rotor
+    found = list(checks._foreign_vibrations(fitted, fits))
+    assert (found == []) == (words == "" or not fits) and all("the motion of the loads is not that" in each for each in found)
 
 
 def test_runs_are_compared_at_their_common_minimum(monkeypatch):

@@ -239,23 +239,22 @@ def closed_motion(
     return readings[0] + own[count + 2 :], states[0, ::length]
 
 
-def motion_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return Z^T Z like `normal_equations`. The columns of Z are the derivatives with respect to x and `own`, and readings
-    minus model."""
+def motion_columns(unknowns: Unknowns, samples: Samples, scene: Scene, x: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Return Z (n C, p + size of `own` + 1): weighted derivatives of the model with respect to x and `own`, and weighted
+    readings minus model. Z^T Z is the matrix of `normal_equations`."""
     at = linearized(unknowns, samples, scene, x, own, closed_motion(unknowns, samples, scene, x, own)[1])
-    return products(samples, at, at.columns[:, :, :-1])
+    return weighted_columns(samples, at, at.columns[:, :, :-1])
 
 
-def products(samples: Samples, at: Linearized, columns: np.ndarray) -> np.ndarray:
-    """Return Z^T Z, where Z contains `columns` and the differences, readings minus model, all multiplied by the weights."""
+def weighted_columns(samples: Samples, at: Linearized, columns: np.ndarray) -> np.ndarray:
+    """Return Z, which contains `columns` and the differences, readings minus model, all multiplied by the weights."""
     weights = np.asarray(samples.weights).reshape(-1, at.model.shape[1])[: len(at.model)]
     z = np.concatenate([columns * weights[:, :, None], weighted(samples, at.model)[:, :, None]], axis=2)
-    z = z.reshape(-1, z.shape[2])
-    return z.T @ z
+    return z.reshape(-1, z.shape[2])
 
 
-def motion_cost(samples: Samples, readings: np.ndarray, offsets: np.ndarray) -> float:
-    """Return the sum of the squared weighted differences between the record and `readings`, the readings of a model before the
-    filter, with their `offsets`."""
-    level = np.sum(np.asarray(samples.taps), axis=0)
-    return float(np.sum(weighted(samples, _filtered(samples, readings - offsets) + level * offsets) ** 2))
+def motion_differences(unknowns: Unknowns, samples: Samples, scene: Scene, x: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Return the weighted differences (n C,), readings minus model, of the motion without gaps."""
+    offsets, level = own[-len(samples.channels) :], np.sum(np.asarray(samples.taps), axis=0)
+    readings, _ = closed_motion(unknowns, samples, scene, x, own)
+    return weighted(samples, _filtered(samples, readings - offsets) + level * offsets).ravel()

@@ -29,7 +29,7 @@ from jaxvib.identification.fit import (
     project,
     unknown_count,
 )
-from jaxvib.identification.jammed.motion import linearized, products
+from jaxvib.identification.jammed.motion import linearized, weighted_columns
 from jaxvib.identification.problem import Problem, channel_sizes, with_noise
 from jaxvib.identification.response import Unknowns, model_states
 from jaxvib.machine.loads import CircularLoads
@@ -222,7 +222,8 @@ def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.
         for samples, place, own in zip(problem.runs, places, starts, strict=True):
             at = linearized(problem.unknowns, samples, problem.scene, x, linear[place], own)
             where = np.concatenate([np.arange(p), p + place, [size, size + 1]])
-            total[np.ix_(where, where)] += products(samples, at, at.columns)
+            columns = weighted_columns(samples, at, at.columns)
+            total[np.ix_(where, where)] += columns.T @ columns
             total[size:, size:] += np.sum((at.gaps / (_GAP_SIZE * scale)) ** 2)  # the last unknown is 1 for closed gaps
             start_changes.append(at.start_changes)
         prior[:size, :size], gradient[:size] = prior_equations(problem, x, linear)

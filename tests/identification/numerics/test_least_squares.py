@@ -294,3 +294,31 @@ def test_largest_change_of_the_noise():
     clipped = problem_with()._replace(bounds=(np.zeros((N, 2)), np.ones((N, 2))))
     cases = [(problem_with(), noise(1.0)), (problem_with(), heavy), (clipped, noise(1.0))]
     assert [fit._has_scores(*case) for case in cases] == [False, True, True]
+
+
+def test_corrected_steps_follow_a_curved_valley():
+    """Readings minus model are 1 - x and 100 (x^2 - y), from (3, 9): the valley y = x^2 has sides 1e4 times as steep as its
+    floor. Without the correction the limit of 40 steps is reached near (1.9, 3.4)."""
+    formed = []
+
+    def differences(x):
+        return np.array([1.0 - x[0], 100.0 * (x[0] ** 2 - x[1])])
+
+    def trial(x):
+        return SimpleNamespace(x=x, cost=float(np.sum(differences(x) ** 2)))
+
+    def slopes(x):
+        return np.array([[1.0, 0.0], [-200.0 * x[0], 100.0]])
+
+    def equations(at):
+        formed.append(at)
+        return slopes(at.x).T @ slopes(at.x), np.zeros((2, 2)), slopes(at.x).T @ differences(at.x)
+
+    def bend(at, step):
+        return slopes(at.x).T @ (differences(at.x + step) - differences(at.x) + slopes(at.x) @ step)
+
+    best, _, converged = fit.descend(
+        trial(np.array([3.0, 9.0])), equations, lambda at, step: trial(at.x + step), 2, np.zeros(0, int), bend
+    )
+    assert converged and len(formed) <= 15
+    np.testing.assert_allclose(best.x, 1.0, atol=1e-2)
