@@ -28,6 +28,7 @@ CASES = {
     "one pulse per turn, times rounded to 1 ms": {"pulses": 1, "resolution": 1e-3},
     "readings clipped at 60 % of the largest": {"full_scale": 0.6},
     "two jammed balls and an unbalance": {"balls": True},
+    "two jammed balls and an unbalance, without a knock": {"balls": True, "knock": 0.0},
 }
 """Options of `record` by the name of a case; `motor`: run-up of a motor in place of the prescribed speed; `balls`: records of
 `repeated_records.jammed`."""
@@ -111,7 +112,7 @@ def repeated(count, seed=0, motor=False, balls=False, **options):
         relative.append(found[0] / true - 1.0)
         statuses.append(fit.status_name)
         order = fit.names
-    least = jammed.bound(order, JAMMED_NOISE) if balls else _bound(turning, **options)
+    least = jammed.bound(order, JAMMED_NOISE, **options) if balls else _bound(turning, **options)
     return Repeated(np.array(away), np.array(relative), least, np.array(statuses))
 
 
