@@ -28,7 +28,7 @@ CASES = {
     "one pulse per turn, times rounded to 1 ms": {"pulses": 1, "resolution": 1e-3},
     "readings clipped at 60 % of the largest": {"full_scale": 0.6},
     "two jammed balls and an unbalance": {"balls": True},
-    "two jammed balls and an unbalance, without a knock": {"balls": True, "knock": 0.0},
+    "two jammed balls and an unbalance, without an impact": {"balls": True, "impact": 0.0},
 }
 """Options of `record` by the name of a case; `motor`: run-up of a motor in place of the prescribed speed; `balls`: records of
 `repeated_records.jammed`."""

@@ -37,15 +37,15 @@ def _rates(t, y, numbers, phase):
     return np.stack([v1, v2, (-k1 * x1 - c1 * v1 - link) / m1, a2, rate, (pull - moment * np.cos(angle) * a2) / inertia])
 
 
-def first_state(knock=0.1):
-    """Return the state at the start of the record: a steady vibration of both masses by the balls, and a knock on both, which
-    changes their velocities by `knock`."""
+def first_state(impact=0.1):
+    """Return the state at the start of the record: a steady vibration of both masses by the balls, and an impact on both, which
+    changes their velocities by `impact`."""
     m1, m2, k1, k2, c1, c2, k, c, _, m, _ = TRUTH.values()
     w, angle = 62.1, 0.3
     mass, stiffness, damping = np.diag([m1, m2 + 2.0 * m]), [[k1 + k, -k], [-k, k2 + k]], [[c1 + c, -c], [-c, c2 + c]]
     steady = np.linalg.solve(stiffness - w**2 * mass + 1j * w * np.array(damping), [0.0, 2.0 * m * RADIUS * w**2])
     steady = steady * np.exp(1j * angle)
-    return np.array([*steady.imag, *(w * steady.real + knock), angle, w])
+    return np.array([*steady.imag, *(w * steady.real + impact), angle, w])
 
 
 def accelerations(numbers, starts, phases):
@@ -62,25 +62,25 @@ def accelerations(numbers, starts, phases):
 
 
 @functools.cache
-def clean(knock=0.1):
+def clean(impact=0.1):
     """Return the accelerations (n, 2) without noise."""
-    return accelerations([TRUTH], [first_state(knock)], [PHASE])[0]
+    return accelerations([TRUTH], [first_state(impact)], [PHASE])[0]
 
 
-def bound(names, noise, knock=0.1):
+def bound(names, noise, impact=0.1):
     """Return the Cramer-Rao bound of the relative standard errors of `names`; states, offsets and phase are free."""
     step, numbers, starts, phases = 1e-5, [], [], []
     for sign in (1.0, -1.0):
         for name in names:
             numbers.append(TRUTH | {name: TRUTH[name] * (1.0 + sign * step)})
-            starts.append(first_state(knock))
+            starts.append(first_state(impact))
             phases.append(PHASE)
         for k in range(STATES):
             numbers.append(TRUTH)
-            starts.append(first_state(knock) + sign * step * np.eye(STATES)[k])
+            starts.append(first_state(impact) + sign * step * np.eye(STATES)[k])
             phases.append(PHASE)
         numbers.append(TRUTH)
-        starts.append(first_state(knock))
+        starts.append(first_state(impact))
         phases.append(PHASE + sign * step)
     high, low = np.split(accelerations(numbers, starts, phases), 2)
     columns = [*((high - low) / (2.0 * step)), *np.repeat(np.eye(2)[:, None], TIMES.size, axis=1)]
@@ -102,6 +102,6 @@ def scene_of(numbers):
     return jv.Scene(machine, exciters=[jv.Exciter(balls, motor, unbalance=numbers["exciters[0].unbalance"], at=2)])
 
 
-def jammed_record(noise, rng, knock=0.1, **options):
+def jammed_record(noise, rng, impact=0.1, **options):
     """Return a record of both accelerometers and the tachometer."""
-    return record(TIMES, clean(knock), noise, rng, turning=turning, **options)
+    return record(TIMES, clean(impact), noise, rng, turning=turning, **options)
