@@ -34,7 +34,7 @@ def campbell_diagram(
     - `rotor_speed` (ns,), `speed` (ns, nd): rotor speed and whirl speeds, rad/s, drawn in `unit`
     - `sense` (ns, nd): "forward", "backward" or "straight"
     - `critical`: critical speeds (k,), rad/s, and their senses (k,), marked on the line w = n with their values
-    - `at`: operating speed, rad/s
+    - `at`: operating speed, rad/s; default: a single rotor speed
 
     >>> import numpy as np
     >>> n = np.linspace(0.0, 2.0, 5)
@@ -47,6 +47,7 @@ def campbell_diagram(
         for k, values in enumerate(whirl_lines(speed, sense == word)):
             alone = {"marker": "o", "ms": 4.0} if len(rotor_speed) == 1 else {}
             axis.plot(scale * rotor_speed, scale * values, ls=line, color=color, label=None if k else label, **alone)
+    at = float(rotor_speed[0]) if at is None and len(rotor_speed) == 1 else at
     found = np.zeros(0) if critical is None else critical[0][np.isfinite(critical[0])]
     right = scale * max(float(np.max(rotor_speed)), 0.0 if at is None else 1.05 * at)
     top = 1.12 * scale * max(float(np.nanmax(speed)), *(w for w in found if scale * w <= right), 1e-300)
