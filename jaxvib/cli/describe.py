@@ -33,6 +33,7 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
         groups = {word: list(kinds) for word, kinds in GROUPS.items()}
         output.done({"groups": groups}, lambda: "\n".join(f"{g}: {', '.join(k)}" for g, k in groups.items()), "describe")
         return
+    group, name = group.replace("-", "_"), name and name.replace("-", "_")  # two-mass, as in `jaxvib new two-mass`
     if group not in GROUPS and name is None:
         group_of_part = next((each for each, kinds in GROUPS.items() if group in kinds), None)
         if group_of_part is None:

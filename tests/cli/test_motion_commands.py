@@ -217,6 +217,7 @@ def test_describe(typed):
     assert reaction["allowed"] == ["exact", "run_up", "steady"] and reaction["default"] == "exact" and not reaction["needed"]
     code, out, _ = typed("describe", "drives", "dc_motor")
     assert code == 0 and "stall_torque" in out and "N m" in out and "**Arguments**" in out
+    assert typed("describe", "three-mass") == typed("describe", "three_mass")
     code, out, _ = typed("describe", "three_mass")
     assert code == 0 and "link_stiffness: N/m; needed; at least 0\n      (3,) of the links 1-2, 1-3, 2-3, N/m" in out
     assert max(map(len, typed("describe", "machines")[1].splitlines())) <= 80
