@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -71,7 +73,7 @@ def _has_values(tree: eqx.Module) -> bool:
     return True
 
 
-def _entries(array: np.ndarray, text: object) -> str:
+def _entries(array: np.ndarray, text: Callable[[Any], str]) -> str:
     if array.ndim == 0:
         return text(array.item())
     return ", ".join(_entries(each, text) if each.ndim == 0 else f"[{_entries(each, text)}]" for each in array)
@@ -82,7 +84,7 @@ def _lines(tree: eqx.Module) -> list[str]:
     lines = []
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name, None)
-        trees = list(value) if isinstance(value, (tuple, list)) else [value]
+        trees: Sequence[Any] = list(value) if isinstance(value, (tuple, list)) else [value]
         if value is None or not trees:
             continue
         if all(isinstance(each, Readable) for each in trees):
