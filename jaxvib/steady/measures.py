@@ -288,10 +288,10 @@ def vibration_measures(
     shaft: 0.2969 N m, 12.43 W
     """
     scene = validate_scene(scene)
-    on = scene.machine.require_body(body)
+    deck = scene.machine.require_body(body)
     has_list = isinstance(at, (list, tuple)) and len(at) > 0 and all(isinstance(each, (list, tuple)) for each in at)
     points = cast("Sequence[Sequence[Number]]", at) if has_list else [cast("Sequence[Number] | None", at)]
-    places = tuple(on_body(read_place(point, "at"), on) for point in points)
+    places = tuple(on_body(read_place(point, "at"), deck) for point in points)
     if isinstance(motion, Jam):
         motion = _vibration_of(scene, motion.omega, motion.displacement, motion.foundation_force)
     elif isinstance(motion, PhaseJam):
@@ -362,8 +362,8 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
 def _measures_at(scene: Scene, motion: Vibration, place: Place, slope: Array) -> dict[str, Array]:
     """Return the measures of a point of a body in a plane by the names of their fields."""
     w = jnp.abs(motion.speed)
-    moved = rows_in_plane(scene.machine, place) @ motion.displacement
-    path = ellipse_at(moved, w, slope, jnp.zeros_like(w))
+    amplitude = rows_in_plane(scene.machine, place) @ motion.displacement
+    path = ellipse_at(amplitude, w, slope, jnp.zeros_like(w))
     at = place.at if isinstance(place, BodyPoint) else place
     return {
         "point": jnp.zeros(2, motion.amplitude.dtype) if at is None else jnp.asarray(at, motion.amplitude.dtype),
@@ -371,7 +371,7 @@ def _measures_at(scene: Scene, motion: Vibration, place: Place, slope: Array) ->
         "point_acceleration": path.acceleration,
         "throw_angle": path.direction,
         "throw_number": path.throw_number,
-        "conveying_speed": conveying_speed_at(moved, w, slope),
+        "conveying_speed": conveying_speed_at(amplitude, w, slope),
     }
 
 
@@ -515,12 +515,12 @@ def conveying_speed_at(amplitude: Array, w: Array, slope: Array) -> Array:
     lands = height(full) <= 0.0
     flight = bracketed_root(height, jnp.asarray(1e-3, g.dtype), jnp.where(lands, full, 4.0 * full))
     # The phase of `normal` is zero at its highest point.
-    turned = along * jnp.where(flies, jnp.conj(normal), 1.0) / jnp.where(flies, size, 1.0)
+    relative_to_normal = along * jnp.where(flies, jnp.conj(normal), 1.0) / jnp.where(flies, size, 1.0)
 
     def path(phase: Array) -> Array:
-        return (turned * jnp.exp(1j * phase)).real
+        return (relative_to_normal * jnp.exp(1j * phase)).real
 
-    rate = w * (1j * turned * jnp.exp(1j * begin)).real
+    rate = w * (1j * relative_to_normal * jnp.exp(1j * begin)).real
     time = flight / w
     step = rate * time - (path(begin + flight) - path(begin)) - STANDARD_GRAVITY * jnp.sin(slope) * time**2 / 2.0
     speed = w / (2.0 * np.pi) * step

@@ -41,8 +41,8 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
     target = jax.lax.stop_gradient(speed)
 
     def gap(w: Array) -> Array:
-        torque = rotor_speed_at(frozen, w) - w
-        return jax.lax.rsqrt(jnp.maximum(torque, 1e-300)) - jax.lax.rsqrt(target - w)
+        slip = rotor_speed_at(frozen, w) - w
+        return jax.lax.rsqrt(jnp.maximum(slip, 1e-300)) - jax.lax.rsqrt(target - w)
 
     omega = _newton(gap, near, target)
     reached, slope = jax.jvp(lambda w: rotor_speed_at(frozen, w), (omega,), (jnp.ones_like(omega),))
@@ -75,13 +75,13 @@ def follow_fold(model: JammedModel, near: Array) -> tuple[Array, Array]:
     return omega, rotor_speed_at(model, omega)
 
 
-def _newton(f: Callable[[Array], Array], start: Array, most: Array) -> Array:
-    """Return a root of `f` by Newton's method with steps of at most a tenth of the unknown, which stays below `most`."""
+def _newton(f: Callable[[Array], Array], start: Array, upper: Array) -> Array:
+    """Return a root of `f` by Newton's method. The unknown stays below `upper`, and no step changes it by more than a tenth."""
 
     def step(_: int, w: Array) -> Array:
         value, slope = jax.jvp(f, (w,), (jnp.ones_like(w),))
         limit = 0.1 * w
         new = w - jnp.clip(jnp.nan_to_num(value / slope), -limit, limit)
-        return jnp.where(new < most, new, 0.5 * (w + most))
+        return jnp.where(new < upper, new, 0.5 * (w + upper))
 
     return jax.lax.stop_gradient(jax.lax.fori_loop(0, _NEWTON_STEPS, step, jax.lax.stop_gradient(start)))

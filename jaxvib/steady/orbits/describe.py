@@ -60,7 +60,7 @@ class Orbit(Result):
     - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, (max - min)/2 over the period. For two
       directions of the force: root of the summed squares of their peaks (sqrt 2 times the force of a circular whirl)
     - `power`, W: mean power that the loads take from the rotor, by drag and dry friction
-    - `stable`: True if small deviations of the loads from this motion decay, that is `multiplier` < 1
+    - `stable`: True if small deviations of the loads from this motion decay (`multiplier` < 1) and the loads do not separate
     - `multiplier`: largest modulus of the non-trivial Floquet multipliers
     - `multipliers`: all Floquet multipliers, complex; those of loads that separate from each other are the last ones
     - `trivial`: computed value of the multiplier of a shift in time, which is exactly 1
@@ -190,19 +190,23 @@ def plot_period(
         return np.real(np.asarray(harmonics) @ np.exp(1j * np.asarray(orders)[:, None] * theta)).T
 
     deviation_orders, angles, title, one, alone = deviation
-    motion, turned, forces = signal(displacement, orders), np.rad2deg(signal(angles, deviation_orders)), signal(force, orders)
+    motion, angles_in_degrees, forces = (
+        signal(displacement, orders),
+        np.rad2deg(signal(angles, deviation_orders)),
+        signal(force, orders),
+    )
     names, units = named
     length, factor = length_unit(motion[:, np.asarray(units) == "m"])
     shown, factors = {"m": length, "rad": "mrad"}, {"m": factor, "rad": 1e3}
     labels = [f"{name}, {shown[unit]}" if len(set(units)) > 1 else name for name, unit in zip(names, units, strict=True)]
-    numbered = [f"{one} {k + 1}" for k in range(turned.shape[1])]
+    numbered = [f"{one} {k + 1}" for k in range(angles_in_degrees.shape[1])]
     panels = [
         (
             f"displacement, {' or '.join(shown[unit] for unit in dict.fromkeys(units))}",
             motion * [factors[unit] for unit in units],
             labels,
         ),
-        (title, turned, numbered if len(numbered) > 1 else [alone]),
+        (title, angles_in_degrees, numbered if len(numbered) > 1 else [alone]),
         ("foundation force, N", forces, ["across", "up"][-forces.shape[1] :]),
     ]
     return signals_chart(np.rad2deg(theta), panels, x_label="load angle Ωt, degrees", ax=ax)
@@ -258,7 +262,7 @@ def orbits(
     """
     grid = grid_of(points, model.half_turn)
     motion, harmonics, measured = _solve_each(model, grid, given, (value, start, deviation))
-    # Steps of twice the phase have errors of 1e-8.
+    # Steps of twice the length that `steps_for` chooses have errors of 1e-8.
     resolved = jnp.asarray(steps) <= (_MAX_INTEGRATION_STEPS if max_steps is None else 2 * max_steps)
     limited = jnp.where(resolved, steps if max_steps is None else jnp.minimum(steps, max_steps), 1)
     growth = floquet(model, grid, motion, harmonics, limited, implicit=implicit, max_steps=max_steps)

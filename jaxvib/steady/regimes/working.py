@@ -94,8 +94,8 @@ def _working(scene: Scene) -> SynchronousRegime:
     numbers = fields_at(balance, *_stable_solution(jax.lax.stop_gradient(balance)))
     stable = numbers["stable"]
     status = RegimeStatus.where(stable, numbers["status"], RegimeStatus.none_stable)
-    kept = {**without_numbers(stable, numbers), "status": status, "can_start": numbers["can_start"]}
-    return SynchronousRegime(**kept, scene=scene)
+    fields = {**without_numbers(stable, numbers), "status": status, "can_start": numbers["can_start"]}
+    return SynchronousRegime(**fields, scene=scene)
 
 
 def _stable_solution(balance: TorqueBalance) -> tuple[Array, Slopes | None, Array | None]:
@@ -118,21 +118,21 @@ def _stable_solution(balance: TorqueBalance) -> tuple[Array, Slopes | None, Arra
     group = jnp.floor((1.0 - omega / jnp.max(omega, initial=jnp.finfo(omega.dtype).tiny)) / _SAME_SPEED)
     order = jnp.lexsort((potential, group))
 
-    def judged(k: Array) -> tuple[Array, Slopes, Array]:
+    def growth_of(k: Array) -> tuple[Array, Slopes, Array]:
         x = solutions[order[k]]
         slopes = slopes_of(x, balance)
         w, angles = motion_of(balance, x)
-        known = jnp.where(omega[order[k]] > 0.0, w, jnp.nan)
-        return k, slopes, regime_growth(balance, known, angles, slopes.neutral)
+        speed = jnp.where(omega[order[k]] > 0.0, w, jnp.nan)
+        return k, slopes, regime_growth(balance, speed, angles, slopes.neutral)
 
     def undecided(state: tuple[Array, Slopes, Array]) -> Array:
         k, _, growth = state
         return ~decays(growth, omega[order[k]]) & (k < len(sets) - 1)
 
     # The loop has one body, which is compiled once; its first iteration judges the first regime.
-    begin = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(judged, jnp.asarray(0)))
+    begin = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(growth_of, jnp.asarray(0)))
     begin = (jnp.asarray(-1), begin[1], jnp.asarray(jnp.nan, omega.dtype))
-    which, slopes, growth = jax.lax.while_loop(undecided, lambda state: judged(state[0] + 1), begin)
+    which, slopes, growth = jax.lax.while_loop(undecided, lambda state: growth_of(state[0] + 1), begin)
     return solutions[order[which]], slopes, growth
 
 

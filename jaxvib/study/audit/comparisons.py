@@ -28,6 +28,7 @@ from jaxvib.steady.orbits.search import branch_at
 from jaxvib.study.accuracy.exact_reference import WINDOW_PERIODS, slow_period
 
 _MIN_UNCERTAINTY = 1e-9
+"""Smallest relative uncertainty that is stated for the values of a motion."""
 
 _WINDOW_PERIODS = 100
 """Length of the measuring window at the end of a run, in slow periods. It must include the beat of an imbalance with jammed
@@ -51,8 +52,8 @@ class MotionValues(NamedTuple):
     - `fold`: the rotor speed (rad/s) at which the jam ends, NaN if there is none or if it was not computed
     - `uncertainty`: relative uncertainty of these values
     - `closest`: smallest distance of two loads in units of their diameter, not finite for points and for coincident loads
-    - `magnified`: factor on amplitudes and force for relative changes, above 1 if the machine is almost at rest, see
-      `MIN_AMPLITUDE_SHARE`
+    - `magnified`: relative changes of amplitudes and force refer to these values times this factor. It is above 1 if the
+      machine is almost at rest, see `MIN_AMPLITUDE_SHARE`
     """
 
     kind: str
@@ -72,8 +73,8 @@ class MotionValues(NamedTuple):
 
 
 class JamComparison(NamedTuple):
-    """Comparison of the jam `mode`, by its exact orbit, or, if that theory does not support the scene, by a run that starts
-    near the jam."""
+    """Comparison of the jam `mode`, by its exact orbit. If exact orbits of the scene cannot be computed, a run that starts near
+    the jam is used."""
 
     mode: int
 
@@ -210,9 +211,9 @@ def fold_speed(scene: Scene, omega: float) -> float:
         folds = jam_modes(scene).folds
     except InputError:
         return math.nan
-    light = np.asarray(folds.omega)[np.asarray(folds.exists)]
-    above, below = light[light > omega], light[light < omega]
-    if not light.size or not np.isfinite(omega):
+    speeds = np.asarray(folds.omega)[np.asarray(folds.exists)]  # for light loads
+    above, below = speeds[speeds > omega], speeds[speeds < omega]
+    if not speeds.size or not np.isfinite(omega):
         return math.nan
     near = float(above[0]) if above.size else float(below[-1])
     low, high, rotor_speed = 0.97 * near, 1.03 * near, math.nan
