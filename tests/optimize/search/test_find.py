@@ -91,7 +91,7 @@ def test_search_reports_progress_and_history():
     found = find(problem, OPTIONS, lambda what, share: told.append((what, share)))
     assert told[0] == ("drawing starts", 0.0)
     shares = [share for _, share in told]
-    assert shares == sorted(shares) and ("descending, best 2.063", 0.5) in told and told[-1] == ("polishing, best 2", 0.9)
+    assert shares == sorted(shares) and ("descending, best 2.063", 0.7) in told and told[-1] == ("polishing, best 2", 0.9)
     random = np.random.default_rng(0).uniform(size=(4, 2))
     starts = 1.0 + 8.0 * random
     np.testing.assert_allclose(found.history[0], np.sum((starts - [6.0, 5.0]) ** 2, axis=1) + 2.0, rtol=1e-12)
