@@ -64,14 +64,14 @@ def label_map(
     'x'
     """
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
-    there = [k for k in range(len(names)) if np.any(codes == k)]
+    present = [k for k in range(len(names)) if np.any(codes == k)]
     place = np.full(len(names) + 1, -1)
-    place[there] = np.arange(len(there))
+    place[present] = np.arange(len(present))
     own = _label_colors(names)
-    colours = [_NO_ANSWER_COLOR, *(_light(own[k]) for k in there)]
-    norm = BoundaryNorm(np.arange(-1, len(there) + 1) - 0.5, len(colours))
+    colours = [_NO_ANSWER_COLOR, *(_light(own[k]) for k in present)]
+    norm = BoundaryNorm(np.arange(-1, len(present) + 1) - 0.5, len(colours))
     axis.pcolormesh(x, y, place[codes], cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True)
-    entries: list[Patch | Line2D] = [Patch(color=colours[k + 1], label=names[which]) for k, which in enumerate(there)]
+    entries: list[Patch | Line2D] = [Patch(color=colours[k + 1], label=names[which]) for k, which in enumerate(present)]
     if np.any(codes < 0):
         entries.append(Patch(color=_NO_ANSWER_COLOR, label="no result"))
     edges = axis.get_xlim(), axis.get_ylim()

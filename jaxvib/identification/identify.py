@@ -269,9 +269,14 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
     status, chance, notes = status_of(fitted, known)
     undetermined, by_gain = directions_of(known)
     exciters = len(problem.unbalances)
-    fitted_to = fitted_scene(problem, fitted.x, fitted.linear)
+    fit_scene = fitted_scene(problem, fitted.x, fitted.linear)
     modes = propagate(
-        fitted_to, known.names, known.covariance, known.undetermined, known.errors, lambda scene: np.concatenate(natural(scene))
+        fit_scene,
+        known.names,
+        known.covariance,
+        known.undetermined,
+        known.errors,
+        lambda scene: np.concatenate(natural(scene)),
     )
     logarithmic = known.logarithmic & ~known.vanished
     estimates = list(map(_estimate, known.values, known.scale, logarithmic, _spreads(known), known.determined))
@@ -292,8 +297,8 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         notes.append(f"{known.names[i]} is not distinguishable from 0; it is at most {estimates[i].high:.3g} {unit}".rstrip())
     return MachineFit(
         status=status,
-        notes=(*problem.notes, *notes, *coverage_notes(fitted, *natural(fitted_to))),
-        scene=fitted_to,
+        notes=(*problem.notes, *notes, *coverage_notes(fitted, *natural(fit_scene))),
+        scene=fit_scene,
         names=known.names,
         units=tuple(find_number(scene, name, "unknown").unit for name in known.names),
         estimates=tuple(estimates),
@@ -340,7 +345,8 @@ def _estimate(value: float, scale: float, logarithmic: bool, spread: float, dete
 
 
 def _with_ends(estimate: Estimate, scale: float, logarithmic: bool, low: float, high: float) -> Estimate:
-    """Return an estimate with the ends of its interval in its coordinate, relative to its value."""
+    """Return an estimate whose interval ends at the distances `low` and `high` from its value: logarithms of factors if
+    `logarithmic`, otherwise in units of `scale`."""
     if logarithmic:
         return estimate._replace(low=estimate.value * math.exp(low), high=estimate.value * math.exp(high))
     return estimate._replace(low=estimate.value + scale * low, high=estimate.value + scale * high)
