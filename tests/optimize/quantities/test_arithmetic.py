@@ -188,6 +188,7 @@ def test_quantities_by_time_integration():
         (lambda: foundation_force(mode=3, harmonic=0), "harmonic is 0"),
         (lambda: peak_force(until=1.0, spin_up=2.0), "at most until"),
         (lambda: settling_time(until=3.0, spin_up=2.0, within=2.0), "less than 1"),
+        (lambda: settling_time(until=3.0, spin_up=2.0, of=0), "of is 0"),
         (lambda: spring_cost([(1e4, 1.0)]), "at least two pairs"),
         (lambda: spring_cost([(1e4, 1.0), (1e3, 1.0)]), "must have ascending stiffnesses"),
         (lambda: under(STIFFNESS, "x", {}), "must be a dictionary"),
