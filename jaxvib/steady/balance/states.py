@@ -418,15 +418,17 @@ def balanced_growth(scene: Scene, speeds: Numbers, angles: ArrayLike | None = No
     array([False,  True])
     """
     angles, neutral = _arrangement(scene, angles)
-    shape = np.shape(speeds) if isinstance(speeds, (np.ndarray, jax.Array)) else None
-    if shape is not None and 0 in shape:
-        return np.zeros(shape)
-    values = np.asarray(numbers(speeds if shape is None else np.ravel(speeds), "rad/s", "speeds", None), dtype=float)
-    flat = np.ravel(values)
+    if isinstance(speeds, (np.ndarray, jax.Array)):
+        if np.size(speeds) == 0:
+            return np.zeros(np.shape(speeds))
+        values = np.asarray(numbers(np.ravel(speeds), "rad/s", "speeds", None), dtype=float).reshape(np.shape(speeds))
+    else:
+        values = np.asarray(numbers(speeds, "rad/s", "speeds", None), dtype=float)
+    flat = values.ravel()
     # Speeds are padded to whole batches, so that few shapes are compiled.
     padded = np.pad(flat, (0, -flat.size % BATCH), mode="edge")
     flows = monodromies(at_constant_speed(scene), angles, padded, validate_steps(scene, flat, steps))[: flat.size]
-    return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(values.shape if shape is None else shape)
+    return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(values.shape)
 
 
 def balanced_intervals(

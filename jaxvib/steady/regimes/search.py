@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -229,7 +230,7 @@ def relaxed(x: Array, balance: TorqueBalance) -> Array:
     if balance.unbalance.size <= MAX_COMPLETE:
         return x
     n, free = x.size, np.flatnonzero(~balance.is_prescribed)
-    mix = np.eye(n, dtype=x.dtype)
+    mix: Any = np.eye(n, dtype=x.dtype)
     if free.size == balance.is_prescribed.size:
         mix[:, 0], mix[0] = -1.0, 1.0 / n
 
