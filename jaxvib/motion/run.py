@@ -373,7 +373,7 @@ def with_separation_status(run: Run, *, is_settled: bool = True) -> Run:
     """
     if status_name(run.status) not in ENDS:
         return run
-    if overlap(run.scene, run.window if is_settled else jax.tree.map(lambda leaf: leaf[-1:], run.window)):
+    if overlap(run.scene, run.window if is_settled else jax.tree.map(lambda leaf: np.asarray(leaf)[-1:], run.window)):
         return dataclasses.replace(run, status=member(RunStatus, "overlapping"))
     if is_settled and would_separate(run.scene, run.window):
         return dataclasses.replace(run, status=member(RunStatus, "would_separate"))

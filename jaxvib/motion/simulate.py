@@ -136,7 +136,11 @@ def simulate(
         prepare_run(plan_from(start="rest", mode=None, separation=None))
     plan = plan_from(start=start, mode=mode, separation=separation)
     run = run_planned(plan, throw=throw)
-    return with_separation_status(run, is_settled=float(run.drift) < SETTLED_DRIFT) if plan.is_known else run
+    if not plan.is_known:
+        return run
+    is_settled = float(run.drift) < SETTLED_DRIFT
+    has_sized_loads = any(getattr(exciter.loads, "ball_radius", None) is not None for exciter in scene.exciters)
+    return with_separation_status(run, is_settled=is_settled) if is_settled or has_sized_loads else run
 
 
 def run_planned(plan: RunPlan, *, throw: bool) -> Run:
