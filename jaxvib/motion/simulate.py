@@ -139,8 +139,8 @@ def simulate(
     if not plan.is_known:
         return run
     is_settled = float(run.drift) < SETTLED_DRIFT
-    has_sized_loads = any(getattr(exciter.loads, "ball_radius", None) is not None for exciter in scene.exciters)
-    return with_separation_status(run, is_settled=is_settled) if is_settled or has_sized_loads else run
+    sized = [exciter for exciter in scene.exciters if getattr(exciter.loads, "ball_radius", None) is not None]
+    return with_separation_status(run, is_settled=is_settled) if is_settled or sized else run
 
 
 def run_planned(plan: RunPlan, *, throw: bool) -> Run:
