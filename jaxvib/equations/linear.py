@@ -395,8 +395,8 @@ def require_circular(loads: Loads, drive: Drive) -> None:
     if not drive.ideal:
         raise InputError(
             "drive.kind",
-            f"is {quoted(drive.kind)}; this function needs a prescribed rotor speed (property ideal): "
-            "use ConstantSpeed, or simulate",
+            f"is {quoted(drive.kind)}; this function needs a prescribed rotor speed (property ideal), such as "
+            "ConstantSpeed; use simulate for loads on the rotor of a motor",
         )
 
 

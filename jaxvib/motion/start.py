@@ -56,8 +56,8 @@ def initial_state(
 
     - `scene` of the state
     - `start`: "rest" (platforms in equilibrium, loads at rest near the bottom of their track, unbalances of motors hanging down
-      if gravity acts on them), "spin_up" (the same state; in
-      `simulate` the rotor speed then rises smoothly), or "jam" (on the leading-order motion of a jam mode)
+      if gravity acts on them; a rotor of constant speed turns with its full speed from the beginning), "spin_up" (the same
+      state; in `simulate` the rotor speed then rises smoothly), or "jam" (on the leading-order motion of a jam mode)
     - `mode`: number of the jam mode, for "jam"; typical: 1, 3, 5, the modes that are stable for light loads
     - `angles` (count,): the angles of the loads about the axis of the rotor, rad; or one value for the middle of all loads
       (default: the angle of `Loads.rest` at rest, and 0 in a jam). The displacements of a jam belong to the mean angle;
