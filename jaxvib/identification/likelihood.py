@@ -27,7 +27,7 @@ _MAX_DIFFERENCE = 0.1
 """Relative difference from the quadratic form above which an interval follows from the profile."""
 
 _TIGHT_ERROR = 1e-3
-"""Error of a fixed number, in standard errors."""
+"""A number is fixed by a known value. Its standard error is this fraction of the standard error of the number in the fit."""
 
 _MAX_DISTANCE = 20.0
 """Distance in standard errors beyond which an interval counts as unbounded."""

@@ -102,7 +102,7 @@ class Exciter(Part):
 
     @property
     def is_plain(self) -> bool:
-        """True for an exciter with loads and without an `unbalance` that turns anticlockwise."""
+        """True for an exciter that turns anticlockwise and has loads but no `unbalance`."""
         return self.carries == ("loads",) and self.direction == 1
 
     @property
@@ -258,7 +258,7 @@ class Scene(Part):
 
     @property
     def is_plain(self) -> bool:
-        """True for one exciter with loads and without an `unbalance` that turns anticlockwise."""
+        """True for a scene with one exciter that turns anticlockwise and has loads but no `unbalance`."""
         return len(self.exciters) == 1 and self.exciters[0].is_plain
 
     @property
@@ -269,7 +269,9 @@ class Scene(Part):
         """
         exciter = _require_anticlockwise(self.exciter)
         if exciter.loads is None or not exciter.is_plain:
-            problem = "has an unbalance; this function needs a balanced rotor with loads, use simulate for others"
+            problem = (
+                "has an unbalance; this function needs an exciter with loads and without unbalance=...; use simulate for others"
+            )
             raise InputError("scene.exciters[0]", problem)
         return exciter.loads
 

@@ -221,8 +221,8 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
 
 
 def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
-    """Plot, for each varied parameter, the mean of a measure over the cases with the lowest and the highest fifth of its
-    values.
+    """Plot two means of a measure for each varied parameter: over the cases with the lowest fifth of the values of this
+    parameter, and over those with the highest fifth.
 
     The parameter with the largest influence is on top. **Returns** a matplotlib figure, or the given `ax`.
     """
@@ -251,7 +251,7 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
         )
     means = np.asarray([sums[axis][:, 0] / np.maximum(sums[axis][:, 1], 1) for axis in axes])
     means = np.where(np.asarray([sums[axis][:, 1] for axis in axes]) > 0, means, np.nan)
-    label = f"mean over all cases: {measure_label(opened, name)}"
+    label = f"mean of {measure_label(opened, name)}"
     _, factor = display_unit(opened, name)
     words = [_axis_words(opened, axis) for axis in axes]
     return tornado_chart(words, *(factor * m for m in (*means.T, total[0] / total[1])), x_label=label, ax=ax)

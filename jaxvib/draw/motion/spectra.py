@@ -66,8 +66,9 @@ def waterfall_chart(
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw amplitudes (P, nf) as shades of grey over P times, s, and nf frequencies; `name` includes their unit.
+    """Draw amplitudes (P, nf) as shades of grey over P times, s, and nf frequencies.
 
+    `name` is that of the amplitudes, with their unit.
     The rotor speeds (P, exciters) and the load speeds (P, loads) are drawn as lines, resonances as horizontal lines.
     Frequencies and speeds are in rad/s, drawn in `unit`.
     """

@@ -74,7 +74,7 @@ def _points(part: type[eqx.Module], **lists: Numbers) -> list[Array]:
     (first, *others), (name, *names) = (found := read_numbers(part, "drive", **lists)).values(), found
     n = np.size(first)
     if np.ndim(first) != 1 or n < 2:
-        raise InputError(f"drive.{name}", f"has {n} value{'s' if n > 1 else ''}; a list of at least 2 is needed")
+        raise InputError(f"drive.{name}", f"has {n} value{'' if n == 1 else 's'}; a list of at least 2 is needed")
     for other, values in zip(names, others, strict=True):
         if np.shape(values) != (n,):
             raise InputError(f"drive.{other}", f"has {np.size(values)} values; {n} are needed, one for each of the {name}")
@@ -153,7 +153,7 @@ class SpeedProfile(IdealDrive):
 
     def settled(self) -> Drive:
         """Return `ConstantSpeed` at the last speed. **Raises** `InputError` if the rotor comes to rest."""
-        problem = "end at 0, so there is no steady motion; use simulate, or a profile that ends at a speed"
+        problem = "end at 0, so there is no steady motion; use simulate, or a profile whose last speed is greater than 0"
         require_if_known(lambda speeds: speeds[-1] != 0.0, self.speeds, field="drive.speeds", problem=problem)
         return ConstantSpeed(cast(Array, self.speed))
 
@@ -169,7 +169,8 @@ class Converter(MotorWrapper):
 
     **Arguments**
 
-    - `motor` without states, such as an `InductionMotor`
+    - `motor` without states of its own (such as currents) and without switching times, such as an `InductionMotor`; not another
+      converter
     - `reference` n(t): an ideal drive, such as a `RunUp`, a `SpinUp` or a `SpeedProfile`
 
     **Raises** `InputError` for a motor or a reference of the wrong type.
@@ -187,7 +188,9 @@ class Converter(MotorWrapper):
 
     def __init__(self, motor: Motor, reference: IdealDrive):
         if not isinstance(motor, Motor) or motor.jump_ts() or motor.state_units() or isinstance(motor, Converter):
-            needed = "it must be a motor without states and switches, for example InductionMotor(...)"
+            needed = (
+                "it must be a motor without currents as states, switching times or a converter, such as InductionMotor(...)"
+            )
             raise InputError("drive.motor", f"is {quoted(motor)}; {needed}")
         _require_ideal(reference)
         self.motor, self.reference, self.kind = motor, reference, "converter"

@@ -35,8 +35,9 @@ class HarmonicConvergence(Result):
 
     - `harmonics` (n,): the highest harmonic of the carrier
     - `omega` (jams,): load speeds, rad/s
-    - `error` (n, jams): relative error of the rotor speed, by comparison with twice the largest number of points
-    - `estimate` (n, jams): estimate of this error from each jam alone
+    - `error` (n, jams): relative error of the rotor speed, by comparison with the jam that is computed with twice the
+      largest number of collocation points
+    - `estimate` (n, jams): estimate of this error, which needs no more accurate jam
     """
 
     status = Computed.done
@@ -47,9 +48,11 @@ class HarmonicConvergence(Result):
     estimate: np.ndarray = eqx.field(metadata=in_unit("", "harmonics", "omega"))
 
     def summary(self) -> str:
-        """Return a line of text for each number of harmonics: the largest error and the largest estimate."""
+        """Return a line of text for each highest harmonic: the largest error and the largest estimate."""
         rows = zip(self.harmonics, np.max(self.error, axis=1), np.max(self.estimate, axis=1), strict=True)
-        return "\n".join(f"{int(n)} harmonics: error {error:.1e}, estimated {estimate:.1e}" for n, error, estimate in rows)
+        return "\n".join(
+            f"harmonics up to {int(n)}: error {error:.1e}, estimated {estimate:.1e}" for n, error, estimate in rows
+        )
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Plot the error over the highest harmonic, with a line for each load speed; the estimates are dashed lines.
