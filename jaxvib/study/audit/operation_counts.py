@@ -114,6 +114,7 @@ def _build_with_halves(build: Callable[..., T]) -> T:
     special_values = {
         "motor": DCMotor(1.0, 1.0, 1.0),
         "reference": ConstantSpeed(1.0),
+        "rated_speed": 100.0,
         "breakdown_ratio": 2.0,
         "pole_pairs": 1,
         "times": [0.5, 1.0],
