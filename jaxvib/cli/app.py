@@ -298,7 +298,7 @@ def _is_command(decorator: ast.expr, name: str) -> bool:
 def app() -> None:
     """Simulate and design vibration machines that work on the Sommerfeld effect.
 
-    Begin with: jaxvib new two-mass > machine.toml
+    Begin with: jaxvib new two-mass > machine.toml (or linear-screen, feeder, rotor: see jaxvib new --help)
     """
 
 

@@ -17,9 +17,11 @@ that turn with theta. The averaged equation keeps the slow part of this product 
     I_j w_j' = D_j (n - w_j) - (S_j/2) Im(e^{-i psi_j} a_j),     psi_j' = w_j - Omega,     a_j = e^H B_j A
 
 Only a_j, the forward circular part of the acceleration at the load, drives the load; the backward part averages to zero. All
-loads at one point have the same a. For loads at different stations s_j, B_j = B + s_j T and a_j = a_1 + s_j a_2. A contains
-w_j' (the reaction of the loads); therefore a, or (a_1, a_2), is the solution of a linear system. With the levers g_j = 1 or
-(1, s_j), P = e^H B M^-1 B^T e (with stations a 2 x 2 matrix, from B and T), h_j = S_j^2/(4 I_j) and f_j = D_j (n - w_j)/I_j
+loads at one point have the same a. For loads at different stations s_j, B_j = B + s_j T, where B q is the displacement of
+the centre of mass and T q its change per length of the axis; then a_j = a_B + s_j a_T with a_B = e^H B A and a_T = e^H T A. A
+contains w_j' (the reaction of the loads); therefore a, or (a_B, a_T), is the solution of a linear system. With the levers
+g_j = 1 or (1, s_j), P = e^H B M^-1 B^T e (with stations a 2 x 2 matrix, from B and T), h_j = S_j^2/(4 I_j) and
+f_j = D_j (n - w_j)/I_j
 (the load's angular acceleration without vibration), the system is
 
     (1 - P sum_j h_j g_j g_j^T) a + P sum_j h_j e^{2 i psi_j} g_j g_j^T conj(a)

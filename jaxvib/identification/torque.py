@@ -66,8 +66,9 @@ _ACCURACY = 1e-5
 """Error of the predicted angle, rad: smallest noise of the rotor's angle in the fit, even if the pulses scatter less."""
 
 _OWN_PASSES = 2
-"""Number of fits of vibrations and rotor together: with the scatter of the pulses, then with the noise of the first fit. The
-noise of a prediction that is not fitted yet is mostly its drift, and a filter that removes it would remove its information."""
+"""Number of fits of vibrations and rotor together: with the scatter of the pulses, then with the noise of the first fit.
+Before the first fit the deviations are mostly a drift of the prediction. A noise filter computed from them would remove this
+drift, and with it the information on the motor."""
 
 
 @cached
@@ -76,8 +77,9 @@ def _deviations(
 ) -> tuple[Array, Array]:
     """Return the deviations (n,) of the predicted rotor from its samples, in units of their spread, and their derivatives.
 
-    **Arguments**: `samples` of the accelerations of the rotor; `x`; `part`: state at the first sample and components of the
-    unbalance; `own`: first angle, first speed, common delay of the pulses in standard errors, offsets of the marks.
+    **Arguments**: `samples` of the accelerations of the rotor; `x`: see `Unknowns`; `part`: state at the first sample and
+    components of the unbalance; `own`: first angle, first speed, common delay of the pulses in standard errors, offsets of the
+    marks.
     """
     nonlinear_count = x.shape[0] - unknowns.errors
     delay_error = rotor.scatter if rotor.kind == "pulses" else 0.0

@@ -33,8 +33,8 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
 
     - A step with e > 1 is rejected and repeated with h_next = s / e^(1/8) h
     - The powers are products of square roots, which cost less than a general power
-    - Steps of constant length have e = s^32. In double precision s = 0.88 and e = 1/60, so that the sum of the errors of 10^5
-      steps is near the tolerance. In single precision s = 0.97 and e = 0.38, because smaller estimates consist of rounding
+    - Steps of constant length have e = s^32. In double precision s = 0.88 and e = 1/60, which leaves room for the sum of the
+      errors of many steps. In single precision s = 0.97 and e = 0.38, because smaller estimates consist of rounding
       errors, which shorter steps hardly reduce
     - h_next / h lies between 0.2 and 5, after a rejected step between 0.2 and 0.9
     - |y| of an entry is the larger of its absolute values at the ends of the step
@@ -67,7 +67,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
 
     @property
     def rtol(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Tolerance of the equations of an implicit method."""
+        """Relative tolerance with which an implicit method solves its algebraic equations."""
         return self.tolerance
 
     @property

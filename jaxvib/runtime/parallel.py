@@ -1,8 +1,8 @@
 """Parallel evaluation of many cases on all cores and accelerators, with one compiled program for all chunks.
 
-Sweeps, ensembles, run-ups, maps and searches use it. `in_parallel` is for cases with host code (a diagram, a criterion).
-`in_chunks` is for cases that are entries of arrays; it pads the last chunk, and therefore uses the same program for any number
-of cases.
+Sweeps, ensembles, run-ups, maps and searches use it. `in_parallel` is for cases with Python code between compiled programs (a
+diagram, a criterion). `in_chunks` is for cases that are entries of arrays; it pads the last chunk, and therefore uses the same
+program for any number of cases.
 """
 
 from __future__ import annotations

@@ -53,8 +53,8 @@ class CriticalSpeeds(Result):
 
     - `speed` (nd,), rad/s, ascending; inf for a speed that does not exist (a thin disc has no second forward critical speed)
     - `forward` (nd,): True if the whirl turns in the direction of the rotor. On supports that are equal in both directions an
-      imbalance excites forward whirls only. If horizontal and vertical values differ, it excites all of them, and between the
-      two critical speeds of one motion it turns the rotor's axis backward
+      imbalance excites forward whirls only. If horizontal and vertical supports differ, it excites all whirls, and between
+      the two speeds into which a critical speed is split, it turns the rotor's axis backward
     - `straight` (nd,): True if the axis moves on a straight line, which needs different horizontal and vertical supports
     - `status`: a `WhirlStatus`
     """
@@ -197,8 +197,9 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
         return jnp.concatenate([jnp.eye(nd, 2 * nd, nd, dtype=mass.dtype), flow])
 
     def one_of_each(values: Array, stops: Array) -> tuple[Array, Array]:
-        # One value of each conjugate pair, with positive frequency. Real values also come in pairs: a displacement that creeps
-        # back and a velocity that stops; without gyroscopic coupling their numbers are equal, see `_stopping`.
+        # One value of each conjugate pair, with positive frequency. Real values are of two kinds: a displacement that creeps
+        # back (small `stops`) and a velocity that stops (large). Without gyroscopic coupling there are as many of one kind as
+        # of the other, see `_stopping`.
         oscillates = jnp.abs(values.imag) > 1e-12 * jnp.max(jnp.abs(values))
         rank = jnp.argsort(jnp.argsort(jnp.where(oscillates, jnp.inf, stops)))
         creeps = rank < jnp.sum(~oscillates) // 2
@@ -241,9 +242,10 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
 
         (s^2 M + s C + K) x = 0,      m s^2 + c s + k = 0 with m = x^H M x, c = x^H C x, k = x^H K x
 
-    The kind is - Re(2 s + c/m). For the two real roots of a single equation it is negative at the slower one, at which damping
-    balances the spring, and positive at the faster one, at which damping stops the mass. The kind is the sign characteristic
-    of the Hermitian matrix polynomial, and therefore also distinguishes several overdamped motions, for any roots.
+    The kind is - Re(2 s + c/m). Of the two real roots of an overdamped motion, it is negative at the slower one, at which
+    damping balances the spring, and positive at the faster one, at which damping stops the mass. Its sign (the sign
+    characteristic in the theory of Hermitian matrix polynomials) tells slow from fast roots also if the roots of several
+    motions are mixed in size.
 
     The error is the step of Newton's method for the scalar equation, plus the rounding of its terms.
 
@@ -255,7 +257,7 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
     slope, length = jnp.abs(2.0 * m * values + c), jnp.abs(values)
     rounding = len(sizes) * jnp.finfo(sizes.dtype).eps * (rough[0] * length**2 + rough[1] * length + rough[2])
     residual = jnp.abs((m * values + c) * values + k) + rounding
-    # Rounding separates two nearly equal roots by its square root.
+    # If two roots are nearly equal, a residual r moves them by at most about sqrt(r/m), although the step of Newton is longer.
     step = jnp.minimum(residual / jnp.where(slope > 0.0, slope, 1.0), jnp.sqrt(residual / m.real))
     step = jnp.where(slope > 0.0, step, jnp.sqrt(residual / m.real))
     return -(2.0 * values + c / m).real, step / length

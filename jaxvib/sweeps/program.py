@@ -166,7 +166,8 @@ def _compute_cases(
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the results of a chunk, of which only the `cases` (indices) are computed.
 
-    Other cases, and cases that raise an error, have NaN (labels: -1). Messages are added to `errors`.
+    A case that raises an error has NaN (-1 in integer results), and its message is added to `errors`. The entries of other
+    cases have no meaning: they are results of the first of the `cases`, or NaN.
     """
     filled = np.repeat(values[cases[:1]], study.size, axis=0)
     filled[cases] = values[cases]

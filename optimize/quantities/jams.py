@@ -173,7 +173,7 @@ def foundation_force(*, mode: int | None = None, harmonic: int | None = None, ti
     - `mode`: number of the jam mode; typical: 1, 3, 5; default: the working regime of exciters, see `throw_stroke`
     - `harmonic`: number k of a harmonic of the exact motion, for the force at k times the load speed only; typical: 1 to 5;
       default: the whole force
-    - `tier`: as for `amplitude`
+    - `tier`: as for `amplitude`; a harmonic is always computed with the tier "exact"
 
     **Returns** `Quantity`, NaN if the mode does not exist; typical: 1 to 2000 N for jams, 1 to 20 kN for screens. A mode that
     the machine does not have raises `InputError` when the quantity is computed. **Raises** `InputError` for a harmonic with the
@@ -239,7 +239,10 @@ def _ratio(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
 
 
 def _peaks(evaluation: Evaluation, sign: float, tier: Tier, mode: int, harmonic: int | None) -> Array:
-    """Return the peaks of the exact force within the period. If its first harmonic is small, several peaks are nearly equal."""
+    """Return pieces whose maximum is `sign` times the force: for the exact force (sign > 0) its peaks within the period.
+
+    If the first harmonic of the force is small, several peaks are nearly equal.
+    """
     if tier != "exact" or sign < 0.0:
         return sign * jam_force(evaluation, tier, mode, harmonic)[None]
     return evaluation.orbit(mode).force_peaks()
@@ -298,10 +301,11 @@ def _margin(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
 
 
 def _margins(evaluation: Evaluation, sign: float, tier: Tier, mode: int) -> Array:
+    """Return pieces whose maximum is `sign` times the margin: minus both distances to the folds, or the smaller distance."""
     below, above = evaluation.folds(mode)
     n = evaluation.scene.drive.speed
     slow, fast = (below, above) if mode % 2 == 1 else (above, below)
-    both = jnp.stack([n - slow, fast - n]) + 0.0 * evaluation.jam(mode).omega
+    both = jnp.stack([n - slow, fast - n]) + 0.0 * evaluation.jam(mode).omega  # NaN if the mode does not exist
     return -both if sign < 0.0 else jnp.minimum(both[0], both[1])[None]
 
 

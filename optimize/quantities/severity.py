@@ -103,7 +103,7 @@ def _velocity(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
 def transmissibility(*, mode: int, tier: Tier = "leading") -> Quantity:
     """Return the foundation force in a jam mode, divided by the centrifugal force of the loads.
 
-        T = F / (S Omega^2),    isolation efficiency = 1 - T
+        T = F / (S Omega^2),    isolation = 1 - T
 
     **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `tier`: as for `amplitude`.
 

@@ -1,7 +1,10 @@
 """Sequential quadratic programming from many designs at once, and the optimality of the results.
 
-Sizes of arrays: s designs, d free parameters, me held quantities (equalities), mi demands (inequalities), m
-equations.
+The objective may be the maximum of several smooth pieces, for example of the peaks of a force. At a kink the largest pieces are
+equal. The shares of the pieces are their multipliers, with the sum 1.
+
+Sizes of arrays: s designs, d free parameters, me held quantities (equalities; `m` in the code), mi demands (inequalities); in
+`_least_change`, m values.
 """
 
 from __future__ import annotations
@@ -34,8 +37,8 @@ _UNREACHABLE_DECREASE = 1e-10
 of exact motions have this size."""
 
 _HIDDEN_DECREASE, _ROUNDING = 1e-13, 1e-15
-"""Relative decrease of the objective that can be smaller than its rounding error, and relative rounding error of the
-objective."""
+"""Predicted relative decrease of the objective below which rounding errors can hide the decrease, and the relative increase
+that counts as rounding."""
 
 _KINK_STEPS = 4
 """Number of first-order steps that move a design back onto a kink."""
@@ -251,7 +254,7 @@ class _Searches:
 
 
 def _begin(problem: Problem, point: Point) -> _Searches:
-    """Return the searches at their starts, after a correction of the constraints."""
+    """Return the searches at their starts, which are first changed to meet the constraints."""
     if problem.parts > 1:  # the descent does not compute the pieces of the objective
         point = evaluate(problem, point.z, point.speeds)
     size = np.maximum(np.abs(point.values[:, 0]), 1e-9 * np.max(np.abs(point.slopes[:, 0]), axis=1))
@@ -278,8 +281,8 @@ def _begin(problem: Problem, point: Point) -> _Searches:
 
 
 def _build_models(problem: Problem, searches: _Searches, index: np.ndarray, here: Point) -> tuple[list[Step], np.ndarray]:
-    """Return the steps of the searches `index` from `here` by quadratic models, and True for searches whose penalty was too
-    small.
+    """Return steps of the searches `index` from `here`, one entry for each of the one or two sets of second derivatives, and
+    True for searches whose penalty was too small.
 
     Updates the second derivatives, the penalties and the remaining decreases.
     """

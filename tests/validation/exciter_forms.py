@@ -292,7 +292,12 @@ FORMS = (
         of(lambda: circular(on_line(-2.0, 0.0, 2.0), 8e6, 4000.0, 2.0)),
         (2e-14, 2e-14, 4e-13),
     ),
-    ClosedForm("5: one exciter below a resonance", "fold of the motor's line", jam_limit, (1e-6, 1e-12, 0.05)),
+    ClosedForm(
+        "5: one exciter below a resonance",
+        "largest stall torque of a motor that the resonance catches",
+        jam_limit,
+        (1e-6, 1e-12, 0.05),
+    ),
     ClosedForm(
         "6: two auto-balancers below the resonance of translation",
         "in step, b R^2 (n - Omega) = 2 c S^2 Omega^5 / |D|^2",

@@ -17,7 +17,7 @@ from jaxvib.errors import InputError
 @app.command("run-up")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--until", required=True, help="End time, such as 20s.")
-@click.option("--least", is_flag=True, help="Also search for the smallest torques of the motors with which all exciters pass.")
+@click.option("--least", is_flag=True, help="Also find the smallest factor of all torques with which all exciters pass.")
 @WITHOUT
 @csv_options
 @shared
@@ -38,7 +38,7 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--until", required=True, help="End time of each run-up, such as 6s.")
 @click.option("--drag", "drags", multiple=True, help="Drag of the loads, such as '0.5 N s/m', repeatable [value of SCENE].")
-@click.option("--starts", type=int, help="Number of random sets of initial angles [1: loads next to each other at the bottom].")
+@click.option("--starts", type=int, help="Number of random sets of initial angles [one set: loads side by side at the bottom].")
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random angles.")
 @SEPARATION
 @click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-7].")

@@ -87,8 +87,8 @@ def speed_of(recorded: Sequence[Recorded], pulses: str | None, speed: str | None
     **Arguments**: `pulses` or `speed`: name of the channel, None for the first channel in rpm or rad/s; `per_turn`: pulses per
     revolution.
 
-    **Returns** None if no channel is named and no channel has such a unit. **Raises** `InputError` for an unknown name, and for
-    pulses that cannot be used.
+    **Returns** None if no channel is named and no channel has such a unit. **Raises** `InputError` for an unknown name,
+    for a `speed` channel whose unit is not a speed, for a channel without times, and for pulses that cannot be used.
     """
     name = pulses or speed or next((each.name for each in recorded if each.unit.lower() in ("rpm", "1/min", "rad/s")), None)
     if name is None:

@@ -35,7 +35,8 @@ def damped_newton(
 
     **Arguments**
 
-    - `balance(x, args)`: returns the residuals, of size 1 or less far from a root, and auxiliary values
+    - `balance(x, args)`: returns the residuals and auxiliary values. The residuals must be scaled such that they are at most of
+      the order of 1 everywhere, because the limit below which they count as rounding errors is absolute
     - `iterations`: maximum number of steps; the iteration ends earlier if only rounding errors are left
     - `on_scalars`: evaluate on scalars, see `scalarize`, which reduces the time to a third for many starts
 

@@ -199,7 +199,8 @@ def solve_whole(
 ) -> WholeMotion:
     """Solve for the periodic motion of a scene by Newton's method.
 
-        x'' = f(theta, x, x', Omega)    at the M points of the grid,    mean psi of the first body = 0
+        x'' = f(theta, x, x', Omega)    at the M points of the grid,    ' = d/dtheta
+        mean psi of the first body = 0    if the motion is not forced; Omega is then an unknown
 
     **Arguments**: `omega`, rad/s: the speed of a `forced` motion, otherwise the initial value of the speed; `known`: the
     solution, if it is known.
@@ -303,8 +304,8 @@ def multipliers_of(
     """Return the Floquet multipliers of the full state about a periodic motion, and the trivial one.
 
     Without forcing the trivial multiplier of a shift in time is not among the others; with forcing it is NaN. The
-    steps of `radau.flow` in a period are as many as the carrier's fastest vibration needs; `max_steps` is their limit, with
-    which derivatives exist in reverse mode.
+    number of steps of `radau.flow` in a period is the number that the carrier's fastest vibration needs, at most `max_steps`.
+    Derivatives in reverse mode exist only if `max_steps` is given.
     """
     x, omega = motion
     n, orders = x.shape[0], jnp.asarray(grid.deviation_orders, x.dtype)

@@ -168,7 +168,7 @@ class _Request:
 
 
 def _single(tree: Tree) -> Tree:
-    """Convert scenes to single precision, for use under `jax.enable_x64(False)`."""
+    """Convert a scene or a state to single precision, for use under `jax.enable_x64(False)`."""
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), tree)
 
 

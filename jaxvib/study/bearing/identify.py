@@ -25,8 +25,8 @@ from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, Friction
 
 _MAX_HALF_PERIODS = 1.3
-"""Number of half periods without a turning point, before the first or after the last one, after which the pendulum counts as at
-rest; for a swinging pendulum it is at most 1.2."""
+"""Longest time, in half periods, before the first and after the last turning point in which the pendulum counts as swinging.
+If the time is longer, the record begins before the release or ends with the pendulum at rest. A swing needs at most 1.2."""
 
 _PATTERN_PROBABILITY = 1e-5
 """Probability with which the F test of residuals that are pure noise gives the status `patterned`."""
@@ -134,6 +134,8 @@ def identify_bearing(
         record(t_i) = offset + f(t_i) + noise
         J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width) - b |f'| f' + M
 
+    f is the angle; the other symbols are those of `BearingPendulum`.
+
     - Least squares over the angle and rate at the first sample, the offset, the frequency of small swings and the friction, by
       Levenberg and Marquardt's method with forward-mode derivatives through the integration
     - The frequency is a free parameter, because the dimensions of a pendulum are never known accurately enough to predict the
@@ -149,8 +151,9 @@ def identify_bearing(
     - `record` of its swing; typical: 250 to 10,000 samples over 10 to 60 s, first amplitude 3 to 60 deg
     - `dry`: True to identify the dry friction mu2 as well (the pendulum then needs the diameter `bearing`)
     - `air`: True to identify b as well; `torque`: True to identify M as well. Only large swings distinguish M from the offset
-    - `instrument`: relative uncertainty of J, from ruler and scales; its square is added to that of the half-width of the
-      intervals; typical: 0.01 to 0.03 (0.03 in the source; default 0)
+    - `instrument`: relative uncertainty of J, from ruler and scales; the half-width of the intervals of the friction (and of M)
+      is sqrt(s^2 + (instrument value)^2), where s is the half-width without it; typical: 0.01 to 0.03 (0.03 in the source;
+      default 0)
     - `throw`: True to raise `ComputationError` if no fit is found; otherwise the status shows it
 
     **Returns** `Identified`. **Raises** `InputError` for a record that cannot be fitted, `ComputationError` "not_converged".

@@ -58,8 +58,8 @@ NUMBERS = (
         printed=16.51,
         computed=lambda: _resonance(2000.0),
         reason="sqrt(2000/7.35) is 16.496; the springs of 2000 and 6000 N/m carry the same mass, therefore the frequencies "
-        "must have the ratio sqrt(3), but 28.57/16.51 is 1.7305; with 5 N s/m the vibrational torque is largest at "
-        "16.506 rad/s",
+        "must have the ratio sqrt(3), but 28.57/16.51 is 1.7305; with a damping of 5 N s/m the vibrational torque is largest "
+        "at 16.506 rad/s",
         differs=16.4957,
     ),
     _frame(

@@ -256,7 +256,8 @@ NUMBERS = (
         _least_that_jams,
         within=5e-5,
         differs=8.5304e-5,
-        reason="m g l/Omega: less friction cannot carry a pendulum over the top; at 5e-5 they swing, at 3e-4 they are jammed",
+        reason="m g l/w with the rotor speed w = 460 rad/s: less friction cannot carry a pendulum over the top; at 5e-5 they "
+        "swing, at 3e-4 they are jammed",
     ),
     _friction_number(
         "lowest friction at which the pendulums balance the rotor",
