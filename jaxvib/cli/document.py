@@ -147,9 +147,7 @@ def run_document(run: jv.Run, measures: jv.VibrationMeasures | None) -> dict[str
         **measures_document(run, measures),
         **({"regime": _regime(run.regime)} if run.scene.is_plain else {}),
         **({} if run.trajectory is None else fields_of(run, "largest_displacement", "largest_force")),
-        **(
-            {"deck": [{"point": at, "largest_displacement": peak} for at, peak in peaks]} if (peaks := _deck_peaks(run)) else {}
-        ),
+        **({"deck": peaks} if peaks else {}),
         **fields_of(run, "coincident", "error", "evaluations", "seconds"),
     }
 

@@ -139,6 +139,7 @@ def simulate(
     if not plan.is_known:
         return run
     is_settled = float(run.drift) < SETTLED_DRIFT
+    # Loads of an unsettled run can overlap only if they have a size.
     sized = [exciter for exciter in scene.exciters if getattr(exciter.loads, "ball_radius", None) is not None]
     return with_separation_status(run, is_settled=is_settled) if is_settled or sized else run
 
