@@ -161,7 +161,6 @@ def _speeds() -> list[PrintedNumber]:
 def _speed(k: int, row: PublishedRow, gap: float, speed: float) -> PrintedNumber:
     where = (row.damping, row.stiffness, row.friction, gap)
     n, p, friction = row.damping, row.stiffness, 1e5 * row.friction
-    borders = "captures and failures alternate; the printed number may be any boundary between them"
     return PrintedNumber(
         "torus",
         f"table {1 if p == 0.005 else 2}, n = {n:g}, p = {p:g}, k = {friction:g}e-5 m",
@@ -169,7 +168,7 @@ def _speed(k: int, row: PublishedRow, gap: float, speed: float) -> PrintedNumber
         speed,
         lambda: _least_speed(k),
         within=0.04 if p == 0.010 else 0.08,
-        note="equations as printed, M = 7.0 kg (not printed), 2000 turns" + ("" if p == 0.010 else f"; {borders}"),
+        note="as printed" if p == 0.010 else "as printed, alternating",
         reason=_CHAOTIC.get(where, _TOO_SLOW if where in _DIFFERENT else ""),
         differs=_DIFFERENT.get(where, math.nan),
         chaotic=0.15 if where in _CHAOTIC else 0.0,
