@@ -46,7 +46,7 @@ check: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/python .ci/english.py
-	$(BIN)/codespell jaxvib optimize tests benchmarks docs .ci README.md CHANGELOG.md CONTRIBUTING.md
+	$(BIN)/codespell jaxvib optimize jaxvib_command.py tests benchmarks docs .ci README.md CHANGELOG.md CONTRIBUTING.md
 
 # The documentation as pages that open from the disk; a warning is an error.
 docs: $(VENV)/installed-docs

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Iterator
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-FOLDERS = ("jaxvib", "optimize", "tests", "benchmarks", "docs", ".ci", "conftest.py")
+FOLDERS = ("jaxvib", "optimize", "tests", "benchmarks", "docs", ".ci", "conftest.py", "jaxvib_command.py")
 
 OPENERS = {
     "What",

@@ -17,10 +17,39 @@ _LATER = 0.05
 """Time after which an interrupt is repeated, s, if its moment was not suitable."""
 
 
+_USING_INTERRUPTS = ("optimize", "sweep", "explore")
+"""Commands for which an interrupt is an exception: they print their result so far or end a server."""
+
+
 def main() -> None:
-    """Run the command `jaxvib`. The exit code is 0 for success, 1 for a failed computation, 2 for bad input."""
+    """Run the command `jaxvib`. The exit code is 0 for success, 1 for a failed computation, 2 for bad input.
+
+    Except for the commands in `_USING_INTERRUPTS`, interrupts are handled by `jaxvib_command`.
+    """
     gc.disable()
     interrupts: list[int] = []
+    try:
+        if sys.argv[1:] and not {"-h", "--help", "--version"} & set(sys.argv[1:]):
+            prepare()
+        from jaxvib.cli.app import run
+
+        gc.freeze()  # garbage collection of the modules would take one fifth of the time of a short command
+        gc.enable()
+        if sys.argv[1:] and sys.argv[1] in _USING_INTERRUPTS:
+            _raise_interrupts(interrupts)
+        code = run(sys.argv[1:])
+    except KeyboardInterrupt:  # a second interrupt while the first was handled
+        print("\njaxvib: interrupted", file=sys.stderr)
+        code = 1
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.freeze()
+    if interrupts:
+        _exit_at_once(code)
+    sys.exit(code)
+
+
+def _raise_interrupts(interrupts: list[int]) -> None:
+    """Raise KeyboardInterrupt in the main thread at each interrupt, which is added to a list."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         interrupts.append(number)
@@ -30,23 +59,8 @@ def main() -> None:
             signal.default_int_handler(number, frame)
 
     signal.signal(signal.SIGINT, interrupt)
+    signal.set_wakeup_fd(-1)
     sys.unraisablehook = _repeat_lost_interrupt
-    try:
-        if sys.argv[1:] and not {"-h", "--help", "--version"} & set(sys.argv[1:]):
-            prepare()
-        from jaxvib.cli.app import run
-
-        gc.freeze()  # garbage collection of the modules would take one fifth of the time of a short command
-        gc.enable()
-        code = run(sys.argv[1:])
-    except KeyboardInterrupt:  # an interrupt before the command began, or a second interrupt while the first was handled
-        print("\njaxvib: interrupted", file=sys.stderr)
-        code = 1
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    gc.freeze()
-    if interrupts:
-        _exit_at_once(code)
-    sys.exit(code)
 
 
 def _is_loading_extension(frame: FrameType | None) -> bool:

@@ -393,7 +393,7 @@ def test_new_never_overwrites(typed):
 
 def test_installed_command_prints_json_alone(tmp_path):
     jv.save_scene(scene("one_mass", "rollers", speed=60.0), tmp_path / "machine.toml")
-    words = [sys.executable, "-c", "from jaxvib.cli import main; main()", "modes", str(tmp_path / "machine.toml"), "--json"]
+    words = [sys.executable, "-c", "from jaxvib_command import main; main()", "modes", str(tmp_path / "machine.toml"), "--json"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["rotor_speed"] == 60.0
@@ -446,10 +446,62 @@ def test_usage_errors_are_sentences_with_clicks_lowest_version(typed, monkeypatc
         assert code == 2 and says in err and "Traceback" not in err and out == ""
 
 
+ENDED = """
+import os, signal, sys, threading, time, weakref
+import jaxvib_command
+
+class Importing:
+    def find_spec(self, name, path, target=None):
+        if name == "jaxvib":
+            interrupt()
+
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+    for _ in range(600):  # not a single sleep: a lost interrupt would end it
+        time.sleep(0.1)
+
+def importing():
+    sys.meta_path.insert(0, Importing())
+    jaxvib_command.main()
+
+def called():
+    import jaxvib.cli
+
+    jaxvib.cli.main = MOMENT
+    jaxvib_command.main()
+
+def callback():
+    machine = {0}
+    watch = weakref.ref(machine, lambda _: interrupt())
+    del machine
+
+def program():
+    import jax
+
+    threading.Timer(0.5, os.kill, [os.getpid(), signal.SIGINT]).start()
+    jax.jit(lambda x: jax.lax.while_loop(lambda x: x > 0.0, lambda x: x + 1.0, x))(1.0).block_until_ready()
+
+sys.argv = ["jaxvib", "cost", "machine.toml", *OPTIONS]
+importing() if "MOMENT" == "importing" else called()
+print("goes on")
+"""
+
+
+@pytest.mark.parametrize("moment", ["importing", "callback", "program"])
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_an_interrupt_ends_a_command_at_once(moment, options):
+    """During imports, in a callback, where Python discards exceptions, and within an endless compiled program."""
+    script = ENDED.replace("MOMENT", moment).replace("OPTIONS", str(options))
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600.0)
+    assert (done.returncode, done.stderr) == (1, "\njaxvib: interrupted\n")
+    error = {"kind": "computation", "status": "interrupted", "message": "interrupted"}
+    assert json.loads(done.stdout) == {"error": error} if options else done.stdout == ""
+
+
 INTERRUPTED = """
 import signal, sys, threading, time
 import jaxvib.cli.app
-from jaxvib.cli import main
+from jaxvib_command import main
 
 def interrupted(arguments):
     thread = threading.Thread(target=compiling)
@@ -464,12 +516,12 @@ def compiling():
     time.sleep(3600.0)  # the compiler of a thread goes on
 
 jaxvib.cli.app.run = interrupted
-sys.argv = ["jaxvib", "-h"]
+sys.argv = ["jaxvib", "optimize", "-h"]
 main()
 """
 
 
-def test_interrupts_end_a_command_whose_threads_compile():
+def test_interrupts_end_a_search_whose_threads_compile():
     """An interrupted `join` marks its thread as finished, so that an orderly exit would crash in the compiler."""
     done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=600.0)
     assert (done.returncode, done.stdout.strip(), done.stderr) == (1, "answered", "\njaxvib: interrupted\n")
@@ -479,7 +531,7 @@ LOST = """
 import signal, sys, time, weakref
 from importlib.machinery import ExtensionFileLoader
 import jaxvib.cli.app
-from jaxvib.cli import main
+from jaxvib_command import main
 
 def callback():
     machine = {0}
@@ -496,13 +548,13 @@ def lost(arguments):
     time.sleep(3600.0)
 
 jaxvib.cli.app.run = lost
-sys.argv = ["jaxvib", "-h"]
+sys.argv = ["jaxvib", "optimize", "-h"]
 main()
 """
 
 
 @pytest.mark.parametrize("moment", ["callback", "loading"])
-def test_an_interrupt_at_an_unsuitable_moment_is_repeated(moment):
+def test_an_interrupt_of_a_search_is_repeated_if_lost(moment):
     """Callbacks of weak references, as in JAX's caches, discard exceptions; XLA crashes if its import raises one."""
     script = LOST.replace("MOMENT", moment)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600.0)
