@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-SCRIPT = pathlib.Path(__file__).parents[1] / "benchmarks" / "trials" / "public_cases.py"
+SCRIPT = pathlib.Path(__file__).parents[1] / "benchmarks" / "trials" / "public" / "compare.py"
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,9 @@
     python benchmarks/trials/interrupts.py audit --count 40 --cold
 
 The command runs undisturbed, then `--count` times with an interrupt between 0.2 s and its end; with `--cold`, each run has an
-empty cache of programs, and therefore compiles in threads. An interrupted command prints the line "jaxvib: interrupted" and ends
-within 30 s with the exit code 1; a search may instead print its result so far, with the exit code 0. The exit code of the script
-is the number of other outcomes, which are printed.
+empty cache of programs, and therefore compiles in threads. An interrupted command prints the line "jaxvib: interrupted" and
+ends within 30 s with the exit code 1; a search may instead print its result so far, with the exit code 0. The exit code of the
+script is the number of other outcomes, which are printed.
 """
 
 from __future__ import annotations

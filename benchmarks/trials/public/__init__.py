@@ -1,1 +1,1 @@
-"""Cases of `public_cases.py` by what they ask for."""
+"""Cases of `compare.py` by what they ask for."""

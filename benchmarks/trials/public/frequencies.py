@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from case import balls, case, two
 from scipy.linalg import eig, eigh
 
 import jaxvib as jv
-from public.case import balls, case, two
 
 
 def chain(masses, springs, ends: tuple[float, float], *, dampers=None, load: float = 0.5) -> jv.Scene:

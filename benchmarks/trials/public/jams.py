@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import jax
 import numpy as np
+from case import RPM, TWO_MASS, balls, case, linear, three, two
 from numpy.polynomial import Polynomial
 from scipy.linalg import eigh
 from scipy.optimize import brentq, minimize_scalar
 
 import jaxvib as jv
-from public.case import RPM, TWO_MASS, balls, case, linear, three, two
 
 
 def jam_speeds(scene: jv.Scene) -> np.ndarray:

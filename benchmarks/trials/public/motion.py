@@ -7,12 +7,12 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import numpy as np
+from case import RPM, RUN, TWO_MASS, Linear, balls, case, linear, three, two
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 from scipy.special import ellipj, ellipk
 
 import jaxvib as jv
-from public.case import RPM, RUN, TWO_MASS, Linear, balls, case, linear, three, two
 
 
 def field(model: Linear, own: np.ndarray, inertia: np.ndarray, drag: np.ndarray, speed: Callable[[float], float]):

@@ -1,6 +1,6 @@
 """Fifty cases in the style of textbooks, catalogues and papers, each beside a computation that shares no code with jaxvib.
 
-    python benchmarks/trials/public_cases.py [frequencies] [jams] [motion] [--only WORD]
+    python benchmarks/trials/public/compare.py [frequencies] [jams] [motion] [--only WORD]
 
 The reference of a case is a closed form, or NumPy and SciPy on equations written out here. The script prints one line per case,
 the largest relative difference and its bound, and exits with 1 if any bound is exceeded.
@@ -16,7 +16,7 @@ from collections.abc import Iterator
 
 import jax
 import numpy as np
-from public.case import CASES, Case
+from case import CASES, Case
 
 import jaxvib as jv
 
@@ -53,7 +53,7 @@ def main() -> int:
     options.add_argument("--only", default="", help="cases whose name has this word")
     given = options.parse_args()
     for kind in given.kinds or ("frequencies", "jams", "motion"):
-        importlib.import_module(f"public.{kind}")  # adds its cases
+        importlib.import_module(kind)  # adds its cases
     outcomes = list(judged(given.only))
     print(f"{sum(outcomes)} of {len(outcomes)} cases agree with their reference")
     return int(not all(outcomes))
