@@ -124,3 +124,17 @@ def speed_text(values: ArrayLike, digits: int = 5, between: str = ", ") -> str:
     ('1500 rpm', '955 .. 1.91e+03 rpm')
     """
     return quantity_text(values, "rad/s", digits, between)
+
+
+class SpeedIntervals(list[list[float]]):
+    """Intervals [from, to] of speed, rad/s, printed in the unit of `display_units`.
+
+    >>> SpeedIntervals([[10.0, 20.0], [40.0, 50.0]]), SpeedIntervals()
+    (95.493 .. 190.986, 381.972 .. 477.465 rpm, no interval)
+    """
+
+    def __repr__(self) -> str:
+        """Return the intervals with six digits."""
+        unit, factor = speed_unit()
+        ends = ", ".join(f"{factor * low:.6g} .. {factor * high:.6g}" for low, high in self)
+        return f"{ends} {unit}" if ends else "no interval"

@@ -155,8 +155,10 @@ def written(path: Path) -> Iterator[Path]:
     except (OSError, ValueError) as error:
         if isinstance(error, ValueError) and "null" not in str(error):
             raise
-        why = getattr(error, "strerror", None) or str(error)
-        raise InputError("path", f"is {quoted(str(path))}, which cannot be written ({why}); name another file") from error
+        why, remedy = getattr(error, "strerror", None) or str(error), "name another file"
+        if not os.path.exists(path.parent):
+            why, remedy = "its folder does not exist", "create the folder first"
+        raise InputError("path", f"is {quoted(str(path))}, which cannot be written ({why}); {remedy}") from error
     finally:
         if part is not None:
             with contextlib.suppress(OSError):

@@ -486,8 +486,9 @@ def test_former_spellings_and_other_choices_of_steps_are_refused(ask, says):
 
 def test_places_that_cannot_be_written_to(tmp_path):
     (tmp_path / "folder.npz").mkdir()
-    for name, why in (("folder", "Is a directory"), ("missing/file", "No such file or directory")):
-        with pytest.raises(jv.InputError, match=rf"path is .* cannot be written \({why}\); name another file"):
+    missing = r"cannot be written \(its folder does not exist\); create the folder first"
+    for name, why in (("folder", r"cannot be written \(Is a directory\); name another file"), ("missing/file", missing)):
+        with pytest.raises(jv.InputError, match=f"path is .* {why}"):
             RESULTS["Run"]().save(tmp_path / name)
     with pytest.raises(jv.InputError, match="cannot be written"):
         jv.save_scene(SCENE, tmp_path)

@@ -11,19 +11,22 @@ from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, panels
 
 
 def threshold_chart(
-    speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, threshold: float, *, ax: Axes | None = None
+    speed: np.ndarray, fraction: np.ndarray, error: np.ndarray | None, threshold: float, *, ax: Axes | None = None
 ) -> Drawn:
-    """Draw the fraction of captured starts over the initial speed, with its standard error, and the threshold.
+    """Draw the fraction of captured starts over the initial speed, with its standard error unless that is None, and the
+    threshold.
 
     >>> import numpy as np
     >>> len(threshold_chart(np.array([-0.5, -0.1]), np.array([0.0, 1.0]), np.array([0.1, 0.1]), -0.3).axes)
     1
     """
     figure, (axis,) = panels(1, size=(7.0, 3.4), ax=ax)
-    axis.fill_between(
-        speed, np.clip(fraction - error, 0.0, 1.0), np.clip(fraction + error, 0.0, 1.0), color=COLORS[0], alpha=0.2, lw=0.0
-    )
-    axis.plot(speed, fraction, marker="o", ms=3.0, color=COLORS[0], label="share, with its standard error")
+    label = "share"
+    if error is not None:
+        low, high = np.clip([fraction - error, fraction + error], 0.0, 1.0)
+        axis.fill_between(speed, low, high, color=COLORS[0], alpha=0.2, lw=0.0)
+        label = "share, with its standard error"
+    axis.plot(speed, fraction, marker="o", ms=3.0, color=COLORS[0], label=label)
     if np.isfinite(threshold):
         axis.axvline(threshold, color=COLORS[1], ls="--", label=f"threshold {threshold:.3f}")
     axis.set(xlabel="initial speed relative to the rotor / rotor speed", ylabel="share of starts captured", ylim=(-0.05, 1.05))
@@ -79,7 +82,7 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
         paths.plot(broken, np.degrees(y), color=colour, lw=0.6, alpha=0.3)
         paths.plot(broken[late:], np.degrees(y[late:]), color=colour, lw=1.2, label=f"ball {j + 1}, the last tenth")
         paths.plot(np.degrees(x[:1]), np.degrees(y[:1]), "o", mfc="white", color=colour, label=None if j else "start")
-        paths.plot(np.degrees(x[-1:]), np.degrees(y[-1:]), "o", color=colour, label=None if j else "end")
+        paths.plot(np.degrees(x[-1:]), np.degrees(y[-1:]), "o", color=colour, mec="white", zorder=4, label=None if j else "end")
         speeds.plot(time, rate[:, j], color=colour, ls=STROKES[j % len(STROKES)], lw=1.0, label=f"ball {j + 1}")
     paths.axhline(90.0, color=GUIDE, ls="--", lw=0.8, label="outer equator")
     paths.set_xlim(-180.0, 180.0)

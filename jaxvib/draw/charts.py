@@ -13,10 +13,12 @@ from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
 from jaxvib.draw.style import (
     COLORS,
     GUIDE,
+    HATCHED,
     MARKERS,
     OPERATING,
     UNSTABLE,
     Look,
+    label_colors,
     legend_above,
     legend_outside,
     length_unit,
@@ -336,8 +338,9 @@ def regime_chart(
     # Bars of a few, distant values are narrow: they must not look like statements about the values between them.
     width = min(0.9 * np.min(np.diff(np.log(drag))), 0.06 * np.log(drag[-1] / drag[0])) if len(drag) > 1 else 0.1
     low = np.zeros(len(drag))
-    for k, (kind, share) in enumerate(shares.items()):
-        look = {"color": COLORS[k % len(COLORS)], "hatch": HATCHES[k % len(HATCHES)], "edgecolor": "white", "lw": 0.0}
+    for k, (kind, colour, share) in enumerate(zip(shares, label_colors([*shares]), shares.values(), strict=True)):
+        bar: Look = {"color": colour, "hatch": HATCHES[k % len(HATCHES)], "edgecolor": "white", "lw": 0.0}
+        look = HATCHED.get(kind, bar)
         top.bar(drag, 100.0 * share, bottom=low, width=drag * width, label=kind, **look)
         low = low + 100.0 * share
     top.set(ylabel="share of the starts, %", ylim=(0.0, 100.0))

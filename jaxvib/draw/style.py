@@ -24,6 +24,27 @@ COLORS = ("#004488", "#d55e00", "#44aa99", "#e69f00", "#882255", "#88ccee", "#00
 """Colours that readers with any colour vision can distinguish; neighbours in this list have different grey levels. Further
 series start again with the first."""
 
+NO_RESULT = "no result"
+
+HATCHED: dict[str, Look] = {
+    "unsettled": {"facecolor": "white", "edgecolor": "#777777", "hatch": "////", "lw": 0.0},
+    NO_RESULT: {"facecolor": "#e8e8e8", "edgecolor": "#777777", "hatch": "...", "lw": 0.0},
+}
+"""Styles of the cells of a map that have no steady motion; the other cells have a colour without a hatch."""
+
+_REGIME_COLORS = {
+    "swinging": "#b3b3b3",
+    "jammed": "#004488",
+    "unbalanced": "#88ccee",
+    "balanced": "#44aa99",
+    "parted": "#882255",
+    "unsettled": "#777777",
+    "not jammed": "#b3b3b3",
+    NO_RESULT: "#b3b3b3",
+}
+_MODE_COLORS = ("#004488", "#d55e00", "#e69f00", "#332288", "#cc79a7")
+"""Colours of regimes and of jam modes 1, 2, ..., equal in all figures."""
+
 MARKERS = "osD^vPX*"
 STROKES = ("-", (0, (6, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
 """Line styles of series; with `MARKERS` they distinguish series without colours."""
@@ -52,6 +73,14 @@ _STYLE: Any = {
     "figure.constrained_layout.h_pad": 0.1,
     "figure.dpi": 130,
 }
+
+
+def label_colors(names: Sequence[str]) -> list[str]:
+    """Return the colour of each label."""
+    modes = [name for name in names if name.startswith("jammed, mode ")]
+    own = {name: _MODE_COLORS[(int(name.rpartition(" ")[2]) - 1) % len(_MODE_COLORS)] for name in modes}
+    own |= _REGIME_COLORS
+    return [own.get(name, COLORS[k % len(COLORS)]) for k, name in enumerate(names)]
 
 
 def panels(

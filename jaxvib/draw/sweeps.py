@@ -8,35 +8,22 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, PathPatch
+from matplotlib.path import Path
 
 from jaxvib.display import Drawn
-from jaxvib.draw.style import COLORS, MARKERS, STROKES, legend_above, log_ticks, panels
-
-_NO_ANSWER_COLOR = "#f4f4f4"
-"""Background colour of a map, which is visible for cases without a result."""
-
-_REGIME_COLORS = {
-    "swinging": "#b3b3b3",
-    "jammed": "#000000",
-    "unbalanced": "#88ccee",
-    "balanced": "#44aa99",
-    "parted": "#882255",
-    "unsettled": "#777777",
-    "not jammed": "#b3b3b3",
-    "no result": "#b3b3b3",
-}
-_MODE_COLORS = ("#004488", "#d55e00", "#e69f00", "#332288", "#cc79a7")
-"""Colours of regimes and of jam modes 1, 2, ..., equal in all figures."""
-
-
-def _label_colors(names: Sequence[str]) -> list[str]:
-    """Return the colour of each label."""
-    modes = [name for name in names if name.startswith("jammed, mode ")]
-    own = {name: _MODE_COLORS[(int(name.rpartition(" ")[2]) - 1) % len(_MODE_COLORS)] for name in modes}
-    own |= _REGIME_COLORS
-    return [own.get(name, COLORS[k % len(COLORS)]) for k, name in enumerate(names)]
-
+from jaxvib.draw.style import (
+    COLORS,
+    HATCHED,
+    MARKERS,
+    NO_RESULT,
+    STROKES,
+    Look,
+    label_colors,
+    legend_above,
+    log_ticks,
+    panels,
+)
 
 _DASHES = {"fold": "-", "torus": "--", "period doubling": "-.", "symmetry": ":"}
 
@@ -64,16 +51,19 @@ def label_map(
     'x'
     """
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
-    present = [k for k in range(len(names)) if np.any(codes == k)]
-    place = np.full(len(names) + 1, -1)
-    place[present] = np.arange(len(present))
-    own = _label_colors(names)
-    colours = [_NO_ANSWER_COLOR, *(_light(own[k]) for k in present)]
-    norm = BoundaryNorm(np.arange(-1, len(present) + 1) - 0.5, len(colours))
-    axis.pcolormesh(x, y, place[codes], cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True)
-    entries: list[Patch | Line2D] = [Patch(color=colours[k + 1], label=names[which]) for k, which in enumerate(present)]
-    if np.any(codes < 0):
-        entries.append(Patch(color=_NO_ANSWER_COLOR, label="no result"))
+    # Code -1 is the last name.
+    names, codes = [*names, NO_RESULT], np.where(codes < 0, len(names), codes)
+    present = np.unique(codes)
+    plain = dict(zip(names, map(_light, label_colors(names)), strict=True))
+    looks: list[Look] = [HATCHED.get(names[k], {"color": plain[names[k]]}) for k in present]
+    colours = [look.get("facecolor", look.get("color")) for look in looks]
+    norm = BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present))
+    places, shown = np.searchsorted(present, codes), ListedColormap(colours)
+    mesh = axis.pcolormesh(x, y, places, cmap=shown, norm=norm, shading="nearest", rasterized=True)
+    for code, look in zip(present, looks, strict=True):
+        if "hatch" in look:
+            axis.add_patch(PathPatch(_cells_path(mesh.get_coordinates(), codes == code), rasterized=True, **look))
+    entries: list[Patch | Line2D] = [Patch(label=names[k], **look) for k, look in zip(present, looks, strict=True)]
     edges = axis.get_xlim(), axis.get_ylim()
     for kind, parts in (lines or {}).items():
         dashes, inside = _DASHES.get(kind, ":"), False
@@ -107,6 +97,19 @@ def _to_edges(
             place = 0 if end == 0 else len(along)
             across, along = np.insert(across, place, across[end] + slope * (edge - centre)), np.insert(along, place, edge)
     return across, along
+
+
+def _cells_path(corners: np.ndarray, chosen: np.ndarray) -> Path:
+    """Return one path of the chosen cells (m, n) of a map with the corners (m + 1, n + 1, 2); a hatch of many separate cells
+    takes seconds.
+
+    >>> corners = np.stack(np.meshgrid([0.0, 1.0, 2.0], [0.0, 1.0]), axis=-1)
+    >>> _cells_path(corners, np.array([[False, True]])).vertices.tolist()
+    [[1.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 1.0], [1.0, 0.0]]
+    """
+    around = (corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1], corners[:-1, :-1])
+    cells = np.stack(around, axis=2)[chosen]
+    return Path(cells.reshape(-1, 2), np.tile([Path.MOVETO, *[Path.LINETO] * 3, Path.CLOSEPOLY], len(cells)))
 
 
 def _light(colour: str) -> tuple[float, float, float]:
@@ -167,7 +170,7 @@ def points_over(
     return figure if ax is None else ax
 
 
-_MAX_BARS = 15
+_MAX_BARS = 40
 """Number of values up to which confidence intervals are drawn as bars, above it as bands."""
 
 
@@ -190,7 +193,7 @@ def shares_chart(
     'share of the cases, % (95 % confidence)'
     """
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
-    for k, (colour, (name, (share, low, high))) in enumerate(zip(_label_colors([*shares]), shares.items(), strict=True)):
+    for k, (colour, (name, (share, low, high))) in enumerate(zip(label_colors([*shares]), shares.items(), strict=True)):
         look = {"color": colour, "ls": STROKES[k % len(STROKES)], "marker": MARKERS[k % len(MARKERS)]}
         shift = 0.006 * (k - 0.5 * (len(shares) - 1)) if len(x) <= _MAX_BARS else 0.0  # bars stand beside each other
         place = x * (x[-1] / x[0]) ** shift if log else x + shift * np.ptp(x)

@@ -167,7 +167,6 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         error = f"estimated error of the end state with its phase {float(self.error):.1e}"
         error = "error not estimated" if np.isnan(self.error) else error
         rotors = [w[-1] for w in self.window.rotor_speeds]
-        rotor = "rotor" if len(rotors) == 1 else "rotors"
         stuck = [] if np.max(np.abs(rotors)) > 1.0 else start_notes(self.scene)
         if not stuck and float(jnp.abs(self.omega)) < STILL_SHARE * float(self.scene.top_speed):
             stuck = [f"the {self._turning} are almost at rest"]
@@ -189,8 +188,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  {error}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
-                f"  {self._turning} turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), "
-                f"{rotor} at {speed_text(rotors, 6)}",
+                f"  {self._turning} turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)})"
+                + self._rotors_of_loads(),
                 f"  {self.amplitude_text(self.scene)}",
                 *(f"  {line}" for line in measures_text(self.scene, self.no_vibration, self.vibration, measures)),
                 *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
@@ -211,6 +210,12 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         largest = zip(structure.coordinates, np.asarray(self.largest_displacement), structure.units, strict=True)
         named = ", ".join(f"{name} {quantity_text(x, unit, 4)}" for name, x, unit in largest)
         return f"largest on the way: {named}; foundation force {quantity_text(self.largest_force, 'N', 4)}"
+
+    def _rotors_of_loads(self) -> str:
+        """Return the final speeds of the rotors of loads as text; the speed of another rotor is that of its exciter."""
+        exciters = zip(self.scene.exciters, self.window.rotor_speeds, strict=True)
+        ends = [speeds[-1] for exciter, speeds in exciters if exciter.loads is not None]
+        return f", {'rotor' if len(ends) == 1 else 'rotors'} at {speed_text(ends, 6)}" if ends else ""
 
     @property
     def _turning(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -350,6 +351,18 @@ def case_labels(store: Store, region: slice | tuple[slice, ...]) -> _Labels:
     codes = np.where(modes > 0, first + modes - 1, codes)
     names = [*words, *(f"jammed, mode {k}" for k in range(1, 2 * store.coordinates + 2))]
     return _Labels(np.where(done, codes, -1), names)
+
+
+def label_counts(store: Store) -> list[tuple[str, int]]:
+    """Return the labels of the finished cases with their numbers of cases, the most frequent first; none without labels."""
+    if not _has_labels(store):
+        return []
+    total: Counter[str] = Counter()
+    for rows in store.pieces():
+        codes, names = case_labels(store, rows)
+        numbers = np.bincount(codes[codes >= 0].ravel(), minlength=len(names))
+        total.update({name: int(n) for name, n in zip(names, numbers, strict=True) if n})
+    return total.most_common()
 
 
 def _theory_lines(

@@ -23,8 +23,8 @@ _MAX_READ = 1_000_000
 def results_table(store: str | Path) -> tuple[str, list[str], list[list[str]]]:
     """Return the results of a study as title, heads and rows of a table, in display units.
 
-    A study with at most 40 cases has a row for each case. For more cases the table has a row for each measure: least value,
-    median and largest value, or the shares of labels, such as regimes. The table of more than a million cases is empty.
+    A study with at most 40 cases has a row for each case. For more cases the table has a row for each measure with numbers:
+    least value, median and largest value. The table of more than a million cases is empty.
     """
     opened = Store(Path(store))
     if np.prod(opened.shape, dtype=np.int64) > _MAX_READ:
@@ -37,7 +37,7 @@ def results_table(store: str | Path) -> tuple[str, list[str], list[list[str]]]:
         columns = [*(_axis_column(opened, axis) for axis in axes), *(_case_texts(opened, name) for name in named)]
         rows = [list(row) for row, finished in zip(zip(*columns, strict=True), done.ravel(), strict=True) if finished]
         return "results of the cases", heads, rows
-    rows = [[measure_label(opened, name), *_summary(opened, name, done)] for name in named]
+    rows = [[measure_label(opened, name), *_summary(opened, name, done)] for name in named if not is_label(opened, name)]
     return f"results of {np.sum(done)} cases", ["measure", "least", "median", "largest"], rows
 
 
@@ -62,12 +62,7 @@ def _case_texts(store: Store, name: str) -> list[str]:
 
 
 def _summary(store: Store, name: str, done: np.ndarray) -> list[str]:
-    """Return least value, median and largest value of a measure over the finished cases, or the shares of labels, as text."""
-    if is_label(store, name):
-        codes, names = case_labels(store, slice(None))
-        count = np.bincount(codes[done].ravel(), minlength=len(names))
-        present = [k for k in np.argsort(-count, kind="stable") if count[k]]
-        return ["", ", ".join(f"{names[k].replace('_', ' ')} {100.0 * count[k] / np.sum(done):.3g} %" for k in present), ""]
+    """Return least value, median and largest value of a measure over the finished cases as text."""
     values = display_unit(store, name)[1] * store.read(name).astype(float)[done]
     values = values[np.isfinite(values)]
     return [f"{x:.4g}" for x in np.quantile(values, [0.0, 0.5, 1.0])] if values.size else ["", "no value", ""]

@@ -60,7 +60,7 @@ Report = Callable[[Progress], None]
 
 
 class CaseCount(NamedTuple):
-    """Number of `cases` that ended with a `status`, a name of `CaseStatus`."""
+    """Number of `cases` that ended with a `status`, a name of `CaseStatus`, or in a regime or jam mode."""
 
     status: str
     cases: int
@@ -77,6 +77,8 @@ class Sweep(Result):
     - `store`: path of the store
     - `cases`: number of cases
     - `counts`: number of cases with each status
+    - `regimes`: number of finished cases in each regime, with the jam mode, the most frequent first; empty if neither was
+      measured, or if files are damaged
     - `computed`: number of cases computed in this call; `seconds`: their time, including compilation
     - `damaged`: number of cases whose files were damaged or incomplete; `sweep` has computed them again, `open_sweep` counts
       them as missing
@@ -89,6 +91,7 @@ class Sweep(Result):
     computed: int = eqx.field(metadata=in_unit(""))
     seconds: float = eqx.field(metadata=in_unit("s"))
     damaged: int = eqx.field(metadata=in_unit(""), default=0)
+    regimes: tuple[CaseCount, ...] = eqx.field(metadata=in_unit("", "regime"), default=())
 
     @property
     def data(self) -> xarray.Dataset:
@@ -109,7 +112,10 @@ class Sweep(Result):
         """Return a text about the progress of the study, the outcomes of its cases and its duration."""
         lines = [f"{self.message}: {self.cases} cases in {self.store}"]
         for name, cases in self.counts:
-            lines.append(f"  {cases} {name}: {sentence(member(CaseStatus, name))}")
+            lines.append(f"  {self._share(cases)} {name}: {sentence(member(CaseStatus, name))}")
+        lines += [f"  {self._share(cases)} {name.replace('_', ' ')}" for name, cases in self.regimes]
+        if any(name == "unsettled" for name, _ in self.regimes):
+            lines.append("  unsettled cases may settle in longer runs: increase `until`")
         if self.damaged:
             again = "they were computed again" if self.computed else "run the study again, which computes them again"
             lines.append(f"  {self.damaged} cases were in damaged or incomplete files: {again}")
@@ -119,6 +125,9 @@ class Sweep(Result):
                 f"  {self.computed} cases were computed in this call, in {self.seconds:.3g} s ({milliseconds:.3g} ms a case)"
             )
         return "\n".join(lines)
+
+    def _share(self, cases: int) -> str:
+        return f"{cases} ({100.0 * cases / self.cases:.3g} %)"
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
@@ -338,4 +347,10 @@ def _sweep_result(store: Store, states: np.ndarray, computed: int, seconds: floa
     counts = store.counts(states)
     rows = tuple(CaseCount(name, int(n)) for name, n in zip(CASE_STATUSES, counts, strict=True) if n)
     status = SweepStatus.incomplete if counts[0] else SweepStatus.done
-    return Sweep(status, str(store.path), math.prod(store.shape), rows, computed, seconds, damaged)
+    regimes: tuple[CaseCount, ...] = ()
+    if not damaged:
+        from jaxvib.sweeps.figures import label_counts  # slow import
+
+        store.is_whole = True  # every file has just been read
+        regimes = tuple(CaseCount(*pair) for pair in label_counts(store))
+    return Sweep(status, str(store.path), math.prod(store.shape), rows, computed, seconds, damaged, regimes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 import click
@@ -21,7 +22,8 @@ from jaxvib.cli.output import csv_options, fields_of
 def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
     """List the synchronous regimes of SCENE: motions in which all exciters turn at one speed; --out adds a picture of
     phases."""
-    from jaxvib.results.status import status_name  # slow imports, which --help does not need
+    from jaxvib.machine.validation import start_notes  # slow imports, which --help does not need
+    from jaxvib.results.status import status_name
     from jaxvib.steady.jams.phases import degrees
 
     loaded = loaded_scene(scene, without)
@@ -71,6 +73,7 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
             "margin: factor by which the differences of the motors' torques can grow; inf for",
             "equal motors",
             *([] if status_name(result.search) == "done" else [jv.RegimeSearchStatus[result.search]]),
+            *(textwrap.fill(note, 80) for note in start_notes(loaded)),
         ]
         blocks = (indented(f"at {speed_text(regime.speed)}, stable:", figures) for regime, figures in stable)
         return "\n".join([drawing, *notes, *blocks])

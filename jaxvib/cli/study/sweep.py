@@ -83,12 +83,9 @@ def _print_result(result: Sweep, output: Output, name: str) -> None:
         output.picture("sweep.png", result.plot)
     from jaxvib.sweeps.results import results_table  # slow import, which --help does not need
 
-    rows = [[status, str(cases), f"{100.0 * cases / result.cases:.3g} %"] for status, cases in result.counts]
-
     def text() -> str:
-        count_table = table(result.store, ["status", "cases", "share"], rows)
         title, heads, results = results_table(result.store)
-        return "\n".join([count_table, result.summary(), *([table(title, heads, results)] if results else [])])
+        return "\n".join([result.summary(), *([table(title, heads, results)] if results else [])])
 
     output.done(result.as_dict(), text, name, result)
 

@@ -135,6 +135,9 @@ def _torque(
 ) -> None:
     """Draw the torque that the vibration needs, the torque of the motor, the operating points and the folds."""
     _line(axis, curve, points, scale, "torque", 1.0, COLORS[0], "-", "needed by the vibration")
+    if points["speed"].size:
+        label = "operating point" + ("" if np.all(points["stable"]) else "; hollow: unstable")
+        axis.plot([], [], "o", ms=5.0, color=COLORS[0], label=label)
     finite = curve["torque"][np.isfinite(curve["torque"])]
     top = float(np.max(finite, initial=0.0))
     if has_motor:

@@ -13,7 +13,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxvib.boundary import validated
-from jaxvib.display import Axes, Drawn, Onto
+from jaxvib.display import Axes, Drawn, Onto, SpeedIntervals, speed_text
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import natural_frequencies, turning_loads
 from jaxvib.errors import InputError, quoted
@@ -99,7 +99,7 @@ class BalancedStates(Result):
     @validated
     def intervals(
         self, low: Number, high: Number, arrangement: int = 0, *, points: int = 200, steps: int | None = None
-    ) -> list[list[float]]:
+    ) -> SpeedIntervals:
         """Return the intervals of rotor speed, rad/s, in which an arrangement is stable, see `balanced_intervals`.
 
         **Arguments**
@@ -389,15 +389,16 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     matrix = fine_and_coarse(scene, angles, validate_steps(scene, scene.drive.speed, steps))
     fine = np.linalg.eigvals(np.asarray(matrix[0]))
     coarse = np.linalg.eigvals(np.asarray(matrix[1]))
-    growth = float(_growth_rate(fine, float(scene.drive.speed), neutral))
+    speed = float(scene.drive.speed)
+    growth = float(_growth_rate(fine, speed, neutral))
     # Half as many steps have at least 64 times the error: the order is 11 if all is resolved, and 6 if the motion of loads
     # decays in a step.
     error = float(np.max(np.min(np.abs(fine[:, None] - coarse[None, :]), axis=1))) / 63.0
     # Neutral multipliers are 1; their difference from 1 is rounding, which grows with the number of steps.
     rounding = float(np.max(np.sort(np.abs(fine - 1.0))[:neutral], initial=fine.size * np.finfo(fine.real.dtype).eps))
-    is_decided = abs(growth) * 2.0 * np.pi / float(scene.drive.speed) > error + 2.0 * rounding
+    is_decided = abs(growth) * 2.0 * np.pi / speed > error + 2.0 * rounding
     order = np.argsort(-np.abs(fine))
-    return BalancedStability(is_decided and growth < 0.0, is_decided, growth, fine[order], neutral, error)
+    return BalancedStability(is_decided and growth < 0.0, is_decided, growth, fine[order], neutral, error, speed)
 
 
 def balanced_growth(scene: Scene, speeds: Numbers, angles: ArrayLike | None = None, *, steps: int | None = None) -> np.ndarray:
@@ -433,7 +434,7 @@ def balanced_growth(scene: Scene, speeds: Numbers, angles: ArrayLike | None = No
 
 def balanced_intervals(
     scene: Scene, low: Number, high: Number, angles: ArrayLike | None = None, *, points: int = 200, steps: int | None = None
-) -> list[list[float]]:
+) -> SpeedIntervals:
     """Return the intervals [from, to] of rotor speed between `low` and `high` (rad/s) in which the balanced motion is exactly
     stable.
 
@@ -441,13 +442,15 @@ def balanced_intervals(
     1e-7 of the speed. An interval narrower than the spacing of the points can be missed. The intervals of the criterion for
     the same range are `criterion(scene).balancing`. `angles` and `steps`: as for `balanced_stability`.
 
-    **Returns** a list of pairs, rad/s. **Raises** as `balanced_stability`, and `InputError` for an empty range.
+    **Returns** a list of pairs, rad/s, which is printed in the unit of `display_units`. **Raises** as `balanced_stability`, and
+    `InputError` for an empty range.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.01, radius=0.1, drag=5.0), jv.ConstantSpeed(40.0))
-    >>> [[round(w, 2) for w in row] for row in balanced_intervals(scene, 20.0, 60.0, points=40)]
-    [[28.28, 60.0]]
+    >>> found = balanced_intervals(scene, 20.0, 60.0, points=40)
+    >>> found, round(found[0][0], 2)
+    (270.103 .. 572.958 rpm, 28.28)
     """
     low, high = (float(number(value, "rad/s", name)) for name, value in (("low", low), ("high", high)))
     if not 0.0 < low < high:
@@ -456,7 +459,7 @@ def balanced_intervals(
     stable = balanced_growth(scene, grid, angles, steps=steps) < 0.0
     changes = stability_changes(scene, grid, stable, angles, steps=steps).tolist()
     ends = [*([low] if stable[0] else []), *changes, *([high] if stable[-1] else [])]
-    return [[float(a), float(b)] for a, b in zip(ends[0::2], ends[1::2], strict=True)]
+    return SpeedIntervals([float(a), float(b)] for a, b in zip(ends[0::2], ends[1::2], strict=True))
 
 
 def stability_changes(
@@ -563,6 +566,7 @@ class BalancedStability(Result):
     - `neutral`: the number of multipliers that are 1 because the arrangements form a family (without an imbalance at least by a
       common rotation)
     - `error` of the multipliers, estimated from half the number of steps
+    - `rotor_speed`, rad/s, at which the stability was computed
     """
 
     stable: bool = eqx.field(metadata=in_unit(""))
@@ -571,6 +575,7 @@ class BalancedStability(Result):
     multipliers: np.ndarray = eqx.field(metadata=in_unit("", "floquet"))
     neutral: int = eqx.field(metadata=in_unit(""))
     error: float = eqx.field(metadata=in_unit(""))
+    rotor_speed: float = eqx.field(metadata=in_unit("rad/s"))
 
     @property
     def status(self) -> StabilityStatus:
@@ -584,8 +589,8 @@ class BalancedStability(Result):
         rate = f"at {abs(self.growth):.4g} 1/s" if self.is_decided else f"({self.growth:.4g} 1/s)"
         largest = ", ".join(f"{abs(m):.6g}" for m in self.multipliers[:3])
         return (
-            f"{self.message} {rate}; largest multipliers {largest}, {self.neutral} of them neutral, "
-            f"with an error of {self.error:.1e}"
+            f"at the rotor speed {speed_text(self.rotor_speed)}: {self.message} {rate}; "
+            f"largest multipliers {largest}, {self.neutral} of them neutral, with an error of {self.error:.1e}"
         )
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:

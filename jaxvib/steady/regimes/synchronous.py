@@ -32,7 +32,7 @@ from jaxvib.equations.torque_balance import (
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.machine.validation import validate_scene
+from jaxvib.machine.validation import start_notes, validate_scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -216,10 +216,10 @@ class SynchronousRegimes(AbstractSynchronousRegime):
         return SynchronousRegime(**jax.tree.map(lambda leaf: leaf[index], fields), scene=self.scene)
 
     def summary(self) -> str:
-        """Return a line of text for each regime."""
+        """Return a line of text for each regime, and for each motor that cannot start from rest."""
         lines = [self.select(k).summary() for k in range(self.speed.shape[0])]
         complete = lines and status_name(self.search) == "done"
-        return "\n".join(lines if complete else [*lines, RegimeSearchStatus[self.search]])
+        return "\n".join([*lines, *([] if complete else [RegimeSearchStatus[self.search]]), *start_notes(self.scene)])
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:

@@ -134,7 +134,8 @@ class Capture(Result):
         """
         from jaxvib.draw.capture import threshold_chart  # slow import
 
-        return threshold_chart(self.speed, self.fraction, self.standard_error, float(self.threshold), ax=ax)
+        error = None if self.captured.shape[1] == 1 else self.standard_error
+        return threshold_chart(self.speed, self.fraction, error, float(self.threshold), ax=ax)
 
 
 def moving_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> State:

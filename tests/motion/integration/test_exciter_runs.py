@@ -54,7 +54,9 @@ def test_a_run_of_two_motors_obeys_the_equations_by_hand():
     np.testing.assert_allclose(run.omega, np.mean(np.asarray(run.load_speed) * DIRECTION), rtol=1e-14)
     turned = [np.ptp(angle) / (run.window.time[-1] - run.window.time[0]) for angle in run.window.rotor_angles]
     np.testing.assert_allclose(np.abs(run.load_speed), turned, rtol=0.05)
-    assert "rotors at" in run.summary() and run.load_speed[0] > 0.0 > run.load_speed[1]
+    speeds = ", ".join(f"{float(speed) * 30.0 / np.pi:.6g}" for speed in run.load_speed)
+    assert f"(each: {speeds} rpm)\n" in run.summary() and "rotor" not in run.summary()
+    assert run.load_speed[0] > 0.0 > run.load_speed[1]
 
 
 def test_ensembles_of_two_motors_obey_the_equations_by_hand():
