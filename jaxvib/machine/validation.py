@@ -217,8 +217,10 @@ def start_notes(scene: Scene) -> list[str]:
             continue
         which = f" of exciter {k}" if len(scene.exciters) > 1 else ""
         weight, start = (f"{float(each):.3g} N m" for each in torques)
+        by_plate = getattr(exciter.drive, "starting_ratio", 0.0) is None
+        hint = " by Kloss's formula; give that of the catalogue as starting_ratio" if by_plate else ""
         notes.append(
-            f"the motor{which} cannot start: the weight of its unbalance needs {weight}, its starting torque is {start}"
+            f"the motor{which} cannot start: the weight of its unbalance needs {weight}, its starting torque is {start}{hint}"
         )
     return notes
 

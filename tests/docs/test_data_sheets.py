@@ -46,7 +46,10 @@ def test_the_motors_lift_their_unbalances(name, scenes):
     assert start_notes(scenes[name]) == []
     weak = PAGE.replace("930 rpm", "970 rpm")
     weak_screen = re.findall(r"```toml\n# my_screen\.toml\n(.*?)```", weak, flags=re.S)[0]
-    assert start_notes(jv.scene_from_toml(weak_screen))[0].endswith("needs 32.4 N m, its starting torque is 22.5 N m")
+    assert start_notes(jv.scene_from_toml(weak_screen))[0].endswith(
+        "needs 32.4 N m, its starting torque is 22.5 N m by Kloss's formula; give that of the catalogue as starting_ratio"
+    )
+    assert start_notes(jv.scene_from_toml(weak_screen.replace("inertia = 0.6", "inertia = 0.6, starting_ratio = 2.0"))) == []
 
 
 def test_the_table_has_its_amplitude(scenes):

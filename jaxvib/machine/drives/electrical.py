@@ -31,6 +31,15 @@ class NamePlateMotor(Motor):
     Kloss's formula then has the rated torque T_r at the rated slip s_r. The synchronous speed n_s is the lowest speed
     frequency / p above the rated speed, for a whole number p of pole pairs.
 
+    Kloss's formula gives less torque at standstill than most cage motors have. Their bars are deep or double, so that the
+    resistance of the rotor, to which s_b is proportional, grows with the frequency of its currents. With a `starting_ratio`,
+    s_b in the last formula is replaced at slips s above it by
+
+        s_b + (s - s_b) (1/u - s_b) / (1 - s_b),    u = r + sqrt(r^2 - 1),    r = breakdown_ratio / starting_ratio
+
+    The torque decreases from T_b at the slip s_b to `starting_ratio` T_r at standstill; below s_b it does not change. A saddle
+    between (pull-up torque) is not included.
+
     **Arguments** (SI, or strings with a unit)
 
     - `power`: rated mechanical power, W; typical: "0.25 kW" to "15 kW"
@@ -38,16 +47,22 @@ class NamePlateMotor(Motor):
     - `breakdown_ratio`: breakdown torque divided by rated torque, greater than 1; typical: 2 to 3.5
     - `inertia` J of the whole rotor with its unbalance, kg m^2; typical: 0.005 to 0.5
     - `frequency` of the supply, rad/s; typical: "50 Hz" (the default) or "60 Hz"
+    - `starting_ratio`: starting torque (locked rotor) divided by rated torque, M_A/M_N of catalogues; None (the default): that
+      of Kloss's formula; typical: 1.8 to 2.8
 
-    **Raises** `InputError` for a wrong unit, a value out of bounds, and a rated speed that needs more than 48 pole pairs or a
-    breakdown slip of 1 or more.
+    **Raises** `InputError` for a wrong unit, a value out of bounds, a rated speed that needs more than 48 pole pairs or a
+    breakdown slip of 1 or more, and a `starting_ratio` that is below that of Kloss's formula or above `breakdown_ratio`.
 
     >>> import jaxvib as jv
     >>> motor = jv.NamePlateMotor("4 kW", "1440 rpm", breakdown_ratio=2.8, inertia="0.02 kg m^2")
     >>> round(float(motor.speed), 2), round(float(motor.breakdown_torque), 2), round(float(motor.breakdown_slip), 4)
     (157.08, 74.27, 0.2166)
+    >>> cage = jv.NamePlateMotor("4 kW", "1440 rpm", breakdown_ratio=2.8, inertia="0.02 kg m^2", starting_ratio=2.2)
+    >>> round(float(motor.torque(0.0)), 2), round(float(cage.torque(0.0)), 2)    # N m; rated torque 26.53 N m
+    (30.73, 58.36)
 
-    Source: Kloss's formula, see `InductionMotor`, solved for the breakdown slip.
+    Source: Kloss's formula, see `InductionMotor`, solved for the breakdown slip. With a `starting_ratio` the resistance of the
+    rotor is a linear function of the slip above s_b that gives the starting torque (derived here).
     """
 
     power: Array = eqx.field(metadata=unit("W", **_POSITIVE, words="rated power of the motor"))
@@ -57,10 +72,19 @@ class NamePlateMotor(Motor):
     )
     inertia: Array = eqx.field(metadata=INERTIA)
     frequency: Array = eqx.field(metadata=unit("rad/s", **_POSITIVE, words="frequency of the supply"))
+    starting_ratio: Array | None = eqx.field(
+        metadata=unit("", **_POSITIVE, words="starting torque divided by rated torque", typical=2.2)
+    )
     kind: str = eqx.field(static=True)
 
     def __init__(
-        self, power: Number, rated_speed: Number, breakdown_ratio: Number, inertia: Number, frequency: Number = "50 Hz"
+        self,
+        power: Number,
+        rated_speed: Number,
+        breakdown_ratio: Number,
+        inertia: Number,
+        frequency: Number = "50 Hz",
+        starting_ratio: Number | None = None,
     ):
         self.power, self.rated_speed, self.breakdown_ratio, self.inertia, self.frequency = read_numbers(
             NamePlateMotor,
@@ -71,8 +95,13 @@ class NamePlateMotor(Motor):
             inertia=inertia,
             frequency=frequency,
         ).values()
+        self.starting_ratio = None
         self.kind = "name_plate_motor"
         when_known(_require_plate, self.rated_speed, self.frequency, self.breakdown_ratio, self.speed, self.breakdown_slip)
+        if starting_ratio is not None:
+            least = self.torque(jnp.zeros_like(self.speed)) * self.rated_speed / self.power
+            self.starting_ratio = read_numbers(NamePlateMotor, "drive", starting_ratio=starting_ratio)["starting_ratio"]
+            when_known(_require_starting_ratio, self.starting_ratio, least, self.breakdown_ratio)
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -93,8 +122,23 @@ class NamePlateMotor(Motor):
         return (1.0 - self.rated_speed / self.speed) * (ratio + jnp.sqrt(ratio**2 - 1.0))
 
     def torque(self, speed: Array) -> Array:
-        """Return the torque of Kloss's formula."""
-        return kloss_torque(1.0 - speed / self.speed, self.breakdown_torque, self.breakdown_slip)
+        """Return the torque of Kloss's formula, with the starting torque if it is known."""
+        slip, breakdown_slip = 1.0 - speed / self.speed, self.breakdown_slip
+        if self.starting_ratio is not None:
+            ratio = jnp.maximum(self.breakdown_ratio / self.starting_ratio, 1.0 + 1e-6)  # the root has a derivative
+            at_standstill = ratio - jnp.sqrt(ratio**2 - 1.0)  # 1/u
+            growth = (at_standstill - breakdown_slip) / (1.0 - breakdown_slip)
+            breakdown_slip = breakdown_slip + growth * jnp.maximum(slip - breakdown_slip, 0.0)
+        return kloss_torque(slip, self.breakdown_torque, breakdown_slip)
+
+
+def _require_starting_ratio(ratio: float, least: float, most: float) -> None:
+    """**Raises** `InputError` for a starting torque below that of Kloss's formula or above the breakdown torque."""
+    if not least * (1.0 - 1e-6) <= ratio < most:
+        problem = (
+            f"is {ratio:.4g}; it must be at least {least:.4g}, that of Kloss's formula, and below breakdown_ratio {most:.4g}"
+        )
+        raise InputError("drive.starting_ratio", f"{problem}; leave it out, or give a torque_table")
 
 
 def _require_plate(rated: float, frequency: float, ratio: float, synchronous: float, breakdown_slip: float) -> None:

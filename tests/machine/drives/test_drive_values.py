@@ -88,13 +88,21 @@ PARTS = {
     ),
     "name_plate_motor": (
         jv.NamePlateMotor,
-        {"power": 4e3, "rated_speed": 150.0, "breakdown_ratio": 2.8, "inertia": 0.02, "frequency": 314.0},
+        {
+            "power": 4e3,
+            "rated_speed": 150.0,
+            "breakdown_ratio": 2.8,
+            "inertia": 0.02,
+            "frequency": 314.0,
+            "starting_ratio": 2.0,
+        },
         {
             "power": ("W", POSITIVE, "rated power of the motor", "", None),
             "rated_speed": ("rad/s", POSITIVE, "rated speed of the motor", "", None),
             "breakdown_ratio": ("", "greater than 1", "breakdown torque divided by rated torque", "", 2.5),
             "inertia": INERTIA,
             "frequency": ("rad/s", POSITIVE, "frequency of the supply", "", None),
+            "starting_ratio": ("", POSITIVE, "starting torque divided by rated torque", "", 2.2),
         },
     ),
     "dc_motor_electrical": (

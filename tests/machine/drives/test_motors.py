@@ -106,6 +106,40 @@ def test_name_plate_is_near_the_equivalent_circuit():
     np.testing.assert_allclose(jax.vmap(plate.torque)(slips), jax.vmap(circuit.torque)(slips), atol=0.03 * largest)
 
 
+def test_starting_torque_is_that_of_a_growing_rotor_resistance():
+    plate = jv.NamePlateMotor("4 kW", "1440 rpm", 2.8, 0.02, starting_ratio=2.2)
+    plain = jv.NamePlateMotor("4 kW", "1440 rpm", 2.8, 0.02)
+    rated = 4000.0 / (1440.0 * np.pi / 30.0)
+    assert float(plate.torque(0.0)) == pytest.approx(2.2 * rated, rel=1e-12)
+    above = np.linspace(1.0 - float(plain.breakdown_slip), 1.1, 9) * float(plain.speed)
+    np.testing.assert_allclose(plate.torque(above), plain.torque(above), rtol=1e-12)
+
+    # An equivalent circuit without resistance of the stator, whose rotor resistance is a linear function of the slip.
+    leakage, magnetizing = 3e-3, 80e-3
+    blocked = 100.0 * np.pi * (1.0 - (magnetizing / (magnetizing + leakage)) ** 2) * (magnetizing + leakage)
+    breakdown, u = float(plain.breakdown_slip), 2.8 / 2.2 + np.sqrt((2.8 / 2.2) ** 2 - 1.0)
+
+    def circuit(slip):
+        share = max(slip - breakdown, 0.0) / (1.0 - breakdown)
+        resistance = blocked * (breakdown + share * (1.0 / u - breakdown))
+        inductances = {"stator_leakage": leakage, "rotor_leakage": leakage, "magnetizing_inductance": magnetizing}
+        motor = jv.InductionMotorCircuit("400 V", "50 Hz", 2, 1e-9, resistance, **inductances, inertia=0.02)
+        return float(motor.torque((1.0 - slip) * motor.speed))
+
+    slips = np.array([0.04, 0.1, breakdown, 0.3, 0.5, 0.8, 1.0, 1.5])
+    torques = [float(plate.torque((1.0 - slip) * plate.speed)) / float(plate.breakdown_torque) for slip in slips]
+    np.testing.assert_allclose(torques, [circuit(slip) / circuit(breakdown) for slip in slips], rtol=1e-6)
+
+
+def test_torque_falls_from_breakdown_to_standstill():
+    for ratio in (1.2, 2.0, 2.79):
+        motor = jv.NamePlateMotor("4 kW", "1440 rpm", 2.8, 0.02, starting_ratio=ratio)
+        torques = np.asarray(motor.torque(jnp.linspace(0.0, float(motor.speed) * (1.0 - float(motor.breakdown_slip)), 50)))
+        assert np.all(np.diff(torques) > 0.0) and torques[-1] == pytest.approx(float(motor.breakdown_torque))
+    slope = jax.grad(lambda r: jv.NamePlateMotor("4 kW", "1440 rpm", 2.8, 0.02, starting_ratio=r).torque(0.0))(2.0)
+    assert float(slope) == pytest.approx(4000.0 / (1440.0 * np.pi / 30.0), rel=1e-9)
+
+
 def test_dc_motor_with_inductance_equals_its_closed_form():
     motor = jv.DCMotorElectrical("24 V", "0.6 ohm", 0.08, inertia=0.002, inductance="20 mH")
     time, rotor = _rotor(_run(motor, 0.5))
@@ -193,6 +227,8 @@ def test_speed_control_equals_scipy():
         (lambda: jv.NamePlateMotor("4 kW", "3200 rpm", 2.8, 0.02), "drive.rated_speed"),
         (lambda: jv.NamePlateMotor("4 kW", "1000 rpm", 2.8, 0.02), "drive.rated_speed"),
         (lambda: jv.NamePlateMotor("4 kW", "1440 rpm", 0.9, 0.02), "drive.breakdown_ratio"),
+        (lambda: jv.NamePlateMotor("4 kW", "1440 rpm", 2.8, 0.02, starting_ratio=1.1), "drive.starting_ratio"),
+        (lambda: jv.NamePlateMotor("4 kW", "1440 rpm", 2.8, 0.02, starting_ratio=2.9), "drive.starting_ratio"),
         (lambda: jv.DCMotorElectrical("24 A", 0.6, 0.08, 0.002), "drive.voltage"),
         (lambda: jv.InductionMotorCircuit(**(KRAUSE | {"pole_pairs": 1.5})), "drive.pole_pairs"),
         (lambda: jv.TorqueTable([0.0, 100.0], [10.0, 5.0], 0.02), "drive.torques"),
