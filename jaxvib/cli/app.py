@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from jaxvib.cli.output import Output
+from jaxvib.cli.output import Output, note
 from jaxvib.errors import ComputationError, InputError, legible, quoted
 
 if TYPE_CHECKING:
@@ -61,8 +61,8 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
         if kind not in kinds:
             raise InputError("--without", f"is {quoted(kind)}; the scene's effects are: {', '.join(kinds) or 'none'}")
     scene = _without_effects(scene, without) if without else scene
-    for note in (*implausible_numbers(scene), *start_notes(scene)):
-        click.echo(f"note: {note}", err=True)
+    for each in (*implausible_numbers(scene), *start_notes(scene)):
+        note(f"note: {each}")
     return scene
 
 
@@ -82,7 +82,7 @@ def _with_final_speed(exciter: Exciter) -> Exciter:
     if not drive.ideal or drive.constant:
         return exciter
     end = float(drive.speed)
-    click.echo(f"constant speed of {speed_text(end, 6)}: the final speed of the drive ({drive.kind})", err=True)
+    note(f"constant speed of {speed_text(end, 6)}: the final speed of the drive ({drive.kind})")
     return exciter.with_parts(exciter.loads, ConstantSpeed(end), exciter.effects)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.output import fields_of
+from jaxvib.cli.output import fields_of, note
 from jaxvib.errors import InputError
 
 SEPARATION = click.option(
@@ -68,9 +68,9 @@ def measures_of(scene: jv.Scene, motion: jv.Jam | jv.PhaseJam | jv.Orbit | jv.Vi
         deck["at"] = deck["at"][0] if len(deck["at"]) == 1 else deck["at"]
     measures = jax.device_get(jv.vibration_measures(scene, motion, **deck))
     if not meta.get(_NOTED_KEY):  # one note for each command
-        for note in measures.notes():
+        for each in measures.notes():
             meta[_NOTED_KEY] = True
-            click.echo(f"note: {note}", err=True)
+            note(f"note: {each}")
     return measures
 
 
@@ -87,7 +87,7 @@ def run_measures(run: jv.Run | jv.Envelope) -> jv.VibrationMeasures | None:
     if not run.no_vibration:
         return measures_of(run.scene, run.vibration())
     if click.get_current_context().meta.get(_DECK_KEY):
-        click.echo("note: --deck, --slope: no stroke, throw and conveying, because the run ends without a vibration", err=True)
+        note("note: --deck, --slope: no stroke, throw and conveying, because the run ends without a vibration")
     return None
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import sys
+import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -43,6 +45,22 @@ _COMMA = "jaxvib.decimal_comma"
 def fields_of(result: object, *names: str) -> dict[str, object]:
     """Return fields of a result by their names, for a document."""
     return {name: getattr(result, name) for name in names}
+
+
+def note(text: str) -> None:
+    """Print a line on stderr, in place of the line of the elapsed time on a terminal."""
+    click.echo(("\r\x1b[K" if sys.stderr.isatty() else "") + text, err=True)
+
+
+def _wrapped(text: str) -> str:
+    """Return a text whose sentences do not break within a word on a terminal; continued lines are indented. Tables fit."""
+    columns = shutil.get_terminal_size().columns
+    folded = []
+    for line in text.splitlines():
+        indent = line[: len(line) - len(line.lstrip())] + "    "
+        options: dict[str, Any] = {"subsequent_indent": indent, "break_long_words": False, "break_on_hyphens": False}
+        folded.append(line if len(line) <= columns or line[:1] in "┏┃┡│└" else textwrap.fill(line, columns, **options))
+    return "\n".join(folded)
 
 
 class Output:
@@ -180,7 +198,7 @@ class Output:
         if self.as_json:
             click.echo(body)
             return
-        click.echo(text())
+        click.echo(_wrapped(text()) if sys.stdout.isatty() else text())
         for written in self.files:
             click.echo(f"wrote {written}")
 

@@ -14,7 +14,7 @@ from scenes import scene
 
 import jaxvib as jv
 from jaxvib.cli.modes import _left_out
-from jaxvib.cli.output import Output
+from jaxvib.cli.output import Output, _wrapped
 from jaxvib.machine.files import SCREENS, TEMPLATES
 from jaxvib.machine.validation import implausible_numbers
 
@@ -561,6 +561,17 @@ def test_an_interrupt_of_a_search_is_repeated_if_lost(moment):
     assert (done.returncode, done.stdout.strip(), done.stderr) == (1, "goes on", "\njaxvib: interrupted\n")
 
 
+def test_sentences_on_a_terminal_break_between_words(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    text = "  a sentence of this machine (573.172, 573.172 rpm) goes on\n" + "┃ a wide table ┃" * 5
+    first, second, wide = _wrapped(text).splitlines()
+    assert (
+        first == "  a sentence of this machine (573.172,"
+        and second == "      573.172 rpm) goes on"
+        and wide == "┃ a wide table ┃" * 5
+    )
+
+
 def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     springs = [jv.support(at=(x, 0.0), stiffness=(3e3, 3e3), damping=(150.0, 150.0)) for x in (-0.6, 0.6)]
     motor = jv.InductionMotor(100.0, breakdown_torque=60.0, breakdown_slip=0.1, inertia=0.05)
@@ -579,6 +590,9 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     shown = float(out.split("throw number ")[1].split(",")[0])
     scene = jv.load_scene(tmp_path / "screen.toml")
     np.testing.assert_allclose(shown, jv.working_regime(scene).ellipse((0.4, 0.1), slope="-5 deg").throw_number, rtol=5e-3)
+    out = typed("regimes", "screen.toml", "--tolerance", "stiffness=5%", "--json")[1]
+    speed = json.loads(out)["tolerances"][0]
+    assert speed["share"] == 1.0 and speed["low"] <= speed["high"] and speed["design"] == pytest.approx(regimes[0]["speed"])
     out = typed("regimes", "screen.toml", "--deck", "-0.4, 0.1", "--deck", "0.4,10 cm", "--json")[1]
     measures = json.loads(out)["regimes"][0]["measures"]
     deck = jv.working_regime(scene).deck([(-0.4, 0.1), (0.4, 0.1)]).ellipses

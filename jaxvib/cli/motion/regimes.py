@@ -8,18 +8,31 @@ from pathlib import Path
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import (
+    TOLERANCE,
+    WITHOUT,
+    Output,
+    app,
+    loaded_scene,
+    ranges_within,
+    require_tolerances,
+    shared,
+    table,
+    tolerance_table,
+)
 from jaxvib.cli.document import deck_options, indented, measures_of
 from jaxvib.cli.output import csv_options, fields_of
+from jaxvib.errors import InputError
 
 
 @app.command("regimes")
 @click.argument("scene", type=click.Path(path_type=Path))
 @WITHOUT
 @deck_options
+@TOLERANCE
 @csv_options
 @shared
-def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
+def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], csv: Path | None, output: Output) -> None:
     """List the synchronous regimes of SCENE: motions in which all exciters turn at one speed; --out adds a picture of
     phases."""
     from jaxvib.machine.validation import start_notes  # slow imports, which --help does not need
@@ -27,9 +40,13 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
     from jaxvib.steady.jams.phases import degrees
 
     loaded = loaded_scene(scene, without)
+    require_tolerances(loaded, tolerances)
     result = jv.synchronous_regimes(loaded)
     selected = [result.select(k) for k in range(result.speed.shape[0])]
     measures = [measures_of(loaded, regime.vibration()) if regime.stable else None for regime in selected]
+    if tolerances and not any(regime.stable for regime in selected):
+        raise InputError("--tolerance", "is for stable regimes; this scene has none, leave it out")
+    ranges = ranges_within(loaded, None, tolerances)
     output.picture("regimes.png", result.plot)
     output.csv(csv, result, "regime")
     document = {
@@ -44,6 +61,7 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
             }
             for regime, figures in zip(selected, measures, strict=True)
         ],
+        **({"tolerances": [each._asdict() for each in ranges]} if tolerances else {}),
     }
 
     def text() -> str:
@@ -76,6 +94,7 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
             *(textwrap.fill(note, 80) for note in start_notes(loaded)),
         ]
         blocks = (indented(f"at {speed_text(regime.speed)}, stable:", figures) for regime, figures in stable)
-        return "\n".join([drawing, *notes, *blocks])
+        within = [tolerance_table(ranges, tolerances)] if tolerances else []
+        return "\n".join([drawing, *notes, *blocks, *within])
 
     output.done(document, text, "regimes", result)

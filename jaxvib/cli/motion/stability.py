@@ -55,7 +55,8 @@ def stability_map(
     make, read = _scene_function_and_reader(loaded, vary)
     x = [read(value, "--value") for value in values]
     result = jv.stability_map(make, x, omega=_speed_range(omega), points=points)
-    output.picture("stability_map.png", lambda: result.plot(label=_words_of(loaded, vary)))
+    words = ", ".join(filter(None, _words_and_unit(loaded, vary)))
+    output.picture("stability_map.png", lambda: result.plot(label=words))
     rows = [
         {
             "value": float(value),
@@ -73,7 +74,7 @@ def stability_map(
             [f"{row['value']:.6g}", f"{100.0 * row['stable_share']:.3g} %", _special_text(row["special"], scale)]
             for row in rows
         ]
-        return table(f"exact jams over {vary}", [vary, "of load speeds stable", f"where stability changes, {unit}"], cells)
+        return table(f"exact jams over {vary}", [words, "of load speeds stable", f"where stability changes, {unit}"], cells)
 
     output.done({"vary": vary, "map": rows}, text, "stability_map", result)
 
@@ -106,11 +107,14 @@ def onset(
     output: Output,
 ) -> None:
     """Find the value of a parameter at which a torus bifurcation, or another special point, appears in the diagram of SCENE."""
-    make, read = _scene_function_and_reader(loaded_scene(scene, without), vary)
+    loaded = loaded_scene(scene, without)
+    make, read = _scene_function_and_reader(loaded, vary)
     low, high = (read(value, "--between") for value in between)
     found = jv.stability_onset(make, kind, (low, high), omega=_speed_range(omega), points=points, accuracy=accuracy)
     document = {"vary": vary, "kind": kind, "value": found, "accuracy": accuracy, "between": [low, high]}
-    sentence = f"{kind.replace('_', ' ')} for {vary} of {found:.6g} and above (relative accuracy {accuracy:g}, SI units)"
+    words, unit = _words_and_unit(loaded, vary)
+    value = f"{found:.6g} {unit}".rstrip()
+    sentence = f"{kind.replace('_', ' ')} for {words} of {value} and above (relative accuracy {accuracy:g})"
     output.done(document, lambda: sentence, "onset")
 
 
@@ -124,13 +128,13 @@ def _scene_function_and_reader(scene: Scene, name: str) -> tuple[Callable[[float
     return lambda x: put_numbers(scene, (parameter,), jnp.full(parameter.size, x)), parameter.value
 
 
-def _words_of(scene: Scene, name: str) -> str:
-    """Return the name of a parameter in words, with its SI unit, for an axis."""
+def _words_and_unit(scene: Scene, name: str) -> tuple[str, str]:
+    """Return the name of a parameter in words, and its SI unit."""
     from jaxvib.machine.numbers.named import find_number
 
     parameter = find_number(scene, name, "--vary")
     words = parameter.words(scene)
-    return f"{words[0] if len(words) == 1 else name}, {parameter.unit}"
+    return words[0] if len(words) == 1 else name, parameter.unit
 
 
 def _speed_range(omega: tuple[str, str]) -> tuple[float, float]:

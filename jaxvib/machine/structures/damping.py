@@ -70,7 +70,8 @@ def _constant(value: Number, field: str, stiffness: Array, mass: Array | None) -
         carried = mass if ratio[2] is None else number(ratio[2], "kg", field, low=0.0, open_low=True)
         if carried is None:
             problem = "the ratio of the critical damping 2 sqrt(k m), which needs the mass m that this spring carries"
-            raise InputError(field, f"is {quoted(value)}, {problem}; write for example {quoted(value.strip() + ' of 250 kg')}")
+            remedy = f"write for example {quoted(value.strip() + ' of 250 kg')} for a body of 500 kg on two supports"
+            raise InputError(field, f"is {quoted(value)}, {problem}; {remedy}")
         constant = 0.02 * size * jnp.sqrt(stiffness * carried)
     known = when_known(float, constant)
     return constant if known is None else known
