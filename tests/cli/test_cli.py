@@ -572,35 +572,6 @@ def test_sentences_on_a_terminal_break_between_words(monkeypatch):
     )
 
 
-def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
-    springs = [jv.support(at=(x, 0.0), stiffness=(3e3, 3e3), damping=(150.0, 150.0)) for x in (-0.6, 0.6)]
-    motor = jv.InductionMotor(100.0, breakdown_torque=60.0, breakdown_slip=0.1, inertia=0.05)
-    ends = ((-0.6, 1), (0.6, -1))
-    exciters = [jv.Exciter(drive=motor, unbalance=0.4, at=(x, 0.0), direction=way) for x, way in ends]
-    screen = jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
-    jv.save_scene(jv.Scene(screen, exciters=exciters), tmp_path / "screen.toml")
-    code, out, _ = typed("regimes", "screen.toml", "--json", "--out", "o")
-    regimes = json.loads(out)["regimes"]
-    assert code == 0 and [regime["stable"] for regime in regimes] == [True, False]
-    np.testing.assert_allclose(np.abs([regime["phases"][1] for regime in regimes]), [np.pi, 0.0], atol=1e-9)
-    assert (tmp_path / "o" / "regimes.png").stat().st_size > 10_000
-    out = typed("regimes", "screen.toml", "--deck", "0.4, 0.1", "--slope", "-5 deg")[1]
-    assert "954.887" in out and "point (0.4, 0.1) m: stroke" in out and max(map(len, out.splitlines())) <= 80
-    assert "rotation: exciter 0 anticlockwise, exciter 1 clockwise" in out and "margin: factor" in out
-    shown = float(out.split("throw number ")[1].split(",")[0])
-    scene = jv.load_scene(tmp_path / "screen.toml")
-    np.testing.assert_allclose(shown, jv.working_regime(scene).ellipse((0.4, 0.1), slope="-5 deg").throw_number, rtol=5e-3)
-    out = typed("regimes", "screen.toml", "--tolerance", "stiffness=5%", "--json")[1]
-    speed = json.loads(out)["tolerances"][0]
-    assert speed["share"] == 1.0 and speed["low"] <= speed["high"] and speed["design"] == pytest.approx(regimes[0]["speed"])
-    out = typed("regimes", "screen.toml", "--deck", "-0.4, 0.1", "--deck", "0.4,10 cm", "--json")[1]
-    measures = json.loads(out)["regimes"][0]["measures"]
-    deck = jv.working_regime(scene).deck([(-0.4, 0.1), (0.4, 0.1)]).ellipses
-    np.testing.assert_allclose(measures["point"], [[-0.4, 0.1], [0.4, 0.1]], rtol=1e-12)
-    np.testing.assert_allclose(measures["point_stroke"], 2.0 * deck.semi_major, rtol=1e-6)
-    np.testing.assert_allclose(measures["point_acceleration"], deck.acceleration, rtol=1e-6)
-
-
 @pytest.mark.parametrize("command", [("simulate", "--until", "1s"), ("settle",)])
 def test_points_of_a_deck_are_checked_before_the_run(typed, monkeypatch, command):
     for name in ("simulate", "settle"):

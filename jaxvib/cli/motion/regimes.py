@@ -37,7 +37,6 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
     phases."""
     from jaxvib.machine.validation import start_notes  # slow imports, which --help does not need
     from jaxvib.results.status import status_name
-    from jaxvib.steady.jams.phases import degrees
 
     loaded = loaded_scene(scene, without)
     require_tolerances(loaded, tolerances)
@@ -68,20 +67,9 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
         from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
 
         unit, scale = speed_unit()
-        rows = [
-            [
-                f"{scale * float(regime.speed):.6g}",
-                "stable" if regime.stable else "unstable",
-                "family" if status_name(regime.status) == "degenerate" else "",
-                " ".join(f"{degrees(float(a)):.4g}" for a in regime.phases),
-                f"{float(regime.margin):.4g}",
-                " ".join(f"{float(p):.4g}" for p in regime.power),
-                f"{float(regime.foundation_force):.4g}",
-            ]
-            for regime in selected
-        ]
-        if not rows:
+        if not selected:
             return result.summary()
+        rows = [_row(regime, scale) for regime in selected]
         head = [unit, "", " ", "phases, degrees", "margin", "power, W", "foundation force, N"]
         drawing = table("synchronous regimes; phases in the direction of rotation, force zero to peak", head, rows)
         stable = [(regime, figures) for regime, figures in zip(selected, measures, strict=True) if figures is not None]
@@ -98,3 +86,19 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
         return "\n".join([drawing, *notes, *blocks, *within])
 
     output.done(document, text, "regimes", result)
+
+
+def _row(regime: jv.SynchronousRegime, scale: float) -> list[str]:
+    """Return a regime as a row of the table; `scale` converts rad/s to the display unit."""
+    from jaxvib.results.status import status_name  # slow imports, which --help does not need
+    from jaxvib.steady.jams.phases import degrees
+
+    return [
+        f"{scale * float(regime.speed):.6g}",
+        "stable" if regime.stable else "unstable",
+        "family" if status_name(regime.status) == "degenerate" else "",
+        " ".join(f"{degrees(float(a)):.4g}" for a in regime.phases),
+        f"{float(regime.margin):.4g}",
+        " ".join(f"{float(p):.4g}" for p in regime.power),
+        f"{float(regime.foundation_force):.4g}",
+    ]

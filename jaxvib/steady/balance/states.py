@@ -162,7 +162,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
     - Loads in two planes at s_1 and s_2 cancel in each plane the part of the imbalance that acts there, (W - s_2 U)/(s_1 - s_2)
       and (W - s_1 U)/(s_2 - s_1). The arrangements of both planes are combined
 
-    Each arrangement has its `stability()`, its `growth(speeds)` and the stable `intervals(low, high)` of rotor speed.
+    Each arrangement has `stability()`, `growth(speeds)` and stable `intervals(low, high)` of rotor speed.
 
     **Arguments**: `scene` with loads on a circle in one plane or in two planes; typical: 2 to 4 loads in each plane, an
     imbalance up to the sum of m_j R_j.
@@ -386,9 +386,8 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     Source: Floquet's theorem; Radau's method of Hairer, Wanner, Solving Ordinary Differential Equations II, section IV.5.
     """
     angles, neutral = _arrangement(scene, angles)
-    matrix = fine_and_coarse(scene, angles, validate_steps(scene, scene.drive.speed, steps))
-    fine = np.linalg.eigvals(np.asarray(matrix[0]))
-    coarse = np.linalg.eigvals(np.asarray(matrix[1]))
+    matrices = fine_and_coarse(scene, angles, validate_steps(scene, scene.drive.speed, steps))
+    fine, coarse = (np.linalg.eigvals(np.asarray(each)) for each in matrices)
     speed = float(scene.drive.speed)
     growth = float(_growth_rate(fine, speed, neutral))
     # Half as many steps have at least 64 times the error: the order is 11 if all is resolved, and 6 if the motion of loads
@@ -448,9 +447,8 @@ def balanced_intervals(
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.01, radius=0.1, drag=5.0), jv.ConstantSpeed(40.0))
-    >>> found = balanced_intervals(scene, 20.0, 60.0, points=40)
-    >>> found, round(found[0][0], 2)
-    (270.103 .. 572.958 rpm, 28.28)
+    >>> balanced_intervals(scene, 20.0, 60.0, points=40)
+    270.103 .. 572.958 rpm
     """
     low, high = (float(number(value, "rad/s", name)) for name, value in (("low", low), ("high", high)))
     if not 0.0 < low < high:
@@ -559,8 +557,7 @@ class BalancedStability(Result):
 
     **Attributes**
 
-    - `stable`: True if deviations decay
-    - `is_decided`: True if the growth over a turn is larger than the error of the computation
+    - `stable`: True if deviations decay; `is_decided`: True if the growth over a turn exceeds the error of the computation
     - `growth`, 1/s: the largest growth rate of a deviation (if negative: the slowest decay), without neutral directions
     - `multipliers` (2 (nd + N),), complex, the largest first
     - `neutral`: the number of multipliers that are 1 because the arrangements form a family (without an imbalance at least by a
