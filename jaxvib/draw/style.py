@@ -123,18 +123,18 @@ def panels(
     return figure, list(grid.ravel())
 
 
-def log_places(low: float, high: float, most: int = 9) -> LogLocator:
+def log_places(low: float, high: float, max_ticks: int = 9) -> LogLocator:
     """Return the tick positions of a logarithmic axis.
 
-    On an axis of three decades or more they are at most `most` powers of ten; on a shorter axis also values between powers of
-    ten.
+    An axis of three decades or more has ticks at powers of ten, at most `max_ticks` of them. A shorter axis also has ticks
+    between powers of ten.
 
     >>> [float(x) for x in log_places(0.4, 3.0).tick_values(0.4, 3.0) if 0.4 < x < 3.0]
     [0.5, 1.0, 2.0]
     """
     decades = math.log10(high / low)
     if decades >= 3.0:
-        return LogLocator(numticks=most)
+        return LogLocator(numticks=max_ticks)
     between = (1.0, 2.0, 5.0) if decades > 0.6 else (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
     return LogLocator(subs=(1.0, 3.0) if decades > 1.5 else between)
 
@@ -223,7 +223,7 @@ def join_names(named: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:
     """
     groups: list[list[tuple[float, str]]] = []
     for share, name in named:
-        # Near the last name of a group, but not far from its first, because the text stands between both.
+        # A name joins a group if it is near the last name and not far from the first one, because the text stands between both.
         first, last = (groups[-1][0][0], groups[-1][-1][0]) if groups else (-1.0, -1.0)
         near = share - last < 0.045 and share - first < 0.09
         groups = [*groups[:-1], [*groups[-1], (share, name)]] if near else [*groups, [(share, name)]]

@@ -34,7 +34,7 @@ def campbell_diagram(
     - `rotor_speed` (ns,), `speed` (ns, nd): rotor speed and whirl speeds, rad/s, drawn in `unit`
     - `sense` (ns, nd): "forward", "backward" or "straight"
     - `critical`: critical speeds (k,), rad/s, and their senses (k,), marked on the line w = n with their values
-    - `at`: operating speed, rad/s; default: a single rotor speed
+    - `at`: operating speed, rad/s; default: the rotor speed if there is only one, otherwise none
 
     >>> import numpy as np
     >>> n = np.linspace(0.0, 2.0, 5)

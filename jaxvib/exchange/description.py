@@ -81,7 +81,7 @@ def describe_model(
 ) -> str:
     """Return the text of modelDescription.xml.
 
-    **Arguments**: `name` and `identifier` of the model; `token`: text that must be equal in the binary; `variables` in the
+    **Arguments**: `name` and `identifier` of the model; `token`: text that the binary must contain too; `variables` in the
     order of their value references; `step` of co-simulation and `stop` time of the default experiment, s.
     """
     is_version_2 = fmi == "2.0"

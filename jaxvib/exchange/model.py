@@ -203,11 +203,11 @@ def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
         force = assemble(scene).foundation_force(state.displacement, state.velocity)
         are_outputs = [exciter.drive.ideal and not by_input for exciter in scene.exciters]
         turning = [exciter.turning_drive for exciter in scene.exciters]
-        known = [
+        rotor_outputs = [
             (each.rotor_angle(t, None), each.rotor_speed(t, None)) if is_output else None
             for each, is_output in zip(turning, are_outputs, strict=True)
         ]
-        return States(rate, tuple(inputs.speed for inputs in values.rotors)), Outputs(force, tuple(known))
+        return States(rate, tuple(inputs.speed for inputs in values.rotors)), Outputs(force, tuple(rotor_outputs))
 
     signals = [*state_signals(scene, start), *angle_signals]
     acceleration = iter(coordinate_signals(carrier, "acceleration", 2))

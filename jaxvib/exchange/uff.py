@@ -102,8 +102,8 @@ def export_uff(
 ) -> Path:
     """Write a universal file (58, 55, 15, 82, 151, 164) of a scene or of a run.
 
-    - Frequency responses of a `Scene`: one function for each node and direction, to a force at each exciter in each of its
-      directions, at evenly spaced frequencies
+    - Frequency responses of a `Scene` at evenly spaced frequencies: one function for each pair of a response (node and
+      direction) and a force (exciter and direction)
     - Natural modes of a `Scene`: undamped (normal modes) for machines that move up and down; damped, at the rotor speed
       (complex modes, the whirl), for machines that move horizontally and vertically
     - Histories of a `Run`: the motion of every node and the force on the foundation (node 0), and the amplitude spectra at the
@@ -347,7 +347,7 @@ def read_uff(path: str | Path) -> UffFile:
     """Read histories and frequency response functions (dataset 58) and nodes (15, 2411) of a universal file, in SI units.
 
     The abscissa may be evenly or unevenly spaced, the data text or binary, real or complex. Values are converted to SI by
-    dataset 164; a file without that dataset is taken as SI.
+    dataset 164; a file without this dataset is assumed to be in SI units.
 
     **Arguments**: `path` of the file.
 

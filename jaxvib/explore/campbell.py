@@ -31,7 +31,7 @@ _LEGEND = {
     "operating speed": OPERATING,
     "critical speeds (no damping), rpm": _CRITICAL,
 }
-"""Styles of lines and dots by kind."""
+"""Styles of the lines and dots in the legend, by their names."""
 
 
 def campbell(result: Whirl, at: float) -> str:

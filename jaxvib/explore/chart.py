@@ -25,7 +25,7 @@ _LEGEND = {
     "rotor speed": ROTOR,
     "operating speed; numbers: jam modes": OPERATING,
 }
-"""Styles of lines by kind."""
+"""Styles of the lines in the legend, by their names."""
 
 
 def chart(result: Branches, max_speed: float) -> str:

@@ -86,7 +86,7 @@ class Panel:
         return _ticks(MaxNLocator(_MAX_TICKS).tick_values(*self.x), self.x)
 
     def _y_ticks(self) -> list[tuple[float, str]]:
-        locator = log_places(*self.y, most=_MAX_TICKS) if self.log else MaxNLocator(_MAX_TICKS)
+        locator = log_places(*self.y, max_ticks=_MAX_TICKS) if self.log else MaxNLocator(_MAX_TICKS)
         return _ticks(locator.tick_values(*self.y), self.y)
 
 

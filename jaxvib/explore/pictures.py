@@ -143,8 +143,8 @@ def heading(scene: Scene) -> str:
 def diagram(scene: Scene, max_speed: float) -> str:
     """Draw the branch diagram with the force chart for a machine that moves up and down, or the Campbell diagram of a rotor.
 
-    **Arguments**: `max_speed`: the highest rotor speed in the diagram, rad/s; a value below 1.15 times the rotor speed of the
-    scene is replaced by that value.
+    **Arguments**: `max_speed`: the highest rotor speed in the diagram, rad/s; the diagram always reaches at least 1.15 times
+    the rotor speed of the scene.
 
     **Returns** the text of an SVG file. **Raises** `InputError` for a scene without such a diagram; the message names the part
     of the scene that prevents it.
@@ -171,10 +171,11 @@ def readings(scene: Scene) -> str:
 
 
 def modes_of(scene: Scene) -> list[int]:
-    """Return the jam modes in which `machine` can show the machine moving: those that are stable by slope.
+    """Return the numbers of the jam modes that `machine` can animate: the modes that are stable by slope.
 
-    Modes that exist at the rotor speed of the scene come first. Within both groups the mode at the highest resonance is first,
-    and the mode beyond all resonances is last. The list is empty for a machine that moves in two directions.
+    Modes that exist at the rotor speed of the scene come first, then the modes that do not. In each group the mode at the
+    highest resonance comes first, and the mode above all resonances last. The list is empty for a machine that moves in two
+    directions.
     """
     if not has_branches(scene):
         return []

@@ -65,8 +65,9 @@ def require_free(port: int) -> None:
 def guarded(page: _Page, token: str, port: int) -> _Page:
     """Return an ASGI application that forwards only requests of the page at `/token/` to `page`; others receive an empty 404.
 
-    The header Host must be this computer with `port`; this rejects sites whose name points to this computer (DNS rebinding). If
-    the header Origin is present, which browsers add to requests of other sites and to all websockets, it must agree with Host.
+    The header Host must name this computer and `port`. This rejects sites whose name points to this computer (DNS rebinding).
+    Browsers add the header Origin to requests of other sites and to all websockets; if the header is present, it must agree
+    with Host.
     """
     hosts = [f"{name}:{port}".encode() for name in (_HOST, "localhost")]
 

@@ -81,9 +81,9 @@ class Growth(Result):
 
     def summary(self) -> str:
         """Return the exponent and the horizon as text."""
-        least = "at least " if self.status_name == "undecided" else ""
-        lasts = "" if math.isinf(self.horizon) else f", horizon {least}{self.horizon:.3g} s"
-        return f"{self.message}: largest Lyapunov exponent {self.exponent:.3g} +- {self.uncertainty:.1g} 1/s{lasts}"
+        at_least = "at least " if self.status_name == "undecided" else ""
+        horizon = "" if math.isinf(self.horizon) else f", horizon {at_least}{self.horizon:.3g} s"
+        return f"{self.message}: largest Lyapunov exponent {self.exponent:.3g} +- {self.uncertainty:.1g} 1/s{horizon}"
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:

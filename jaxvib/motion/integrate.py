@@ -188,7 +188,7 @@ def integrate(
     window = trajectory(model, times, states)
     whole_run = trajectory(model, solution.ts[2], motion.unpack(solution.ys[2])) if plan.samples else None
     measured = partial(measure, model, field, times, states, unit)
-    # For a run with larger steps only the states are needed; it is not measured.
+    # The second run, with larger steps, only estimates the error. It needs the states of its window, but no measurement.
     numbers = measured() if is_measured is None else jax.lax.cond(is_measured, measured, partial(unmeasured, model, states))
     # The speeds of ideal drives are not in the states.
     numbers, whole_run, speeds = where_start_exists((numbers, whole_run, window.rotor_speeds))
@@ -290,7 +290,7 @@ def _status(result: diffrax.RESULTS, is_bounded: Array) -> RunStatus:
 
 
 def _stages(solver: diffrax.AbstractSolver) -> int:
-    """Return the number of evaluations of the vector field in a step; 0 for a method that does not state it."""
+    """Return the number of evaluations of the vector field in a step; 0 if the method has no tableau."""
     tableau = getattr(solver, "tableau", None)
     return 0 if tableau is None else tableau.num_stages - tableau.fsal
 

@@ -197,13 +197,16 @@ def plan_run(
         max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_STEPS_FACTOR) * fastest, end)
     if (solver := stiff if solver is None else solver) is None and not known and end.dtype.itemsize >= 8:
         solver = _solver_for_derivatives(adjoint)
-    kept, most = samples if save == "all" else 0, min(count(max_steps, "max_steps"), MAX_STEPS)
+    saved_samples, step_limit = samples if save == "all" else 0, min(count(max_steps, "max_steps"), MAX_STEPS)
+    integration = IntegrationPlan(
+        solver, control, adjoint, saved_samples, periods, (fastest, slowest), step_limit, progress_meter
+    )
     return RunPlan(
         given_scene=given_scene,
         scene=scene,
         end=end,
         state=state,
-        integration=IntegrationPlan(solver, control, adjoint, kept, periods, (fastest, slowest), most, progress_meter),
+        integration=integration,
         stretches=_stretches(scene, end, state, fastest) if known and save == "window" else 1,
         is_known=known,
         is_estimated=is_estimated,
@@ -213,15 +216,15 @@ def plan_run(
 
 
 def _solver_for_derivatives(adjoint: diffrax.AbstractAdjoint | None) -> LoopDopri8:
-    """Return the method of a run that the caller may differentiate; derivatives of the unrolled step take several times as long
-    to compile."""
+    """Return the method of a run that the caller may differentiate: the method in a loop, because the compilation of a
+    derivative of the unrolled step takes several times as long."""
     forward = isinstance(adjoint, diffrax.ForwardMode)
     return LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
 
 
 def _stretches(scene: Scene, end: Array, state: State, fastest: Array | np.ndarray) -> int:
-    """Return the number of consecutive integrations; in single precision it is above 1 for long runs, because time would lose
-    its digits."""
+    """Return the number of consecutive integrations. It is above 1 for long runs in single precision, which cannot resolve a
+    step at a late time."""
     if state.displacement.dtype.itemsize >= 8 or len(scene.exciters) != 1 or not scene.drive.constant:
         return 1
     return max(1, math.ceil(float(end * fastest) / (2.0 * math.pi * _STRETCH_TURNS)))

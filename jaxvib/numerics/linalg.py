@@ -16,7 +16,7 @@ _MAX_UNROLLED_EQUATIONS = 8
 """Largest number of equations for which `eliminate` is as fast as a library call for each system of a batch."""
 
 MAX_EIGENVALUE_ERROR = 1e-2
-"""Largest relative error of a valid eigenvalue; beyond it, its digits are lost to rounding."""
+"""Largest relative error of a valid eigenvalue. An eigenvalue with a larger error has lost its digits to rounding."""
 
 _compiled = functools.partial(jax.jit, inline=True)
 """Decorator that compiles functions with loops. Without it, JAX would trace and compile them at each call outside a program."""
@@ -199,8 +199,8 @@ def small_solve(a: Array, b: Array) -> Array:
         return _unrolled_solve(a, b)
     if n <= _MAX_UNROLLED_EQUATIONS:
         return eliminate(a, b)
-    both = jnp.result_type(a, b)
-    a, b = a.astype(both), b.astype(both)
+    dtype = jnp.result_type(a, b)
+    a, b = a.astype(dtype), b.astype(dtype)
     return jax.lax.custom_linear_solve(
         lambda x: a @ x, b, lambda _, right: solve_in_turn(a, right), lambda _, right: solve_in_turn(a.T, right)
     )
@@ -225,7 +225,7 @@ def _unrolled_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Arr
 
 
 def _adjugate(a: Array) -> tuple[Array, Array]:
-    """Return adj(a) and det(a) of a matrix 2 x 2 or 3 x 3: a adj(a) = det(a) 1."""
+    """Return the adjugate adj(a) and the determinant det(a) of a matrix 2 x 2 or 3 x 3: a adj(a) = det(a) I."""
     if a.shape[0] == 2:
         cofactors = a[::-1, ::-1] * np.array([[1.0, -1.0], [-1.0, 1.0]], a.dtype)
     else:

@@ -170,14 +170,16 @@ def bounded(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return 1.0 / ratio_plus_z, np.sqrt(ratio * ratio_plus_z)
 
 
-def autoregression(residual: np.ndarray, used: np.ndarray | None = None, most: int = _MAX_ORDER) -> tuple[np.ndarray, float]:
+def autoregression(
+    residual: np.ndarray, used: np.ndarray | None = None, max_order: int = _MAX_ORDER
+) -> tuple[np.ndarray, float]:
     """Return the filter that turns noise into white noise, and the standard deviation of the white noise.
 
         e_k = r_k + a_1 r_{k-1} + ... + a_p r_{k-p}
 
     The coefficients solve the Yule-Walker equations; the order p has the smallest Bayesian information criterion.
 
-    **Arguments**: `residual` r (n,); `used` (n,): False for samples to leave out; `most`: largest order.
+    **Arguments**: `residual` r (n,); `used` (n,): False for samples to leave out; `max_order`: largest order.
 
     **Returns** (1, a_1, ..., a_p) and the standard deviation of e.
 
@@ -192,18 +194,18 @@ def autoregression(residual: np.ndarray, used: np.ndarray | None = None, most: i
     """
     used = np.isfinite(residual) if used is None else used & np.isfinite(residual)
     n = int(np.count_nonzero(used))
-    most = max(min(most, n // 20), 0)
+    max_order = max(min(max_order, n // 20), 0)
     r = np.where(used, residual, 0.0)
     size = 2 ** int(np.ceil(np.log2(2 * r.size + 1)))
     spectra = [np.fft.rfft(each, size) for each in (r, used.astype(float))]
-    product, pairs = (np.fft.irfft(np.abs(each) ** 2, size)[: most + 1] for each in spectra)
+    product, pairs = (np.fft.irfft(np.abs(each) ** 2, size)[: max_order + 1] for each in spectra)
     covariance = product / np.maximum(pairs, 1.0)
     if covariance[0] <= 0.0:
         return np.ones(1), 0.0
     # Levinson's recursion gives the coefficients of every order.
     taps, variance = np.ones(1), float(covariance[0])
-    best, least = (taps, variance), n * np.log(variance)
-    for order in range(1, most + 1):
+    best, best_criterion = (taps, variance), n * np.log(variance)
+    for order in range(1, max_order + 1):
         reflection = -float(taps @ covariance[order:0:-1]) / variance
         longer = np.concatenate([taps, [0.0]])
         taps = longer + reflection * longer[::-1]
@@ -211,8 +213,8 @@ def autoregression(residual: np.ndarray, used: np.ndarray | None = None, most: i
         if variance <= 1e-12 * covariance[0]:
             break
         criterion = n * np.log(variance) + order * np.log(n)
-        if criterion < least:
-            best, least = (taps, variance), criterion
+        if criterion < best_criterion:
+            best, best_criterion = (taps, variance), criterion
     return best[0], float(np.sqrt(best[1]))
 
 
@@ -223,7 +225,8 @@ def colored_covariance(slopes: np.ndarray, residual: np.ndarray) -> np.ndarray:
 
     R is the covariance of the noise by `autoregression` of the residuals. For white residuals this is the usual covariance.
 
-    **Arguments**: `slopes` J (n, p), derivatives of the residuals by the parameters; `residual` (n,), evenly sampled.
+    **Arguments**: `slopes` J (n, p), derivatives of the residuals with respect to the parameters; `residual` (n,), evenly
+    sampled.
 
     >>> slopes, noise = np.ones((4000, 1)), np.random.default_rng(0).normal(size=4000)
     >>> round(float(colored_covariance(slopes, noise)[0, 0] * 4000), 1)

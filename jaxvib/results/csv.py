@@ -50,7 +50,7 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
         writer.writerow(table)
         shown = (lambda x: _shown(x).replace(".", ",")) if decimal_comma else _shown
         rows = ([shown(x) for x in row] for row in zip(*table.values(), strict=True))
-        writer.writerows(row for row, _ in itertools.groupby(rows))  # curves repeat the points at which pieces of them meet
+        writer.writerows(row for row, _ in itertools.groupby(rows))  # a point at which two pieces of a curve meet occurs twice
     return path
 
 
@@ -70,15 +70,15 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
             continue
         for place in np.ndindex(values.shape[1:]):
             places = [_label(labels, a, k, n) for a, k, n in zip(axes[1:], place, values.shape[1:], strict=True)]
-            own = _own_unit(unit, axes[1:], place, units)
+            column_unit = _own_unit(unit, axes[1:], place, units)
             head, column = " ".join([name, *filter(None, places)]), values[(slice(None), *place)]
             parts = [("real ", np.real(column)), ("imaginary ", np.imag(column))] if np.iscomplexobj(column) else [("", column)]
             for part, numbers in parts:
-                if display and own and np.issubdtype(numbers.dtype, np.floating):
-                    own_size = float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers)))
-                    own, factor = shown_unit(own, own_size)
+                if display and column_unit and np.issubdtype(numbers.dtype, np.floating):
+                    largest = float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers)))
+                    column_unit, factor = shown_unit(column_unit, largest)
                     numbers = factor * numbers
-                table[f"{part}{head}" + (f" ({own})" if own else "")] = numbers
+                table[f"{part}{head}" + (f" ({column_unit})" if column_unit else "")] = numbers
     if not table:
         known = sorted({axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes)})
         raise InputError("axis", f"is {quoted(axis)}; the axes of {type(result).__name__} are: {', '.join(known) or 'none'}")

@@ -28,8 +28,8 @@ class Share(NamedTuple):
 
     Returned by `estimate_share`.
 
-    **Attributes**: its `value`; `low` and `high`: Wilson's confidence interval of 95 % for the probability; the number of
-    `hits`, in which the statement is true, and of all `cases`.
+    **Attributes**: its `value`; `low` and `high`: Wilson's confidence interval of 95 % for the probability; `hits`: number of
+    cases in which the statement is true; `cases`: number of all cases.
     """
 
     value: float
@@ -40,7 +40,7 @@ class Share(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The share in percent, with its interval and its numbers of cases."""
+        """The share in percent, with its interval and the numbers of hits and cases."""
         low, high = 100.0 * self.low, 100.0 * self.high
         return f"{self.hits} of {self.cases} runs, {100.0 * self.value:.3g} % (95 % interval: {low:.3g} to {high:.3g} %)"
 

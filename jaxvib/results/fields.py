@@ -27,7 +27,7 @@ Plain: TypeAlias = "bool | int | float | str | list[Plain] | dict[str, Plain] | 
 """Values that JSON can represent."""
 
 Labels: TypeAlias = Mapping[str, Sequence[str]]
-"""Labels along axes by the axis's name, and the units of the coordinates by the name "unit"."""
+"""Labels of the points on each axis by the name of the axis; the entry "unit" contains the units of the coordinates."""
 
 Column: TypeAlias = tuple[str, tuple[str, ...], np.ndarray, str]
 """Name of an array, names of its axes, values and unit."""
@@ -105,7 +105,7 @@ def as_dict(result: eqx.Module) -> dict[str, Plain]:
 
 
 def plain(value: object) -> Plain:
-    """Return a value as JSON can represent it, see `as_dict`. **Raises** `TypeError` for a value of another class."""
+    """Return a value in a form that JSON can represent, see `as_dict`. **Raises** `TypeError` for a value of another class."""
     if is_status(value):
         return status_names(value).tolist()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -128,8 +128,8 @@ def plain(value: object) -> Plain:
 
 
 def _plain_fields(value: DataclassInstance) -> dict[str, Plain]:
-    found = {field.name: (field.metadata, getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return {name: known["write"](part) if "write" in known else plain(part) for name, (known, part) in found.items()}
+    entries = {field.name: (field.metadata, getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return {name: meta["write"](entry) if "write" in meta else plain(entry) for name, (meta, entry) in entries.items()}
 
 
 def to_xarray(result: eqx.Module) -> xarray.Dataset:
@@ -170,7 +170,8 @@ def is_single(result: eqx.Module) -> bool:
 
 
 def labels_of(result: eqx.Module) -> Labels:
-    """Return the labels of axes by the axis's name, and the units of the coordinates by the name "unit"."""
+    """Return the labels of the points on each axis by the name of the axis; the entry "unit" contains the units of the
+    coordinates."""
     labels: dict[str, Sequence[str]] = {}
     for field in dataclasses.fields(result):
         if "labels" in field.metadata and getattr(result, field.name) is not None:

@@ -104,8 +104,8 @@ _READ_ERRORS = (
 def _arrays(file: Any) -> dict[str, np.ndarray]:
     """Return the arrays of an archive by name.
 
-    **Raises** an error of `_READ_ERRORS` if an entry is compressed, or if the entries are larger than the file, because a few
-    bytes of such an entry can fill any memory.
+    **Raises** an error of `_READ_ERRORS` if an entry is compressed, or if the entries are larger than the file: a few bytes of
+    such an entry could expand to more than the memory can hold.
     """
     with zipfile.ZipFile(file) as archive:
         entries = archive.infolist()
@@ -138,7 +138,7 @@ def _digest(layout: str, arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def _encoded(value: object, arrays: dict[str, np.ndarray]) -> Plain:
-    """Return a value as JSON can represent it, with names in place of its arrays, which are added to `arrays`."""
+    """Return a value in a form that JSON can represent. Its arrays are added to `arrays` and replaced by their names."""
     if value is None or (isinstance(value, (bool, int, float, str)) and not isinstance(value, np.generic)):
         return value
     if is_status(value):
@@ -184,7 +184,10 @@ def _class(kind: type) -> str:
 
 
 def _decoded(value: Any, arrays: Mapping[str, np.ndarray], read: Callable[[str], object] | None = None) -> Any:
-    """Return the value of which `value` is the encoded form; `read` is the function of the metadata `as_text` of a field."""
+    """Return the value that `_encoded` stored as `value`.
+
+    **Arguments**: `read`: the function `read` of `as_text`, for a field that is stored as text.
+    """
     if isinstance(value, str) and CONTROL.search(value):
         raise ValueError("control characters")
     if isinstance(value, list):

@@ -15,8 +15,8 @@ from jaxvib.results.fields import is_single
 from jaxvib.results.status import is_status, sentence
 
 _MAX_ENTRIES = 12
-"""Largest number of entries of an array that are all shown; of a larger array the shape, the smallest and the largest value are
-shown."""
+"""Largest number of entries of an array whose entries are all shown. For a larger array the shape, the smallest and the largest
+value are shown."""
 
 
 class Readable(eqx.Module):
@@ -33,7 +33,8 @@ class Readable(eqx.Module):
     """
 
     def __repr__(self) -> str:
-        """Return the summary of a single result, otherwise values and units of all fields; for a traced object its shapes."""
+        """Return a text: the summary of a single result; the values and units of all fields of another object; the shapes of a
+        traced object."""
         if not _has_values(self):
             return super().__repr__()
         summary = getattr(self, "summary", None)
@@ -43,7 +44,7 @@ class Readable(eqx.Module):
 
 
 def values_text(values: object, unit: str = "", digits: int = 5) -> str:
-    """Return numbers of any shape in their display unit as text: all of a few, otherwise their shape and range.
+    """Return numbers of any shape in their display unit as text: all of up to 12 numbers, otherwise their shape and range.
 
     **Arguments**: `values` in the SI `unit`; `digits`: significant digits.
 

@@ -27,7 +27,7 @@ def is_status(value: object) -> TypeGuard[eqx.Enumeration]:
 
 
 def member(enumeration: type[Status], names: str | np.ndarray) -> Status:
-    """Return the member of a name, or an array of members for an array of names (any shape), on JAX's device.
+    """Return the member with a name, or an array of members for an array of names of any shape, on JAX's device.
 
     >>> bool(member(Computed, "done") == Computed.done)
     True

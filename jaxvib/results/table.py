@@ -35,7 +35,7 @@ class TextTable(NamedTuple):
     - `heads` and `units`: texts of the line of names and of the line below it, an empty list without such a line
     - `width`: number of columns
     - `remarks`: lines above the head, and those that begin with #
-    - `first`: number of lines above the first row of numbers, without empty lines and lines that begin with #
+    - `first`: number of lines above the first row of numbers; empty lines and lines that begin with # do not count
     - `mark`: character between columns, None for blanks, a line break for one column
     """
 
@@ -53,7 +53,8 @@ class TextTable(NamedTuple):
         **Arguments**: `places` of the columns, from 0; their `names` for messages; `missing`: True to return NaN for readings
         that are empty or NaN.
 
-        **Raises** `InputError` with the line, for a row of another width and for a text that is not a finite number.
+        **Raises** `InputError`, which names the line, for a row with another number of columns and for a text that is not a
+        finite number.
         """
         try:
             mark = None if self.mark == _ONE_COLUMN_MARK else self.mark
@@ -72,7 +73,7 @@ class TextTable(NamedTuple):
         return itertools.islice(_content(self.path), self.first, None)
 
     def _texts(self) -> Iterator[str]:
-        """Yield the rows for NumPy. **Raises** `ValueError` for a row of another width."""
+        """Yield the rows for NumPy. **Raises** `ValueError` for a row with another number of columns."""
         for _, text in self._rows():
             if (len(text.split()) if self.mark is None else text.count(self.mark) + 1) != self.width:
                 raise ValueError
@@ -124,14 +125,14 @@ def read_table(path: str | Path, needs: str) -> TextTable:
     start = 0
     if not _is_table(texts[: count + 2], mark):
         for k in range(1, len(texts) - 1):
-            own = _mark(texts[k:])
-            if _has_number(texts[k], own) or not _has_number(texts[k + 1], own) or not _is_table(texts[k : k + 3], own):
+            this = _mark(texts[k:])
+            if _has_number(texts[k], this) or not _has_number(texts[k + 1], this) or not _is_table(texts[k : k + 3], this):
                 continue
-            alike = [above for above in texts[:k] if _is_table([above, texts[k]], own)]
-            if any(_has_number(above, own) for above in alike):  # numbers above the names: the table is damaged
+            alike = [above for above in texts[:k] if _is_table([above, texts[k]], this)]
+            if any(_has_number(above, this) for above in alike):  # numbers above the names: the table is damaged
                 break
-            two = bool(alike) and alike[-1] == texts[k - 1] and len(_cells(texts[k], own)) > 1
-            start, mark, count = (k - 1, own, 2) if two else (k, own, 1)
+            has_units = bool(alike) and alike[-1] == texts[k - 1] and len(_cells(texts[k], this)) > 1
+            start, mark, count = (k - 1, this, 2) if has_units else (k, this, 1)
             break
     if start + count == len(texts):
         raise InputError(str(path), "contains no lines of numbers below its header")
@@ -180,15 +181,15 @@ def _content(path: Path) -> Iterator[tuple[int, str]]:
     return ((k, text) for k, text in _lines(path) if text.strip() and not text.startswith("#"))
 
 
-def _lines(path: Path, most: int | None = None) -> Iterator[tuple[int, str]]:
-    """Yield the number, from 1, and the text of each line without surrounding blanks, for at most `most` lines."""
+def _lines(path: Path, max_lines: int | None = None) -> Iterator[tuple[int, str]]:
+    """Yield the number, from 1, and the text of each line without surrounding blanks, for at most `max_lines` lines."""
     try:
         with open_regular(path) as file:
             if file.seek(0, io.SEEK_END) > _MAX_BYTES:
                 raise InputError(str(path), f"is larger than {_MAX_BYTES >> 20} MB; give the path of a CSV file")
             file.seek(0)
             text = io.TextIOWrapper(file, encoding="utf-8-sig")
-            for k in itertools.count(1) if most is None else range(1, most + 1):
+            for k in itertools.count(1) if max_lines is None else range(1, max_lines + 1):
                 line = text.readline(_MAX_LINE + 1)
                 if not line:
                     return

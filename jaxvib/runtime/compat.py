@@ -142,8 +142,8 @@ def evaluating() -> contextlib.AbstractContextManager[None]:
 def without_source_locations() -> Iterator[None]:
     """Trace without source locations of operations.
 
-    The answer to whether a file belongs to JAX is also cached, because JAX otherwise searches the list of its files again for
-    each run-time check. Together the two changes save a tenth of the time until a program is compiled. A change whose private
+    For each run-time check, JAX searches a list of its files to find whether a source file belongs to JAX. The results of this
+    search are cached too. Together the two changes save a tenth of the time until a program is compiled. A change whose private
     name is missing in JAX is omitted.
     """
     limit = getattr(sys.modules.get("jax._src.config"), "traceback_in_locations_limit", None)

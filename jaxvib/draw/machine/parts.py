@@ -71,8 +71,8 @@ def _zigzag(coils: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def damper(start: Point, end: Point, width: float = 0.2, cup: float = 0.4) -> np.ndarray:
-    """Return a dashpot from one point to another: a cup on the side of the first point, whose length is the fraction `cup` of
-    the distance, and a piston."""
+    """Return a dashpot from one point to another: a cup on the side of the first point, and a piston. The length of the cup is
+    the fraction `cup` of the distance."""
     gap, low, high = np.nan, 0.5 - 0.5 * cup, 0.5 + 0.5 * cup
     forward = np.array([0.0, low, gap, high, low, low, high, gap, 1.0, 0.52, gap, 0.52, 0.52])
     side = np.array([0.0, 0.0, gap, 0.5, 0.5, -0.5, -0.5, gap, 0.0, 0.0, gap, 0.36, -0.36]) * width

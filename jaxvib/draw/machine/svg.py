@@ -34,8 +34,8 @@ def svg(
     **Arguments**
 
     - `limits`: (left, right, bottom, top) of the drawing
-    - `frames`: the parts at equal time steps over one period, the same parts in each frame. The rotor's angle is that of the
-      first frame in all of them
+    - `frames`: the parts at equal time steps over one period, the same parts in each frame. All frames show the rotor at the
+      same angle, because `turns` adds the rotation
     - `texts`: texts at the same times
     - `head`: lines of text above the drawing
     - `seconds`: duration of a period, s

@@ -37,7 +37,7 @@ def response_chart(
 
     - `curve`: the arrays `speed` (n,) rad/s, `amplitude` and `phase` (n, nd), `foundation_force` (n,) N, `torque` and
       `motor_torque` (n,) N m
-    - `points`: the same for the operating points, and `stable`
+    - `points`: the same arrays for the operating points, and the Boolean array `stable`
     - `folds`: `speed` and `torque` of the folds
     - `resonances` (k,), rad/s, drawn as dotted lines
     - `names` and `units` (nd,) of the coordinates; lengths are drawn in mm, angles in mrad
@@ -152,11 +152,11 @@ def _torque(
 
 
 def _logarithmic(axis: Axes) -> None:
-    """Set a logarithmic axis over at most some decades below the largest value."""
+    """Set a logarithmic axis that covers at most `_DECADES` decades below the largest value."""
     values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axis.get_lines() if np.size(line.get_xdata()) > 2])
-    there = values[np.isfinite(values) & (values > 0.0)]
-    if there.size == 0:
+    positive = values[np.isfinite(values) & (values > 0.0)]
+    if positive.size == 0:
         return
-    top = 2.0 * float(np.max(there))
-    axis.set(yscale="log", ylim=(max(0.5 * float(np.min(there)), top / 10.0**_DECADES), top))
+    top = 2.0 * float(np.max(positive))
+    axis.set(yscale="log", ylim=(max(0.5 * float(np.min(positive)), top / 10.0**_DECADES), top))
     log_ticks(axis)

@@ -19,7 +19,7 @@ from jaxvib.units import Number
 FIT_TABLES = ["machine", "run", "channel", "identify", "candidate", "limits"]
 
 _RUN_FIELDS = {"file": "file", "from": "start", "until": "until", "rate": "rate", "change": "change"}
-"""Names of fields of a run in a file, and in Python, in which `from` is a keyword."""
+"""Fields of a run in a file, and the names of the same arguments in Python, where `from` is a keyword."""
 
 
 _CANDIDATE_FIELDS = ["name", "drive", "duration", "rate", "at", "noise", "change", "channel"]

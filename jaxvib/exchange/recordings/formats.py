@@ -37,7 +37,7 @@ _SI = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "force":
 
 
 def read_channels(path: Path, rate: float | None) -> list[Recorded]:
-    """Return the channels of a file, whose format follows from the end of its name.
+    """Return the channels of a file. The extension of the file's name determines the format.
 
     **Arguments**: `rate`, Hz, replaces the times of the file.
 
@@ -75,7 +75,7 @@ def _floating(values: np.ndarray) -> np.ndarray:
 
 
 def _with_unique_names(channels: list[Recorded]) -> list[Recorded]:
-    """Return the channels with different names: a number is appended to a name that occurs more than once."""
+    """Return the channels with unique names: a number is appended to a name that occurs more than once."""
     counts, occurrences = Counter(channel.name for channel in channels), Counter()
     unique = []
     for channel in channels:

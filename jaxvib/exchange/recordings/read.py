@@ -37,7 +37,7 @@ def read_run(
 
     **Arguments**
 
-    - `path` of the file; the end of its name states the format
+    - `path` of the file; the extension of its name determines the format
     - `channels` that are read, with names as in the file, with or without their units; typical: 1 to 10
     - `start` and `until`, s: beginning and end of the part that is read; default: the whole record
     - `change`: numbers of the scene that were different in this run, as for `MeasuredRun.from_arrays`

@@ -1,4 +1,4 @@
-"""Choice of the next run: errors of the numbers that candidate runs would leave, by the Fisher information."""
+"""Choice of the next run by the expected errors of the fitted numbers, computed from the Fisher information."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class RunPlan(Result):
       remain undetermined
     - `now` (k,): relative standard errors after the runs so far
     - `minutes` (c,): durations, min
-    - `benefit` (c,): sum over the numbers of the logarithm of the ratio of errors before and after, per minute of test. An
-      undetermined number counts as an error of 1
-    - `profile`: the `SpeedProfile` of the run with the optimized speed; None without limits, and if no such run is better than
-      the candidates
+    - `benefit` (c,): sum over the numbers of log(error now / error after the run), per minute of the run. An error above 1, or
+      of an undetermined number, counts as 1
+    - `profile`: the `SpeedProfile` of the run with the optimized speed; None if no limits were given, or if the optimized run
+      is not better than the candidates
     """
 
     status = Computed.done
@@ -78,11 +78,12 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
 
         errors^2 = diagonal of (F_so_far + F_candidate)^-1,       F = J^T J / noise^2,       J = d readings / d unknowns
 
-    - F is the Fisher information about the unknown numbers and the gains of the sensors; the state at the first sample and the
-      offsets of the candidate are free, and so is the zero of the rotor's angle, unless a channel of kind pulses or angle has
-      the mark of the runs so far
-    - The model of the fit gives the expected readings. An added mass, other places of sensors, and sensors that change places
-      are `change` and `channels` of a candidate
+    - F is the Fisher information about the unknown numbers and the gains of the sensors
+    - Each candidate has further unknowns: its state at the first sample and the offsets of its channels. The zero of the
+      rotor's angle is also unknown, unless the candidate has a channel of kind "pulses" or "angle"; the mark of such a channel
+      is assumed to be the mark of the runs so far
+    - The model of the fit gives the expected readings. `change` of a candidate describes an added mass; its `channels` describe
+      new sensors and sensors at other places
     - With `limits`, the speeds of the best candidate at 9 evenly spaced times are optimized for the smallest errors, by
       gradients and sequential quadratic programming. The result is one more candidate, of the same duration, if it is better
       than all others

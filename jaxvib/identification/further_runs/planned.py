@@ -31,8 +31,8 @@ class PlannedRun(Readable):
     - `name` for tables
     - `drive` of prescribed speed: a ramp (`RunUp`, `SpinUp`), a dwell (`ConstantSpeed`), or a coast-down (`SpeedProfile`)
     - `duration`, s; typical: 10 to 60
-    - `channels` of the run; their places and the numbers of the scene may differ from those of the runs so far. A sensor keeps
-      its name, and thereby its gain, at another place
+    - `channels` of the run; their places may differ from those of the runs so far. A sensor that is moved to another place
+      keeps its name: the name identifies its gain
     - `rate`, Hz, of the samples; typical: 200 to 2000
     - `noise`: standard deviation of the readings by the name of the channel, for channels that no run so far has, in SI units
       or as strings; typical: "0.05 m/s^2". Other channels have the noise of the fit, with the same spectral density
@@ -81,26 +81,26 @@ class PlannedRun(Readable):
 
 
 class Expected(NamedTuple):
-    """Planned run at the numbers of a fit.
+    """Planned run, evaluated with the numbers of a fit.
 
-    **Attributes**: `fitted`: a fit without iterations; `own`: places of the shared unknowns of the run and the fit among the
-    unknowns of the run; `place`: their places in the information of the fit.
+    **Attributes**: `fitted`: the run as a fit without iterations; `places_in_run` and `places_in_fit`: indices of the unknowns
+    that the run shares with the fit, among the unknowns of the run and in the information of the fit.
     """
 
     fitted: Fitted
-    own: np.ndarray
-    place: np.ndarray
+    places_in_run: np.ndarray
+    places_in_fit: np.ndarray
 
     def shared(self, information: np.ndarray, size: int) -> np.ndarray:
         """Return the information (size, size) of the run about the unknowns of the fit, from its `information` about all
         unknowns of the run."""
         total = np.zeros((size, size))
-        total[np.ix_(self.place, self.place)] = eliminate(information, self.own)
+        total[np.ix_(self.places_in_fit, self.places_in_fit)] = eliminate(information, self.places_in_run)
         return total
 
 
 def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
-    """Return a planned run at the numbers of a fit.
+    """Return a planned run, evaluated with the numbers of a fit.
 
     **Raises** `InputError` for a channel whose noise is unknown, and for a scene with several exciters or with loads.
     """
@@ -138,7 +138,8 @@ def vibrating(fit: MachineFit) -> list[str]:
 
 
 def own_precisions(fit: MachineFit, problem: Problem) -> np.ndarray:
-    """Return 1/error^2 (p,) of the known unknowns of a run, without those that the information of `fit` contains."""
+    """Return 1/error^2 (p,) of the stated errors of the unknowns of a run; 0 for gains that the information of `fit` already
+    contains."""
     precisions = problem.precisions.copy()
     for k, name in enumerate(problem.unknowns.gains):
         if name in fit.gain_names:

@@ -85,11 +85,11 @@ class RunPrediction(Result):
 def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     """Return the prediction of a run that the fit did not use, and compare it with the readings.
 
-    - The numbers and the gains are those of the fit. The motion at the first sample and the offsets are free, and so is the
-      zero of the rotor's angle, unless both have the mark of a tachometer
-    - The deviation is compared with the errors of the fit and the noise of the run by the ratio of likelihoods of "other
-      numbers" to "the same numbers"; below a chance of 1e-5 the run contradicts the fit, and a note names the number whose
-      change explains most of the deviation
+    - The numbers and the gains are those of the fit. The motion at the first sample and the offsets are fitted to the run. The
+      zero of the rotor's angle is also fitted, unless the fit and the run both have the mark of a tachometer
+    - A likelihood-ratio test compares two hypotheses: the machine has the same numbers in the run as in the fit, or it has
+      other numbers. The test accounts for the errors of the fit and the noise of the run. If the chance of the deviation is
+      below 1e-5, the run contradicts the fit, and a note names the number whose change explains most of the deviation
 
     **Arguments**: `fit` from `identify`; `run`: a `MeasuredRun`, with its own `change` of numbers.
 
@@ -111,25 +111,25 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     """
     at = _at_the_fit(fit, run)
     names, noise = [channel.name for channel in at.problem.runs[0].channels], np.nanstd(at.residuals, axis=0)
-    known: dict[str, float] = {}
-    for of_run, noises in zip(fit.channels, fit.noise, strict=True):
-        known |= dict(zip(of_run, noises, strict=True))
-    ratio = noise / np.array([known.get(name, math.nan) for name in names])
-    found, notes = _deviation(fit, at), []
+    fit_noise: dict[str, float] = {}
+    for channel_names, noises in zip(fit.channels, fit.noise, strict=True):
+        fit_noise |= dict(zip(channel_names, noises, strict=True))
+    ratio = noise / np.array([fit_noise.get(name, math.nan) for name in names])
+    deviation, notes = _deviation(fit, at), []
     for k, name in enumerate(names):
         if ratio[k] > _NOISE_RATIO:
             notes.append(f"the residuals of channel {name!r} are {ratio[k]:.3g} times the noise of the fit")
         if residual_chance(at.residuals[:, k], at.taps[k], at.problem.angles[0][:, 0], 0) < CHANCE:
             notes.append(f"the residuals of channel {name!r} repeat with the rotor's angle")
     status = PredictionStatus.patterned if notes else PredictionStatus.predicted
-    if found.chance < CHANCE:
+    if deviation.chance < CHANCE:
         status = PredictionStatus.contradicted
-        notes.append(found.sentence("the run"))
+        notes.append(deviation.sentence("the run"))
     mask, raw = at.problem.masks[0], at.problem.raw[0]
     return RunPrediction(
         status=status,
         notes=(*at.problem.notes, *notes),
-        chance=found.chance,
+        chance=deviation.chance,
         channels=tuple(names),
         noise=noise,
         ratio=ratio,
@@ -140,7 +140,7 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
 
 
 class _Predicted(NamedTuple):
-    """Run at the numbers of a fit.
+    """Run, evaluated with the numbers of a fit.
 
     **Attributes**: its `problem`; unknowns `x`; `linear` unknowns, with the best state at the first sample and the best
     offsets; `residuals` (n, C); `taps` of the filters to white noise (C,); `has_mark`: True if the zero of the rotor's angle is
@@ -189,11 +189,11 @@ def _deviation(fit: MachineFit, at: _Predicted) -> Disagreement:
     for k in range(len(fit.scene.exciters)):
         if f"exciters[{k}].unbalance" not in fit.names:  # known exactly
             matrix[p + 2 * k, p + 2 * k] += 1.0 / EXACT**2
-    own, place = shared_places(fit, problem, at.has_mark)
+    in_run, in_fit = shared_places(fit, problem, at.has_mark)
     part, gradient = np.zeros((size, size)), np.zeros(size)
-    part[np.ix_(place, place)] = eliminate(matrix, own)
-    gradient[place] = elimination(matrix, own).T @ slope
+    part[np.ix_(in_fit, in_fit)] = eliminate(matrix, in_run)
+    gradient[in_fit] = elimination(matrix, in_run).T @ slope
     names = [*fit.names, *(f"the gain of channel {name!r}" for name in fit.gain_names), "the angle (rad) of the unbalance"]
-    # Change to the gradient at the numbers of a common fit of the run and the records of the fit.
+    # The gradient is moved from the numbers of the fit to the numbers of a common fit of the run and the records of the fit.
     gradient = fit.information @ pseudoinverse(fit.information + part)[0] @ gradient
     return disagreement(fit.information, part, gradient, names)

@@ -66,8 +66,8 @@ def require_within(planned: PlannedRun, limits: Limits) -> None:
     if speed > (1.0 + _SLACK) * limits.speed:
         raise InputError(field, f"reaches {speed_text(speed, 4)}; limits.speed is {speed_text(limits.speed, 4)}")
     if acceleration > (1.0 + _SLACK) * limits.acceleration:
-        most = f"limits.acceleration is {limits.acceleration:.4g} rad/s^2"
-        raise InputError(field, f"has an acceleration of {acceleration:.4g} rad/s^2; {most}")
+        limit_text = f"limits.acceleration is {limits.acceleration:.4g} rad/s^2"
+        raise InputError(field, f"has an acceleration of {acceleration:.4g} rad/s^2; {limit_text}")
 
 
 def optimized_profile(fit: MachineFit, planned: PlannedRun, expected: Expected, limits: Limits) -> SpeedProfile:
@@ -102,7 +102,8 @@ def optimized_profile(fit: MachineFit, planned: PlannedRun, expected: Expected, 
 
 
 def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return half the sum of the logarithms of the expected variances of the numbers, and its gradient by the speeds.
+    """Return half the sum of the logarithms of the expected variances of the numbers, and its gradient with respect to the
+    speeds.
 
     F is the Fisher information of the run (the matrix of its normal equations). L, the projection onto the numbers that are not
     eliminated, is kept fixed, so that a change dF changes L^T F L by L^T dF L. The gradient is therefore one vector-Jacobian
@@ -120,7 +121,7 @@ def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.n
     run = np.zeros_like(fitted.information)
     run[np.ix_(where, where)] = np.asarray(equations)[:-1, :-1]
     data, known, _ = in_polar_unbalances(fitted._replace(information=run))
-    inner = elimination(data + known, expected.own)
+    inner = elimination(data + known, expected.places_in_run)
     total = fit.information + expected.shared(data + known, len(fit.information))
     outer = elimination(total, np.arange(k))
     covariance = np.linalg.inv(outer.T @ total @ outer + np.eye(k))
@@ -128,7 +129,7 @@ def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.n
 
     weights = -0.5 * outer @ (covariance / variances) @ covariance @ outer.T
     polar, _ = polar_unbalances(problem, fitted.linear)
-    weights = polar @ inner @ weights[np.ix_(expected.place, expected.place)] @ inner.T @ polar.T
+    weights = polar @ inner @ weights[np.ix_(expected.places_in_fit, expected.places_in_fit)] @ inner.T @ polar.T
     padded = np.zeros(equations.shape)
     padded[:-1, :-1] = weights[np.ix_(where, where)]
     (gradient,) = vector_product(jnp.asarray(padded))

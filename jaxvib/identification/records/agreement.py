@@ -1,8 +1,10 @@
 """Agreement of the channels of a run with one another: units, signs, swapped channels, shafts, clocks, aliasing.
 
-Two kinds of comparison need no model of the machine. Speeds of the rotor from pulses, an angle and a speed must be equal.
-Motions x, y of one point in one direction are derivatives of one another, Y = (i w)^d X with d = 0, 1 or 2, at each frequency
-at which they are coherent.
+Two kinds of comparison need no model of the machine:
+
+- Rotor speeds that are measured by pulses, by an angle and by a speed must be equal
+- Motions x and y of one point in one direction are derivatives of each other: Y = (i w)^d X with d = 0, 1 or 2 at each
+  frequency w at which they are coherent
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ _ALIASING_LENGTH, _ALIASING_PIECES = 8192, 64
 """Number of samples of a piece of a record, and largest number of pieces, whose spectrum is examined for aliasing."""
 
 _DRIFT = 3.0
-"""Drift of a clock, relative to its standard error, above which it is stated."""
+"""Drift of a clock, relative to its standard error, above which a note reports it."""
 
 
 class _Signal(NamedTuple):
@@ -119,17 +121,19 @@ def _compare_speeds(reference_signal: _Signal, other: _Signal, source: str) -> l
 
 
 def _fitting_unit(channel: Channel, factor: float, error: float) -> str | None:
-    """Return the unit by which readings would be `factor` times as large; None if there is no such unit."""
+    """Return the unit with which the readings would be `factor` times as large; None if no unit does this."""
     for unit in _OTHER_UNITS[channel.kind]:
-        found = (unit_factor(unit, UNITS[channel.kind]) or 1.0) / channel.factor
-        if found != 1.0 and abs(found / factor - 1.0) <= error:
+        ratio = (unit_factor(unit, UNITS[channel.kind]) or 1.0) / channel.factor
+        if ratio != 1.0 and abs(ratio / factor - 1.0) <= error:
             return unit
     return None
 
 
 def _drift(reference_signal: _Signal, other: _Signal, sign: float, source: str) -> list[str]:
-    """Return a note if the clock of one speed drifts against that of the other: while the speed changes at the rate a, a
-    delay of d + e t changes the reading by -a (d + e t)."""
+    """Return a note if the clock of one speed drifts against the clock of the other speed.
+
+    While the speed changes at the rate a, a delay of d + e t changes the reading by -a (d + e t).
+    """
     inside = (reference_signal.time > other.time[0]) & (reference_signal.time < other.time[-1])
     time, reference = reference_signal.time[inside], reference_signal.value[inside]
     if time.size < 32:
@@ -186,7 +190,7 @@ def _check_motions(motions: Sequence[_Signal], source: str) -> None:
             for each, need in ((other, 1.0 / abs(factor)), (one, abs(factor)))
             if (unit := _fitting_unit(each.channel, need, _UNIT_ERROR))
         ]
-        problem = f"is {abs(factor):.3g} times what follows from {name} at the same place"
+        problem = f"is {abs(factor):.3g} times the motion that follows from {name} at the same place"
         fix = f"the unit {' or '.join(units)} would fit" if units else "correct the unit, the place or the gain of one of them"
         raise InputError(where, f"{problem}; {fix}")
 

@@ -61,8 +61,8 @@ def _starts(flags: np.ndarray) -> np.ndarray:
 def number_pulses(time: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Return the times (n,), s, of the pulses without false pulses, their numbers (n,), and notes about repairs.
 
-    The interval between two pulses is compared with the geometric mean of the medians of five intervals before it and five
-    after it, which is also right while a rotor starts from rest. A missed pulse leaves a number out.
+    The interval between two pulses is compared with the geometric mean of two medians: of five intervals before it and of five
+    intervals after it. This mean is also right while a rotor starts from rest. The number of a missed pulse is skipped.
 
     **Raises** `InputError` for too few pulses, times that do not ascend, and too many missed and false pulses.
 
@@ -102,7 +102,7 @@ def number_pulses(time: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray,
 
 
 def _usual_intervals(steps: np.ndarray) -> np.ndarray:
-    """Return, for each interval, the geometric mean of the medians of 5 intervals before it and 5 after it."""
+    """Return, for each interval, the geometric mean of two medians: of 5 intervals before it and of 5 intervals after it."""
     padded = np.concatenate([np.full(_NEIGHBOURS, np.nan), steps, np.full(_NEIGHBOURS, np.nan)])
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOURS + 1)
     before, after = np.full(steps.size, np.nan), np.full(steps.size, np.nan)

@@ -117,7 +117,7 @@ class Regime(Result):
         loads, rotor = (speed_text(speed) for speed in (self.load_speed, self.rotor_speed))
         evidence = [f"loads {loads}, rotor {rotor}, ripple {speed_text(self.ripple, 2)}"]
         if bool(self.name == RegimeName.jammed):
-            # A mode that rises to the rotor speed lies beyond its resonance.
+            # Mode 2 k + 1 begins above natural frequency k.
             relation = "beyond" if int(self.mode) == 2 * int(self.resonance) + 1 else "by"
             speed = speed_text(self.resonance_speed)
             place_text = f"{relation} resonance {int(self.resonance)} at {speed} (mode {int(self.mode)})"

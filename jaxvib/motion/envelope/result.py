@@ -142,8 +142,8 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         rates = zip(scene.exciters, window.rotor_speeds, _split(scene, window.load_speed), strict=True)
         torques = [_torque_of(each, window.time, speed, rate) for each, speed, rate in rates]
         powers = [
-            jnp.mean(each.direction * n * own)
-            for each, n, own in zip(scene.exciters, window.rotor_speeds, torques, strict=True)
+            jnp.mean(each.direction * n * torque)
+            for each, n, torque in zip(scene.exciters, window.rotor_speeds, torques, strict=True)
         ]
         return Vibration(
             speed=self.omega,
@@ -151,7 +151,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
             amplitude=self.amplitude,
             foundation_force=self.foundation_force,
             exciter_force=jnp.where(has_term(scene.all_effects, RotorImbalance), jnp.nan, force),
-            torque=jnp.stack([jnp.mean(own) for own in torques]),
+            torque=jnp.stack([jnp.mean(torque) for torque in torques]),
             power=jnp.stack(powers),
         )
 
@@ -212,11 +212,12 @@ def plot_histories(run: Envelope, *, resonances: Sequence[float] = (), unit: Spe
 
     kept, structure = run.window if run.trajectory is None else run.trajectory, run.scene.machine.structure()
     exciters = run.scene.exciters
-    own = np.repeat([e.loads is not None for e in exciters], [1 if e.loads is None else e.loads.count for e in exciters])
+    counts = [1 if e.loads is None else e.loads.count for e in exciters]
+    is_load = np.repeat([e.loads is not None for e in exciters], counts)
     return amplitude_histories(
         np.asarray(kept.time),
         np.asarray(kept.amplitude),
-        np.asarray(kept.load_speed)[:, own],
+        np.asarray(kept.load_speed)[:, is_load],
         np.asarray(kept.foundation_force),
         np.stack([np.asarray(speed) for speed in kept.rotor_speeds], axis=1),
         names=structure.coordinates,

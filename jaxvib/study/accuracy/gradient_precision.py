@@ -62,7 +62,7 @@ def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: 
     left_out: list[str] = []
     light = jam_modes(scene).select(mode, throw=False)
     if not bool(light.status == JamStatus.found):
-        left_out = [f"leading order, and full, which starts from it: {light.message}"]
+        left_out = [f"leading order, and full (its runs start from the jam of leading order): {light.message}"]
     else:
         ways.insert(0, ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading_amplitude))))
         if not bool(jam.fine.stable):

@@ -37,7 +37,7 @@ class TierValues(Readable):
 
 
 class Tiers(Result):
-    """Jams by two tiers over the mass of a load.
+    """Jams computed by two tiers for several masses of a load.
 
     **Attributes**: `mass` (n,) of one load, kg (the mean if loads differ); `leading` and `exact`: `TierValues` of the two
     tiers.

@@ -28,7 +28,7 @@ from jaxvib.steady.orbits.search import branch_at
 from jaxvib.study.accuracy.exact_reference import WINDOW_PERIODS, slow_period
 
 _MIN_UNCERTAINTY = 1e-9
-"""Smallest relative uncertainty that is stated for the values of a motion."""
+"""Lower bound of the relative uncertainty of the values of a motion."""
 
 _WINDOW_PERIODS = 100
 """Length of the measuring window at the end of a run, in slow periods. It must include the beat of an imbalance with jammed
@@ -91,7 +91,7 @@ class JamComparison(NamedTuple):
         orbit = jam_orbit(scene, mode=self.mode, throw=False)
         exists = bool(np.isfinite(orbit.omega))
         kind = f"jam mode {self.mode}, {orbit.judgement}" if exists else f"no jam mode {self.mode}"
-        # If the loads would separate, the real motion is another one; other statuses concern the computation only.
+        # If the loads would separate, the machine does not have this motion; other statuses concern the computation only.
         if exists and bool(orbit.status == OrbitStatus.would_separate):
             kind = f"{kind}, but the loads separate"
         computed = not exists or bool(orbit.status == OrbitStatus.would_separate) or bool(orbit.status == OrbitStatus.found)

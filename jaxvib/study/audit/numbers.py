@@ -17,7 +17,9 @@ from jaxvib.study.audit.comparisons import MotionValues, total_drag_torque
 
 _G = 9.81
 _STEEL = 7850.0
-_ROLLING, _BEARING, _BEARING_WIDTH = 3e-5, 0.0015, 0.2
+_ROLLING, _BEARING, _BEARING_DIAMETER = 3e-5, 0.0015, 0.2
+"""Typical values: arm of rolling friction of steel on steel, m; friction coefficient mu2 of a ball bearing; diameter of the bearing
+of a load, relative to the radius of its track."""
 
 
 class NumberRow(NamedTuple):
@@ -46,8 +48,8 @@ def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -
     - contact: diameter of the loads divided by the smallest distance of two loads, if the scene has no contact between loads
     - dry friction divided by viscous friction: friction of a ball bearing, or of steel on steel, divided by the drag torque
       b_W R^2 (n - Omega)
-    - gyroscopic, if the machine cannot tilt: sum kappa m / M, the inertia sum kappa m R^2 of the loads about the axis, divided
-      by the inertia M R^2 that the machine would have about a tilt with the radius of gyration R
+    - gyroscopic, if the machine cannot tilt: sum kappa m / M. This is the moment of inertia sum kappa m R^2 of the loads about
+      the axis of the rotor, divided by M R^2, the moment of inertia of a machine with the radius of gyration R
     - lift, for machines that move up and down: foundation force divided by the weight; above 1, supports under the machine
       would have to pull
 
@@ -134,8 +136,9 @@ def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
     arm, n = _arm(scene), scene.loads.count
     normal_force = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (n,)))) * arm * values.omega**2
     if scene.loads.has_bearing:
-        lever, of = 0.5 * _BEARING * _BEARING_WIDTH * arm, f"mu2 = {_BEARING:g}, {1e3 * _BEARING_WIDTH * arm:.3g} mm wide"
-        note, name = f"of a ball bearing ({of}): dry_friction", "bearing: mu2 (d/2) m R Omega^2 / drag torque"
+        diameter = _BEARING_DIAMETER * arm
+        lever, bearing = 0.5 * _BEARING * diameter, f"mu2 = {_BEARING:g}, d = {1e3 * diameter:.3g} mm"
+        note, name = f"of a ball bearing ({bearing}): dry_friction", "bearing: mu2 (d/2) m R Omega^2 / drag torque"
     else:
         ball = _ball_radius(scene)
         assert ball is not None

@@ -44,9 +44,9 @@ class Fit(NamedTuple):
     """Result of a fit with p unknowns and n samples.
 
     **Attributes**: the `unknowns`; their `covariance` (p, p), in the same order, from the Fisher information and the estimated
-    noise, valid for white noise; `slopes` (n, p): derivatives of the fitted angles by the unknowns; `residual` (n,), rad:
-    fitted minus recorded angle; `noise`, rad: standard deviation of a sample; `stopped_at`, s from the first sample, NaN if the
-    pendulum swings to the end; `converged`: True if the fit converged.
+    noise, valid for white noise; `slopes` (n, p): derivatives of the fitted angles with respect to the unknowns; `residual`
+    (n,), rad: fitted minus recorded angle; `noise`, rad: standard deviation of a sample; `stopped_at`, s from the first sample,
+    NaN if the pendulum swings to the end; `converged`: True if the fit converged.
     """
 
     unknowns: Unknowns
@@ -190,9 +190,9 @@ def _least_squares(
     undamped (Gauss-Newton) step is below 0.01 standard errors. The fit counts as converged if that step is below 0.1 standard
     errors, because the time steps of the integration limit the resolution. The code compares the squares, 1e-4 and 1e-2.
 
-    Trials within 0.001 standard errors are accepted although the sum of squares is larger, because only the error of the
-    integration differs. The estimated error of a time step may be accidentally small at a reversal of the dry friction. Without
-    this rule, a sum of squares that is too small for this reason ended the iteration.
+    A trial step below 0.001 standard errors is accepted even if the sum of squares increases: only the error of the integration
+    causes such an increase. At a reversal of the dry friction this error may make a sum of squares too small. Without this
+    rule, no later trial would be accepted, and the iteration would end there.
 
     **Returns** x (p,), the residual (n,), its Jacobian (n, p), the other two outputs of `residual` (`stopped_at` and the fitted
     angles (n,)), and True if the fit converged.

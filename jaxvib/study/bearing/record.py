@@ -132,7 +132,7 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
 
 
 def _columns(table: TextTable, requested: Sequence[str] | None, angle_unit: str | None) -> tuple[list[int], list[float]]:
-    """Return the columns of time and angle, and the factors that make them SI."""
+    """Return the indices of the columns of time and angle, and the factors from their units to SI units."""
     path, width, heads = table.path, table.width, table.heads
     if width < 2:
         raise InputError(str(path), "has one column; two are needed, time and angle, separated by commas, semicolons or tabs")

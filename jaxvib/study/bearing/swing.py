@@ -239,7 +239,7 @@ def swing(
     if torque is not None:
         problem = "is {:g} N m; it must be below m g l, {:.4g} N m"
         weight = pendulum.mass * pendulum.g * pendulum.length
-        require_if_known(lambda torque, most: abs(torque) < most, friction.torque, weight, field="torque", problem=problem)
+        require_if_known(lambda torque, limit: abs(torque) < limit, friction.torque, weight, field="torque", problem=problem)
     run = swing_states(
         pendulum,
         times,
@@ -362,8 +362,11 @@ def _margin_to_rest(pendulum: BearingPendulum, friction: Friction, dry: Array, w
 def _rates(
     pendulum: BearingPendulum, friction: Friction, width: Array | None, free: Array | None
 ) -> Callable[[RealScalarLike, _Pair, None], _Pair]:
-    """Return the equations of motion of the pendulum. With dry friction it stays at rest unless `free` is True: friction does
-    not hold it at the start."""
+    """Return the equations of motion of the pendulum.
+
+    **Arguments**: `free`: False if dry friction holds the pendulum at the start; it then stays at rest. None without dry
+    friction.
+    """
 
     def rates(t: RealScalarLike, y: _Pair, args: None) -> _Pair:
         f, slip = y

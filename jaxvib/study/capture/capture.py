@@ -67,8 +67,9 @@ class Capture(Result):
     - `detached` (S, starts): True if a load lost contact with its wall at some time; the equations keep it on the wall
     - `threshold`: midpoint of two neighbouring computed speeds: the lowest one such that every start at this speed and at all
       higher speeds was captured, and the one below it
-    - `uncertainty` of the threshold: the largest of half the distance between these two speeds, half the distance from the
-      threshold to the highest speed at which half of the starts or more fail, and `last_change`; NaN if there is no threshold
+    - `uncertainty` of the threshold; NaN if there is no threshold. It is the largest of three numbers: half the distance
+      between these two speeds; half the distance from the threshold to the highest speed below it at which at least half of the
+      starts fail; `last_change`
     - `last_change`: change of the threshold by the last doubling of the steps, infinite if the threshold appeared or vanished,
       NaN without a doubling
     - `steps`, and `turns` of the rotor, of each run

@@ -119,8 +119,8 @@ def stability_onset(
 ) -> float:
     """Return the x from which the exact diagram of `make(x)` has a special point of a kind, by bisection in log x.
 
-    The bisection finds one change from diagrams without such a point to diagrams with one; it is the smallest x if the point
-    exists for all larger x.
+    The bisection finds one x at which such a point appears. This x is the smallest one only if the point exists for all larger
+    x.
 
     Odd jam modes of light loads are stable on their whole range. This function finds, for example, the load mass above which a
     torus bifurcation ends the stable range before the fold, or above which the half-turn symmetry breaks.

@@ -131,7 +131,7 @@ def test_error_of_a_wrong_unit_of_a_motion_names_a_fitting_unit(kinds, stated, f
     ]
     with pytest.raises(jv.InputError) as error:
         run(*readings)
-    assert "times what follows from 'one' at the same place; " in str(error.value) and fits in str(error.value)
+    assert "times the motion that follows from 'one' at the same place; " in str(error.value) and fits in str(error.value)
 
 
 def test_swapped_channels_are_named():
