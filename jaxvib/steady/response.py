@@ -199,7 +199,7 @@ class Response(AbstractResponse, Result):
         """
         from jaxvib.draw.motion.response import response_chart  # slow import
 
-        structure, folds, there = self.scene.machine.structure(), self.folds, np.asarray(self.operating.exists)
+        structure, folds, exists = self.scene.machine.structure(), self.folds, np.asarray(self.operating.exists)
         names = ("speed", "amplitude", "phase", "foundation_force")
 
         def arrays(of: AbstractResponse) -> dict[str, np.ndarray]:
@@ -209,7 +209,7 @@ class Response(AbstractResponse, Result):
         points = arrays(self.operating) | {"stable": np.asarray(self.operating.stable)}
         return response_chart(
             arrays(self),
-            {name: values[there] for name, values in points.items()},
+            {name: values[exists] for name, values in points.items()},
             {"speed": np.asarray(folds.speed), "torque": np.asarray(folds.torque)},
             np.asarray(self.resonances),
             names=structure.coordinates,

@@ -190,16 +190,17 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
     carrier, mass = model.carrier, _mass(model, loads)
     nd = mass.shape[0]
     gyroscopic = jnp.zeros_like(mass) if model.mount.gyroscopic is None else model.mount.gyroscopic
-    part = _coupling(mass.dtype) * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass)) * _sense_matrix(model.mount)
+    size = _coupling_size(mass.dtype) * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass))
+    coupling = size * _sense_matrix(model.mount)
 
     def first_order(resisting: Array) -> Array:
         flow = jnp.linalg.solve(mass, jnp.concatenate([-carrier.stiffness, -resisting], axis=1))
         return jnp.concatenate([jnp.eye(nd, 2 * nd, nd, dtype=mass.dtype), flow])
 
     def one_of_each(values: Array, stops: Array) -> tuple[Array, Array]:
-        # One value of each conjugate pair, with positive frequency. Real values are of two kinds: a displacement that creeps
-        # back (small `stops`) and a velocity that stops (large). Without gyroscopic coupling there are as many of one kind as
-        # of the other, see `_stopping`.
+        # Of each conjugate pair, the value with the positive frequency is chosen. Real values are of two kinds: in the one kind
+        # a displacement creeps back (`stops` is small), in the other kind a velocity stops (`stops` is large). Without
+        # gyroscopic coupling both kinds have the same number of values, see `_stopping`.
         oscillates = jnp.abs(values.imag) > 1e-12 * jnp.max(jnp.abs(values))
         rank = jnp.argsort(jnp.argsort(jnp.where(oscillates, jnp.inf, stops)))
         creeps = rank < jnp.sum(~oscillates) // 2
@@ -209,20 +210,20 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
     def at(n: Array) -> tuple[Array, Array, Array, Array, Array]:
         resisting = carrier.damping + n * gyroscopic
         values = jnp.linalg.eigvals(first_order(resisting))
-        # A coupling too small to change the speeds separates two whirls of one speed.
-        coupled = jax.lax.stop_gradient(resisting + part)
-        apart, vectors = jnp.linalg.eig(jax.lax.stop_gradient(first_order(coupled)))
+        # The coupling is too small to change the speeds. It separates two whirls of equal speed.
+        coupled = jax.lax.stop_gradient(resisting + coupling)
+        separated, vectors = jnp.linalg.eig(jax.lax.stop_gradient(first_order(coupled)))
         shapes = vectors[:nd]
-        stops, error = _stopping(jax.lax.stop_gradient((mass, coupled, carrier.stiffness)), apart, shapes)
-        nearest = jnp.argmin(jnp.abs(values[:, None] - apart[None, :]), axis=1)
+        stops, error = _stopping(jax.lax.stop_gradient((mass, coupled, carrier.stiffness)), separated, shapes)
+        nearest = jnp.argmin(jnp.abs(values[:, None] - separated[None, :]), axis=1)
         chosen, oscillates = one_of_each(values, stops[nearest])
         turns = oscillates[chosen]
-        own = shapes[:, one_of_each(apart, stops)[0]]
-        straight = turns & _is_straight(model, own)
+        chosen_shapes = shapes[:, one_of_each(separated, stops)[0]]
+        straight = turns & _is_straight(model, chosen_shapes)
         return (
             jnp.where(turns, values.imag[chosen], 0.0),
             -values.real[chosen],
-            turns & (_sense(model.mount, own) > 0.0) & ~straight,
+            turns & (_sense(model.mount, chosen_shapes) > 0.0) & ~straight,
             straight,
             error[nearest][chosen] > MAX_EIGENVALUE_ERROR,
         )
@@ -233,7 +234,7 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
     return Whirl(status, speeds, speed, decay, forward, straight, critical=_critical_speeds(model, loads))
 
 
-def _coupling(dtype: np.dtype) -> float:
+def _coupling_size(dtype: np.dtype) -> float:
     return max(_COUPLING, _MIN_COUPLING_ROUNDINGS * float(jnp.finfo(dtype).eps))
 
 
@@ -271,9 +272,9 @@ def critical_speeds(scene: Scene, *, loads: LoadMasses = "fixed") -> CriticalSpe
     transverse inertia of the rotor minus the polar one, that of a backward tilt their sum. Supports that differ split each
     critical speed in two.
 
-    **Arguments** as `whirl`: `scene`; `loads` "fixed" or "none".
+    **Arguments** as for `whirl`: `scene`; `loads` "fixed" or "none".
 
-    **Returns** `CriticalSpeeds`; typical: 100 to 500 rad/s. **Raises** `InputError` as `whirl`.
+    **Returns** `CriticalSpeeds`; typical: 100 to 500 rad/s. **Raises** `InputError` in the cases of `whirl`.
 
     >>> import jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=0.0)
@@ -290,17 +291,17 @@ def critical_speeds(scene: Scene, *, loads: LoadMasses = "fixed") -> CriticalSpe
 def _critical_speeds(model: LinearModel, loads: LoadMasses) -> CriticalSpeeds:
     carrier, mount, mass = model.carrier, model.mount, _mass(model, loads)
     inertia = mass if mount.gyroscopic is None else mass - 1j * mount.gyroscopic
-    part = 1j * _coupling(mass.dtype) * jnp.trace(mass) * _sense_matrix(model.mount)
+    coupling = 1j * _coupling_size(mass.dtype) * jnp.trace(mass) * _sense_matrix(model.mount)
     values, _ = hermitian_modes(relative_to(carrier.stiffness, inertia)[0])
-    square, inverse = relative_to(carrier.stiffness, jax.lax.stop_gradient(inertia - part))
+    square, inverse = relative_to(carrier.stiffness, jax.lax.stop_gradient(inertia - coupling))
     shapes = inverse.T @ hermitian_modes(square)[1]
     values, shapes = values[::-1], shapes[:, ::-1]
     # A whirl 1e7 times as fast as the slowest one counts as absent.
-    none = 1e-14 * jnp.max(values)
-    there, decided = values > none, jnp.abs(values) < none
+    limit = 1e-14 * jnp.max(values)
+    exists, is_absent = values > limit, jnp.abs(values) < limit
     error = hermitian_error(jax.lax.stop_gradient((inertia, carrier.stiffness)), values, shapes)
-    lost = ~decided & (error > 2.0 * MAX_EIGENVALUE_ERROR)
-    speed = jnp.where(there, 1.0 / jnp.sqrt(jnp.where(there, values, 1.0)), jnp.inf)
+    lost = ~is_absent & (error > 2.0 * MAX_EIGENVALUE_ERROR)
+    speed = jnp.where(exists, 1.0 / jnp.sqrt(jnp.where(exists, values, 1.0)), jnp.inf)
     status = WhirlStatus.where(jnp.any(lost), WhirlStatus.lost_digits, WhirlStatus.done)
     straight = _is_straight(model, shapes)
     return CriticalSpeeds(status, jnp.where(lost, jnp.nan, speed), (_sense(mount, shapes) > 0.0) & ~straight, straight)

@@ -26,9 +26,9 @@ _MIN_DROPOUT, _MIN_RATIO = 20, 10
 times the length that 99 % of all stretches do not exceed."""
 
 _BINS, _SPIKE, _MIN_CLIPPED = (0.001, 0.003, 0.01), 3.0, 10
-"""Limits for clipped readings in a histogram: widths of its last bin, relative to the range of the values; smallest ratio of the
-number of readings in this bin to the number in the next four bins; smallest number of readings in this bin. For a smooth signal
-the ratio is below 2."""
+"""Limits for clipped readings in a histogram: widths of its last bin, relative to the range of the values; smallest ratio of
+the number of readings in this bin to the number in the next four bins; smallest number of readings in this bin. For a smooth
+signal the ratio is below 2."""
 
 
 def require_ascending(time: np.ndarray, where: str) -> None:

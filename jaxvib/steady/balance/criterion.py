@@ -148,10 +148,10 @@ def criterion(scene: Scene) -> Criterion:
     **Arguments**: `scene` with at least two loads; typical: loads of 0.1 % to 1 % of the machine's mass. The share of correct
     predictions for random machines was 0.99 for loads of 0.1 %, and 0.55 for 10 %.
 
-    **Returns** `Criterion`; derivatives and `vmap` as `characteristic_speeds`.
+    **Returns** `Criterion`; derivatives and `vmap` are supported as by `characteristic_speeds`.
 
-    **Raises** `InputError` as `characteristic_speeds`, for a single load, and for effects whose potential exerts a torque on
-    each single load (`Gravity`).
+    **Raises** `InputError` in the cases of `characteristic_speeds`, for a single load, and for effects whose potential exerts a
+    torque on each single load (`Gravity`).
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,

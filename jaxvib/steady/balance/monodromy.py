@@ -85,8 +85,8 @@ def monodromies(scene: Scene, angles: Any, speeds: Any, steps: int | None) -> Ar
     """Return monodromy matrices at rotor speeds (S,), S a multiple of `BATCH`: (S, 2 (nd + N), 2 (nd + N))."""
 
     def flow(speed: Array) -> Array:
-        this = eqx.tree_at(lambda s: s.drive.speed, scene, speed)
-        return monodromy(this, angles, _steps_for(this) if steps is None else steps)
+        scene_at_speed = eqx.tree_at(lambda s: s.drive.speed, scene, speed)
+        return monodromy(scene_at_speed, angles, _steps_for(scene_at_speed) if steps is None else steps)
 
     return jax.lax.map(flow, speeds, batch_size=BATCH)
 
@@ -101,13 +101,13 @@ def fine_and_coarse(scene: Scene, angles: Any, steps: int | None) -> tuple[Array
 def validate_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | None:
     """Return the validated number of `steps`; None if it is chosen for each speed.
 
-    **Raises** `InputError` for other steps, for speeds that are not positive, and for a rotor so slow that the allowed steps do
-    not resolve a vibration of the carrier that outlasts the turn; the method would damp it.
+    **Raises** `InputError` for other steps, for speeds that are not positive, and for a rotor that is too slow: a vibration of
+    the carrier then lasts longer than a turn, and the allowed number of steps does not resolve it.
     """
-    values, most = np.asarray(speeds), 0.1 * float(np.finfo(float_dtype()).max) ** 0.5
-    wrong = values[~((values > 0.0) & (values < most))]
+    values, limit = np.asarray(speeds), 0.1 * float(np.finfo(float_dtype()).max) ** 0.5
+    wrong = values[~((values > 0.0) & (values < limit))]
     if wrong.size:
-        raise InputError("speeds", f"contain {wrong[0]:g} rad/s; they must be greater than 0 and below {most:.1e}")
+        raise InputError("speeds", f"contain {wrong[0]:g} rad/s; they must be greater than 0 and below {limit:.1e}")
     if steps is not None:
         return count(steps, "steps", low=2, each=64.0)
     slowest = float(np.min(np.asarray(speeds), initial=np.inf))

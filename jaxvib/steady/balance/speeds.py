@@ -208,7 +208,7 @@ def _require_mount_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndar
         if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
             raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; every motion needs one")
         return
-    # Resonances so much lower than the highest one that they are lost in rounding errors, although a spring resists the motion.
+    # A resonance is lost in rounding errors if it is much lower than the highest one, although a spring resists its motion.
     rounding = mass.shape[0] * np.finfo(mass.dtype).eps
     inverse = np.linalg.inv(np.linalg.cholesky(mass))
     squares = np.linalg.eigvalsh(inverse @ stiffness @ inverse.T)

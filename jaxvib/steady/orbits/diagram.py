@@ -102,9 +102,9 @@ class ExactBranches(Result):
         linear: bool = False,
         ax: Onto = None,
     ) -> Drawn:
-        """Plot the diagram: stable solid, unstable dashed, special points by their kind.
+        """Plot the diagram: stable parts as solid lines, unstable parts as dashed lines, special points by their kind.
 
-        **Arguments**: `unit`, `most`, `show`, `linear`, `ax` as `Branches.plot`.
+        **Arguments**: `unit`, `most`, `show`, `linear`, `ax` as for `Branches.plot`.
         """
         return plot_branch(self, list(self.special), unit, most, _STABILITY_CRITERION, show, linear, ax)
 
@@ -142,8 +142,8 @@ def exact_branches(
     """
     count(points, "points", low=2, each=1e4)
     if not _search_grid.is_ready(scene):
-        lanes = np.ones(_ORBITS_PER_BATCH, scene.drive.speed.dtype)
-        in_background(functools.partial(_values.prepare, scene, lanes, _points(scene)[0], accuracy, False))
+        load_speeds = np.ones(_ORBITS_PER_BATCH, scene.drive.speed.dtype)
+        in_background(functools.partial(_values.prepare, scene, load_speeds, _points(scene)[0], accuracy, False))
     grid, resonances = map(np.asarray, _search_grid(scene))
     lowest = np.min(resonances[resonances > 0.0], initial=np.max(resonances))
     low = float(0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True))
@@ -182,7 +182,7 @@ class _Solver:
 
     def __init__(self, scene: Scene, accuracy: float, slowest: float):
         self.scene, self.accuracy = scene, accuracy
-        # In comparison with the speed of the loads, decay is fastest for the slowest loads. All points use the same integration
+        # The ratio of the decay rate to the load speed is largest at the lowest load speed. All points use the same integration
         # method (explicit or implicit), so that no test function changes sign only because the method changes.
         self.implicit = bool(_is_stiff(scene, jnp.asarray(slowest, scene.drive.speed.dtype)))
 
@@ -190,15 +190,15 @@ class _Solver:
         """Solve for the jams at load speeds; a batch takes as many integration steps as its slowest loads need."""
         first, *more = _points(self.scene)
         found = self._batches(omega, first)
-        for many in more:
+        for point_count in more:
             todo = np.flatnonzero(~(found.error <= self.accuracy))
             if todo.size == 0:
                 break
-            found = jax.tree.map(functools.partial(_replaced_rows, todo), found, self._batches(omega[todo], many))
+            found = jax.tree.map(functools.partial(_replaced_rows, todo), found, self._batches(omega[todo], point_count))
         return found
 
-    def _batches(self, omega: np.ndarray, many: int) -> _Values:
-        return in_chunks(_ORBITS_PER_BATCH, lambda w: _values(self.scene, w, many, self.accuracy, self.implicit), omega)
+    def _batches(self, omega: np.ndarray, points: int) -> _Values:
+        return in_chunks(_ORBITS_PER_BATCH, lambda w: _values(self.scene, w, points, self.accuracy, self.implicit), omega)
 
 
 def _points(scene: Scene) -> list[int]:
@@ -228,11 +228,11 @@ def _is_stiff(scene: Scene, omega: Array) -> Array:
 
 
 @cached
-def _values(scene: Scene, omega: Array | np.ndarray, many: int, accuracy: float, implicit: bool) -> _Values:
+def _values(scene: Scene, omega: Array | np.ndarray, points: int, accuracy: float, implicit: bool) -> _Values:
     model, omega = jammed_bodies(jammed_model(scene)), jnp.asarray(omega)
     start = jax.vmap(lambda w: light_rotor_speed(model.linear, w))(omega)
     steps = jnp.max(steps_for(model, omega, start, implicit=implicit))
-    orbit, growth = orbits(model, omega, start, "omega", many, steps, accuracy, implicit=implicit)
+    orbit, growth = orbits(model, omega, start, "omega", points, steps, accuracy, implicit=implicit)
     return _Values(*(getattr(orbit, name) for name in _Values._fields[:-1]), tests=_tests(growth))
 
 
@@ -292,7 +292,7 @@ def _special_points(solve: _Solver, grid: _Values) -> tuple[SpecialPoint, ...]:
     for k in range(row.size):
         s = values.multipliers[k]
         # Two real multipliers with product 1 are a root of the torus test, but not a bifurcation: such a point is left out.
-        real = which[k] == 1 and not np.any((np.abs(np.abs(s) - 1.0) < 1e-4) & (np.abs(s.imag) > 1e-6))
-        if np.isfinite(values.rotor_speed[k]) and not real:
+        is_real_pair = which[k] == 1 and not np.any((np.abs(np.abs(s) - 1.0) < 1e-4) & (np.abs(s.imag) > 1e-6))
+        if np.isfinite(values.rotor_speed[k]) and not is_real_pair:
             points.append(SpecialPoint(kinds[which[k]], float(a[k]), float(values.rotor_speed[k])))
     return tuple(sorted(points, key=lambda point: point.omega))

@@ -96,9 +96,10 @@ def jam_orbit(
     **Returns** `Orbit`; its fields have derivatives with respect to every parameter of the scene (implicit function theorem,
     forward and reverse).
 
-    **Raises** `InputError` for wrong arguments, loads without drag, and a `mode` of a machine with gyroscopic coupling (its
-    resonances depend on the rotor speed; a load speed may have motions at several rotor speeds, and `omega` gives the motion
-    at the lowest one); `ComputationError` with the status "absent" or "not_converged".
+    **Raises** `InputError` for wrong arguments, loads without drag, and a `mode` of a machine with gyroscopic coupling, whose
+    resonances depend on the rotor speed; `ComputationError` with the status "absent" or "not_converged". For a machine with
+    gyroscopic coupling use `omega` or `near`. Such a machine may have motions with the same load speed at several rotor speeds;
+    `omega` then gives the motion at the lowest rotor speed.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -128,9 +129,9 @@ class JamProblem(NamedTuple):
     """Problem whose solution is one exact jam.
 
     **Attributes**: the `scene`; `given`: the name of the prescribed speed; its `value`, and the `start` of the other speed,
-    rad/s; `exists`: true if the mode exists, in leading order or in the search of the exact branch; `direction`: the sign of
-    dn/dOmega that the mode needs, or None; relative `accuracy`; `implicit`: true for implicit integration of the multipliers;
-    `is_start_solved`: true if Newton's method starts from the motion that is first solved at the load speed `start`.
+    rad/s; `exists`: True if the mode exists, in leading order or in the search of the exact branch; `direction`: the sign of
+    dn/dOmega that the mode needs, or None; relative `accuracy`; `implicit`: True for implicit integration of the multipliers;
+    `is_start_solved`: True if the motion at the load speed `start` is solved first, and Newton's method starts from it.
     """
 
     scene: Scene
@@ -148,7 +149,7 @@ class OrbitPlan(NamedTuple):
     """Plan of an exact jam.
 
     **Attributes**: the `problem`; `mode`: its number, or None; `points`: numbers of collocation points to try one after the
-    other; `is_known`: true if no parameter is traced.
+    other; `is_known`: True if no parameter is traced.
     """
 
     problem: JamProblem
@@ -223,14 +224,14 @@ def _is_stiff(scene: Scene, omega: Array, speed: Array) -> Array:
 
 
 def _solve_accurately(plan: OrbitPlan) -> Orbit:
-    """Return the first orbit that is accurate enough; otherwise the one with the smallest error, because near a fold more
-    points only add rounding errors."""
-    best, least = None, math.inf
+    """Return the first orbit that is accurate enough. If there is none, return the orbit with the smallest error: near a fold,
+    more points only add rounding errors."""
+    best, best_error = None, math.inf
     for points in plan.points:
         orbit = _solve_program(plan.problem, points, None)
         error = float(orbit.error)
-        if best is None or error < least:
-            best, least = orbit, error
+        if best is None or error < best_error:
+            best, best_error = orbit, error
         if not error > plan.problem.accuracy:  # NaN if there is no motion
             break
     assert best is not None

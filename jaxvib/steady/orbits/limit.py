@@ -183,7 +183,7 @@ class _Point(NamedTuple):
 
     - `value` of the parameter
     - `speed`, rad/s, and `phases` (N,), rad, of the motion
-    - `slope`: derivative of the value by the coordinate along the branch
+    - `slope`: derivative of the value with respect to the coordinate along the branch
     - `is_met`: True if the equations are satisfied
     - `along`: coordinate along the branch, the phase of one exciter, rad, or the change of the speed in units of
       `_SPEED_PER_STEP`
@@ -244,7 +244,7 @@ def _branch_point(
 
     `exciter`: its number; None for the motion that has the given speed. `points`: number of collocation points on a period.
 
-    **Returns** the fields of `_Point` without `along`; `slope` over the phase or the speed.
+    **Returns** the fields of `_Point` without `along`; `slope` is the derivative with respect to the phase or the speed.
     """
     value, speed, phases = jnp.asarray(value), jnp.asarray(speed), jnp.asarray(phases)
     number, grid, forced = find_number(scene, over, "over"), grid_of(points, False), is_forced(scene)
@@ -280,9 +280,9 @@ def _branch_point(
 
     def move(unknowns: tuple[Array, ...], change: Array, length: Array) -> tuple[Array, ...]:
         x, w, share = unknowns
-        most = 1.0 / jnp.max(jnp.abs(change[:size].reshape(x.shape)[nd:]), initial=1e-30)
-        most = jnp.minimum(most, 0.5 / jnp.maximum(jnp.abs(change[-1]), 1e-30))
-        change = jnp.minimum(length, most) * change
+        limit = 1.0 / jnp.max(jnp.abs(change[:size].reshape(x.shape)[nd:]), initial=1e-30)
+        limit = jnp.minimum(limit, 0.5 / jnp.maximum(jnp.abs(change[-1]), 1e-30))
+        change = jnp.minimum(length, limit) * change
         return x + change[:size].reshape(x.shape), w if forced else w + change[size], share + change[-1]
 
     change = jnp.zeros(size + (1 if forced else 2), x.dtype)

@@ -46,9 +46,9 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     turn = 1 + np.flatnonzero(rising[1:] != rising[:-1])[: 4 * nd]
     padded = np.pad(turn, (0, 4 * nd - turn.size))
     main = np.asarray(without_ripples(jnp.asarray(speed[padded]), jnp.asarray(turn.size), 2 * nd))
-    there = main < turn.size
-    cuts = np.where(there, omega[padded[main]], np.inf)
-    modes = np.asarray(piece_modes(jnp.asarray(cuts), jnp.asarray(there), resonances))
+    exists = main < turn.size
+    cuts = np.where(exists, omega[padded[main]], np.inf)
+    modes = np.asarray(piece_modes(jnp.asarray(cuts), jnp.asarray(exists), resonances))
     crossed = (speed[1:] - target) * (speed[:-1] - target) <= 0.0
     near = turn[np.abs(speed[turn] - target) < _NEAR_FOLD_DISTANCE * target]
     close = []
@@ -63,7 +63,7 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     for k in np.flatnonzero(crossed):
         part = (target - speed[k]) / (speed[k + 1] - speed[k])
         found.setdefault(int(modes[np.searchsorted(cuts, omega[k])]), float(omega[k] + part * (omega[k + 1] - omega[k])))
-    # If the fold lies between two points, both of its modes are near these.
+    # If a fold lies between two points, the two modes that meet at the fold are near these points.
     for k in close:
         for side in (k - 1, k + 1):
             found.setdefault(int(modes[np.searchsorted(cuts, omega[side])]), float(omega[side]))

@@ -82,8 +82,8 @@ def _drag_rate(model: JammedBodies, omega: Array, speed: Array) -> Array:
         return jnp.max(-by_rate[:, 0] / model.inertia)
 
     accelerance = jnp.max(jnp.linalg.eigvalsh(mount.rows[0] @ small_solve(linear.mass, mount.rows[0].T)))
-    left = 1.0 - accelerance * jnp.sum(model.unbalance**2 / model.inertia)
-    return jnp.vectorize(fastest)(omega, speed) / left
+    share_of_inertia = 1.0 - accelerance * jnp.sum(model.unbalance**2 / model.inertia)
+    return jnp.vectorize(fastest)(omega, speed) / share_of_inertia
 
 
 def is_stiff(model: JammedBodies, omega: Array, speed: Array) -> Array:
@@ -109,8 +109,8 @@ class _Coefficients(NamedTuple):
 
     **Attributes** (s: share of each body in the total unbalance)
 
-    - `moving` s e', with its derivatives `moving1` and `moving2` by theta, and `coupling`, s e' minus the part of dry friction,
-      (directions, G, P)
+    - `moving` s e', its derivatives `moving1` and `moving2` with respect to theta, and `coupling`, s e' minus the part of dry
+      friction, (directions, G, P)
     - `by_angle`, `by_rate` (G, P): derivatives of the torque, divided by I Omega^2
     """
 
@@ -384,7 +384,7 @@ def _integrate(
 
 
 def _units(size: int, equations: _Disturbances) -> Array:
-    """Return a unit matrix (size, size, P) for each orbit."""
+    """Return unit matrices (size, size, P), one for each orbit."""
     omega = equations.omega
     return jnp.broadcast_to(jnp.eye(size, dtype=omega.dtype)[:, :, None], (size, size, omega.shape[0]))
 

@@ -110,7 +110,7 @@ class SynchronousOrbit(PathsOfPoints, Result):
     - `multipliers`: all Floquet multipliers, complex; `trivial`: computed value of the multiplier of a shift in time, which is
       exactly 1; NaN if an ideal drive turns an unbalance, because a shifted motion is then not a solution
     - `residual` of the equations of motion, relative; `error`: estimated relative error of speed and displacements, and error
-      of angles in rad, due to the number of harmonics
+      of angles in rad, due to the limited number of harmonics
     - `deviation_harmonics` (bodies, K), rad: alpha_k + psi_k of each load or rotor, `displacement_harmonics` (nd, K), m (rad
       for rotations), and `force_harmonics` (directions, K), N, of the force on the foundation; orders 0, 1, 2, ...
     - `scene`
@@ -289,18 +289,18 @@ def plan_synchronous(
     for k, exciter in enumerate(scene.exciters):
         _require_one_body(exciter, scene.prefix_of(k))
         scene = eqx.tree_at(lambda s, k=k: s.exciters[k].drive, scene, exciter.drive.settled())
-    shaken = [e for e in scene.exciters if e.drive.ideal and e.loads is None]
+    prescribed = [e for e in scene.exciters if e.drive.ideal and e.loads is None]
     motors = [e.drive.speed for e in scene.exciters if not e.drive.ideal and not isinstance(e.drive, SwitchedOff)]
-    if shaken:
-        start = shaken[0].drive.speed
+    if prescribed:
+        start = prescribed[0].drive.speed
     elif speed is not None:
         start = number(speed, "rad/s", "speed", low=0.0, open_low=True)
     elif motors:
         start = jnp.mean(jnp.stack(motors))
     else:
         raise InputError("speed", "is missing; give the speed near which the loads turn, rad/s, for example speed=95.0")
-    count_of = len(scene.exciters)
-    angles = jnp.zeros(count_of, start.dtype) if phases is None else numbers(phases, "rad", "phases", count_of)
+    n = len(scene.exciters)
+    angles = jnp.zeros(n, start.dtype) if phases is None else numbers(phases, "rad", "phases", n)
     all_known = is_known(scene, start, angles)
     if accuracy is None:
         accuracy = 1e-8 if start.dtype.itemsize >= 8 else 1e-3

@@ -49,7 +49,7 @@ def _inertia_of(exciter: Exciter) -> Array:
 
 
 def is_forced(scene: Scene) -> bool:
-    """True if an ideal drive turns an unbalance, and therefore determines the period of the motion."""
+    """Return True if an ideal drive turns an unbalance, and therefore determines the period of the motion."""
     return any(e.drive.ideal and e.loads is None for e in scene.exciters)
 
 
@@ -90,11 +90,11 @@ class PeriodicScene(eqx.Module):
         """Return d^2 x / dtheta^2 by the equations of motion."""
         change = self.field(theta / omega, self.state(theta, x, rate, omega))
         parts = [change.velocity / self.length]
-        for exciter, own in zip(self.model.scene.exciters, change.exciters, strict=True):
-            if own.rate:
-                parts.append(exciter.direction * own.rate[0])
-            elif own.rotor is not None:
-                parts.append(exciter.direction * own.rotor[1][None])
+        for exciter, exciter_change in zip(self.model.scene.exciters, change.exciters, strict=True):
+            if exciter_change.rate:
+                parts.append(exciter.direction * exciter_change.rate[0])
+            elif exciter_change.rotor is not None:
+                parts.append(exciter.direction * exciter_change.rotor[1][None])
         return jnp.concatenate(parts) / omega**2
 
     def slopes(self, theta: Array, x: Array, rate: Array, omega: Array) -> tuple[Array, Array]:
@@ -213,8 +213,8 @@ def solve_whole(
     else:
         start, omega = known.x, omega if forced else known.omega
     speed = omega if forced else jax.lax.stop_gradient(omega)
-    points = (grid.theta.size, grid.symmetric)
-    x, w = _solve(scene, speed, jax.lax.stop_gradient(start), grid=points, forced=forced, is_known=known is not None)
+    grid_key = (grid.theta.size, grid.symmetric)
+    x, w = _solve(scene, speed, jax.lax.stop_gradient(start), grid_key=grid_key, forced=forced, is_known=known is not None)
     return WholeMotion(x, w)
 
 
@@ -225,36 +225,37 @@ def linear_start(scene: PeriodicScene, grid: Grid, omega: Array) -> Array:
     """
     model, phases, force = linear_model(scene.model.scene), list(scene.phases), []
     for exciter, mount, count in zip(model.scene.exciters, model.mounts, body_counts(model.scene), strict=True):
-        own = [phases.pop(0) for _ in range(count)]
+        body_phases = [phases.pop(0) for _ in range(count)]
+        phase = body_phases[0] if body_phases else 0.0
         direction = jnp.stack([(1.0 + 0.0j, -1.0j * exciter.direction)[axis] for axis in mount.axes])
-        force.append(unbalance_of(exciter) * jnp.exp(1j * (own[0] if own else 0.0)) * (mount.rows[0].T @ direction))
+        force.append(unbalance_of(exciter) * jnp.exp(1j * phase) * (mount.rows[0].T @ direction))
     response = small_solve(model.dynamic_stiffness(omega, model.scene.top_speed), omega**2 * sum(force[1:], force[0]))
     q = (response[:, None] * np.exp(1j * grid.theta)[None]).real / scene.length
-    still = jnp.zeros((scene.phases.size, grid.theta.size), omega.dtype)
-    return jax.lax.stop_gradient(jnp.concatenate([q.astype(omega.dtype), still]))
+    no_deviation = jnp.zeros((scene.phases.size, grid.theta.size), omega.dtype)
+    return jax.lax.stop_gradient(jnp.concatenate([q.astype(omega.dtype), no_deviation]))
 
 
 @eqx.filter_custom_jvp
 def _solve(
-    scene: PeriodicScene, omega: Array, start: Array, *, grid: tuple[int, bool], forced: bool, is_known: bool
+    scene: PeriodicScene, omega: Array, start: Array, *, grid_key: tuple[int, bool], forced: bool, is_known: bool
 ) -> tuple[Array, Array]:
     if is_known:
         return start, omega
-    on, size, weight = grid_of(*grid), start.size, jnp.minimum(scene.feedback, 1.0)
+    grid, size, weight = grid_of(*grid_key), start.size, jnp.minimum(scene.feedback, 1.0)
 
     def move(unknowns: tuple[Array, Array], change: Array, length: Array) -> tuple[Array, Array]:
         x, w = unknowns
-        # A step turns bodies by at most 1 rad and changes the speed by at most half, because the linear model is not valid
-        # beyond.
+        # A step turns bodies by at most 1 rad and changes the speed by at most half, because the linear model is not valid for
+        # larger changes.
         turned = change[:size].reshape(x.shape)[scene.coordinates :]
-        most = 1.0 / jnp.max(jnp.abs(turned), initial=1e-30)
+        limit = 1.0 / jnp.max(jnp.abs(turned), initial=1e-30)
         if not forced:
-            most = jnp.minimum(most, 0.5 * jnp.abs(w / change[-1]))
-        change = jnp.minimum(length, most) * change
+            limit = jnp.minimum(limit, 0.5 * jnp.abs(w / change[-1]))
+        change = jnp.minimum(length, limit) * change
         return x + change[:size].reshape(x.shape), w if forced else w + change[-1]
 
     def linearize(x: Array, w: Array) -> Linearized:
-        system = collocation(scene, on, x, w, forced=forced)
+        system = collocation(scene, grid, x, w, forced=forced)
         right = system.residual.ravel() if forced else jnp.append(system.residual.ravel(), 0.0)
         # Residuals of the carrier are weighted by the torques that they cause. Otherwise no step that turns bodies would
         # reduce the norm, because the torques between bodies are small compared with the forces on the carrier.
@@ -267,13 +268,13 @@ def _solve(
 
 
 @_solve.def_jvp
-def _solve_jvp(primals, tangents, *, grid: tuple[int, bool], forced: bool, is_known: bool):
+def _solve_jvp(primals, tangents, *, grid_key: tuple[int, bool], forced: bool, is_known: bool):
     scene, omega, start = primals
-    x, w = _solve(scene, omega, start, grid=grid, forced=forced, is_known=is_known)
-    on = grid_of(*grid)
+    x, w = _solve(scene, omega, start, grid_key=grid_key, forced=forced, is_known=is_known)
+    grid = grid_of(*grid_key)
     by_omega = tangents[1] if forced else None
-    change = eqx.filter_jvp(lambda s, v: residual_of(s, on, x, v), (scene, w), (tangents[0], by_omega))[1].ravel()
-    matrix = collocation(scene, on, x, w, forced=forced).matrix
+    change = eqx.filter_jvp(lambda s, v: residual_of(s, grid, x, v), (scene, w), (tangents[0], by_omega))[1].ravel()
+    matrix = collocation(scene, grid, x, w, forced=forced).matrix
     tangent = -jnp.linalg.solve(matrix, change if forced else jnp.append(change, 0.0))
     speed = (jnp.zeros_like(w) if by_omega is None else by_omega) if forced else tangent[-1]
     return (x, w), (tangent[: x.size].reshape(x.shape), speed)
@@ -282,15 +283,15 @@ def _solve_jvp(primals, tangents, *, grid: tuple[int, bool], forced: bool, is_kn
 def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, forced: bool) -> tuple[Array, Array]:
     """Return the residual of the equations at the points, relative to their terms, and the estimated error of the motion.
 
-    The error is the largest of the relative error of the speed, the error of angles, rad, and the error of displacements
-    relative to the largest displacement. The error is estimated from the change in one Newton step with the residuals at twice
-    as many points, and from the highest harmonic.
+    The error is the largest of three errors: of the speed, relative; of angles, rad; of displacements, relative to the largest
+    displacement. They are estimated from the change in one Newton step with the residuals at twice as many points, and from the
+    highest harmonic.
     """
     scene, (x, omega) = jax.lax.stop_gradient((scene, motion))
     system, nd = collocation(scene, grid, x, omega, forced=forced), scene.coordinates
     fine = grid_of(2 * grid.theta.size, grid.symmetric)
-    between = residual_of(scene, fine, x @ resampling(grid, fine), omega) @ resampling(fine, grid)
-    change = solve_in_turn(system.matrix, between.ravel() if forced else jnp.append(between.ravel(), 0.0))
+    residual = (residual_of(scene, fine, x @ resampling(grid, fine), omega) @ resampling(fine, grid)).ravel()
+    change = solve_in_turn(system.matrix, residual if forced else jnp.append(residual, 0.0))
     last = jnp.abs(analyzed(x, deviation_analysis(grid))[:, -1:])
     error = jnp.concatenate([jnp.abs(change[: x.size].reshape(x.shape)), last], axis=1)
     largest = jnp.maximum(jnp.max(jnp.abs(x[:nd])), 1e-3)  # the forces of the exciters may cancel

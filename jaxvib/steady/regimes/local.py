@@ -158,20 +158,21 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
 
     def trial(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         x, factor, step = state
-        new, there = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, (x, factor * (1.0 + step)))
-        good = (size(new, there) < tolerance) & (jnp.max(jnp.abs(new - x)) < _LONGEST_STEP) & (factor < _LARGEST_FACTOR)
+        new_x, new_factor = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, (x, factor * (1.0 + step)))
+        good = size(new_x, new_factor) < tolerance
+        good = good & (jnp.max(jnp.abs(new_x - x)) < _LONGEST_STEP) & (factor < _LARGEST_FACTOR)
         return (
-            jnp.where(good, new, x),
-            jnp.where(good, there, factor),
+            jnp.where(good, new_x, x),
+            jnp.where(good, new_factor, factor),
             jnp.where(good, jnp.minimum(1.5 * step, 1.0), 0.4 * step),
         )
 
     at, factor, _ = jax.lax.fori_loop(0, _TRIALS, trial, (start, one, 0.1 * one))
-    fold, there, slopes = _fold_near(frozen, at, factor)
-    polished = (jnp.abs(there - factor) < 1e-2 * factor) & (jnp.max(jnp.abs(fold - at)) < _LONGEST_STEP)
-    at, factor = jnp.where(polished, fold, at), jnp.where(polished, there, factor)
+    fold, fold_factor, slopes = _fold_near(frozen, at, factor)
+    polished = (jnp.abs(fold_factor - factor) < 1e-2 * factor) & (jnp.max(jnp.abs(fold - at)) < _LONGEST_STEP)
+    at, factor = jnp.where(polished, fold, at), jnp.where(polished, fold_factor, factor)
     ends = factor < _LARGEST_FACTOR
-    # Without a fold the values below are not used; finite ones leave no NaN in derivatives.
+    # If there is no fold, the values below are not used. They must be finite, because a NaN would appear in derivatives.
     at, factor = jnp.where(ends, at, start), jnp.where(ends, factor, one)
     # At the fold, changes of the unknowns do not change the left null vector times the residuals to first order.
     left = jnp.where(ends, slopes.rows * slopes.left[:, -1], 1.0)

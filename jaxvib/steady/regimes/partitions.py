@@ -141,7 +141,7 @@ def regime_partitions(scene: Scene, *, stable: bool = True) -> RegimePartitions:
 
     **Returns** `RegimePartitions`.
 
-    **Raises** `InputError` as `synchronous_regimes`, and for more than 6 rotating masses.
+    **Raises** `InputError` in the cases of `synchronous_regimes`, and for more than 6 rotating masses.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -266,8 +266,8 @@ def _distinct(speed: np.ndarray, torque: np.ndarray, orders: np.ndarray) -> np.n
     numbers = np.stack([speed, torque], axis=-1)
     scale = 1e-5 * np.max(np.abs(numbers), axis=(0, 1), initial=1e-300)
     kept: list[int] = []
-    for k, own in enumerate(numbers):
-        forms = own[orders]
-        if not any(np.any(np.all(np.abs(forms - numbers[i]) <= scale, axis=(1, 2))) for i in kept):
+    for k, motion in enumerate(numbers):
+        exchanged = motion[orders]
+        if not any(np.any(np.all(np.abs(exchanged - numbers[i]) <= scale, axis=(1, 2))) for i in kept):
             kept.append(k)
     return np.asarray(kept, dtype=int)

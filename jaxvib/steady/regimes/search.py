@@ -123,8 +123,8 @@ def _speeds(balance: TorqueBalance) -> np.ndarray:
     top = drives.max()
     resonances = np.asarray(estimated_frequencies(balance.model.scene), float)
     centres = np.concatenate([drives, resonances[(resonances > 0.0) & (resonances < 1.2 * top)]])
-    apart = np.concatenate([[0.0], np.geomspace(1e-7, 0.3, _NEAR_SPEEDS)])
-    near = [w * (1.0 + side * apart) for w in centres for side in (-1.0, 1.0)]
+    distance = np.concatenate([[0.0], np.geomspace(1e-7, 0.3, _NEAR_SPEEDS)])
+    near = [w * (1.0 + side * distance) for w in centres for side in (-1.0, 1.0)]
     speeds = np.unique(np.concatenate([np.linspace(0.005, 1.01, _EVEN_SPEEDS) * top, *near]))
     return speeds[speeds < 1.02 * top].astype(balance.unbalance.dtype)
 
@@ -138,8 +138,8 @@ def sets_of_phases(prescribed: np.ndarray, dtype: np.dtype, per_unknown: int = _
     free = np.flatnonzero(~prescribed) if prescribed.any() else np.arange(1, prescribed.size)
     n = free.size
     even = np.linspace(-np.pi, np.pi, per_unknown, endpoint=False)[:, None] if n == 1 else np.zeros((0, n))
-    drawn = per_unknown * min(n, MAX_COMPLETE - 1) ** 2 if n > 1 else 0
-    random = np.random.default_rng(0).uniform(-np.pi, np.pi, (drawn, n))
+    random_count = per_unknown * min(n, MAX_COMPLETE - 1) ** 2 if n > 1 else 0
+    random = np.random.default_rng(0).uniform(-np.pi, np.pi, (random_count, n))
     sets = np.concatenate([_regular_sets(n), even, random])
     phases = np.zeros((len(sets), prescribed.size), dtype)
     phases[:, free] = sets
@@ -176,7 +176,10 @@ def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tup
 
 
 def _nearly_touching(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return indices of local minima of |values| (n, points), between equal signs, that are below the change beside them."""
+    """Return the indices of local minima of |values| (n, points) at which the values are close to 0.
+
+    Both neighbours of such a minimum have its sign, and the larger of them is at least twice as large.
+    """
     left, size, right = (np.abs(x) for x in (values[:, :-2], values[:, 1:-1], values[:, 2:]))
     same = (values[:, :-2] * values[:, 1:-1] > 0.0) & (values[:, 1:-1] * values[:, 2:] > 0.0)
     row, point = np.nonzero(same & (size <= np.minimum(left, right)) & (2.0 * size <= np.maximum(left, right)))

@@ -18,8 +18,8 @@ from jaxvib.study.audit.comparisons import MotionValues, total_drag_torque
 _G = 9.81
 _STEEL = 7850.0
 _ROLLING, _BEARING, _BEARING_DIAMETER = 3e-5, 0.0015, 0.2
-"""Typical values: arm of rolling friction of steel on steel, m; friction coefficient mu2 of a ball bearing; diameter of the bearing
-of a load, relative to the radius of its track."""
+"""Typical values: arm of rolling friction of steel on steel, m; friction coefficient mu2 of a ball bearing; diameter of the
+bearing of a load, relative to the radius of its track."""
 
 
 class NumberRow(NamedTuple):
