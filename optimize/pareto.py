@@ -111,7 +111,7 @@ def pareto(
 
     **Returns** `Front`, in ascending order of `first`. The front has one machine if this machine has the least values of both.
 
-    **Raises** as `synthesize`; `KeyboardInterrupt` if a search is interrupted.
+    **Raises** the errors of `synthesize`; `KeyboardInterrupt` if a search is interrupted.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

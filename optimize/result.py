@@ -207,13 +207,13 @@ class Synthesis(Result):
 
     def rows(self) -> list[list[str]]:
         """Return the table as text in practical units: name, before, after, by the exact motion, by time integration."""
-        out = []
+        rows = []
         for row in self.table:
             sizes = [abs(v) for v in row[2:] if math.isfinite(v)]
             unit, factor = shown_unit(row.unit, max(sizes, default=0.0))
             values = ["" if math.isnan(v) else f"{v * factor:.5g}" for v in row[2:]]
-            out.append([f"{row.what}, {unit}".rstrip(", "), *values])
-        return out
+            rows.append([f"{row.what}, {unit}".rstrip(", "), *values])
+        return rows
 
     def findings(self) -> list[str]:
         """Return lines of text with the limits, the five largest influences, and the distinct final designs."""

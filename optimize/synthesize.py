@@ -176,8 +176,11 @@ def synthesize(
 
 
 def _report(progress: Progress | None, searching: float, what: str, share: float) -> None:
-    """Report the share of the whole time. Up to 0.9, `share` is that of the search, which takes the part `searching` of the
-    time."""
+    """Report the finished share of the whole time.
+
+    **Arguments**: `searching`: share of the search in the whole time; `what`: name of the present step; `share`: 0 to 0.9
+    during the search, 0.9 to 1 after it.
+    """
     if progress is not None:
         shown = share * searching / 0.9 if share <= 0.9 else searching + (share - 0.9) / 0.1 * (1.0 - searching)
         call_user(progress, "progress", what, shown)
@@ -259,8 +262,9 @@ def _search(
     best: tuple[DesignSpace, Problem, SearchResult] | None = None
     existing = drawn = 0
     for loads in space.counts or (None,):
-        here = space if loads is None or loads == space.scene.loads.count else _with_loads(space, loads)
-        problem = problem_of(here, objective, demands, options.starts)
+        is_unchanged = loads is None or loads == space.scene.loads.count
+        space_of_count = space if is_unchanged else _with_loads(space, loads)
+        problem = problem_of(space_of_count, objective, demands, options.starts)
         if problem.keys:
             require_drag(jammed_loads(space.scene))
         result = choose(problem, options, report)
@@ -268,7 +272,7 @@ def _search(
             continue
         existing, drawn = existing + result.existing, drawn + result.drawn
         if best is None or _rank(result) < _rank(best[2]):
-            best = here, problem, result
+            best = space_of_count, problem, result
         if result.interrupted:
             best = (*best[:2], best[2]._replace(interrupted=True))
             break
@@ -299,10 +303,10 @@ def _rank(result: SearchResult) -> tuple[bool, float]:
 
 def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
     """Return the design space with another number of loads. **Raises** `InputError` for loads with different parameters."""
-    now = space.scene.loads
-    if not getattr(now, "alike", False):
+    present = space.scene.loads
+    if not getattr(present, "alike", False):
         raise InputError("choices.loads.count", "needs equal loads; give one mass, radius and drag for all")
-    scene = eqx.tree_at(lambda s: s.loads, space.scene, dataclasses.replace(now, count=loads))
+    scene = eqx.tree_at(lambda s: s.loads, space.scene, dataclasses.replace(present, count=loads))
     return eqx.tree_at(lambda s: s.scene, space, validate_scene(scene))
 
 

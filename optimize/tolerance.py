@@ -169,8 +169,8 @@ def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) 
         machine = scene if batch is None else jax.tree.map(lambda leaf, k=k: leaf[k], batch)
         for entry, share in zip(ranges, shares, strict=True):
             value = entry.low + (entry.high - entry.low) * share[k]
-            now = entry.number.read(machine)
-            machine = put_numbers(machine, (entry.number,), now + value if entry.is_added else 0.0 * now + value)
+            present = entry.number.read(machine)
+            machine = put_numbers(machine, (entry.number,), present + value if entry.is_added else 0.0 * present + value)
         yield machine
 
 

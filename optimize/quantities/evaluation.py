@@ -29,8 +29,8 @@ from jaxvib.steady.regimes.working import working_regime
 from jaxvib.units.known import is_known
 
 _NO_FOLD = 10.0
-"""Rotor speed, in units of that of the scene, in place of a fold at the end of a mode toward higher rotor speeds if there is no
-fold at this end."""
+"""Value for a fold that does not exist, at the end of a mode toward higher rotor speeds, in units of the rotor speed of the
+scene."""
 
 _RUN_UP_SAMPLES = 4000
 """Number of stored states of a run-up."""
@@ -154,9 +154,10 @@ class Evaluation:
                 orbit = jam_orbit(self.scene, mode=mode, throw=False)
             else:
                 orbit = jam_orbit(self.scene, near=jax.lax.stop_gradient(jam.omega), throw=False)
-                away = (orbit.slope > 0.0) != (mode % 2 == 1)
+                is_other_mode = (orbit.slope > 0.0) != (mode % 2 == 1)
                 orbit = jax.tree.map(
-                    lambda leaf: jnp.where(away, jnp.nan, leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf, orbit
+                    lambda leaf: jnp.where(is_other_mode, jnp.nan, leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf,
+                    orbit,
                 )
             self._orbits[mode] = orbit
         return self._orbits[mode]

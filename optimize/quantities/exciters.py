@@ -290,8 +290,8 @@ def least_torque() -> Quantity:
         max_r max_w (w^4/2) sum_ik S_i S_k |A_ik(w)| / sum_i L_i(w),      A = (H^H - H)/(2 i),    w within 10 % of w_r
 
     S_i is the unbalance of exciter i, kg m, L_i(w) the torque of its motor, H(w) the matrix of displacements per centrifugal
-    force of the exciters. The numerator is an upper bound of the mean torque of a steady vibration at the speed w over all
-    phases. The resonances w_r up to 95 % of the least no-load speed of the motors count. Rotors of large inertia need this
+    force of the exciters. The numerator is an upper bound, for any phases, of the mean torque of a steady vibration at the
+    speed w. Only resonances w_r up to 95 % of the lowest no-load speed of the motors count. Rotors of large inertia need this
     torque in a slow run-up; a fast passage needs less, see `jaxvib.run_up`, which integrates the run-up.
 
     **Returns** `Quantity`; typical: 0.1 to 0.8; above 1 the motors are caught by a resonance. A scene with an ideal drive
@@ -340,9 +340,9 @@ def _least_torques(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
 
     resonances = jax.lax.stop_gradient(natural_frequencies(scene))
     slowest = jnp.min(jnp.stack([exciter.drive.speed for exciter in scene.exciters]))
-    counts = (resonances > 0.0) & (resonances < _MAX_PASSED_RESONANCE * slowest)
-    ratios = jax.vmap(peak)(jnp.where(counts, resonances, 0.5 * slowest))
-    ratios = jnp.where(counts, ratios, 0.0)
+    is_passed = (resonances > 0.0) & (resonances < _MAX_PASSED_RESONANCE * slowest)
+    ratios = jax.vmap(peak)(jnp.where(is_passed, resonances, 0.5 * slowest))
+    ratios = jnp.where(is_passed, ratios, 0.0)
     return ratios if sign > 0.0 else -jnp.max(ratios)[None]
 
 

@@ -139,9 +139,9 @@ def static_deflection(of: int | None = None) -> Quantity:
 
     **Arguments**: `of`: the platform; typical: 1 to 3; default: the largest deflection of all platforms.
 
-    **Returns** `Quantity`, NaN for a platform that neither has a support nor is linked, directly or through other platforms, to
-    one that has; typical: 2 to 50 mm. A machine without platforms, or without this platform, raises `InputError` when the
-    quantity is computed.
+    **Returns** `Quantity`; typical: 2 to 50 mm; NaN if no support carries the platform, neither its own nor one of a platform
+    to which links connect it. A machine without platforms, or without this platform, raises `InputError` when the quantity is
+    computed.
 
     >>> import jaxvib as jv
     >>> from optimize import static_deflection

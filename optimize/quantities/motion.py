@@ -65,8 +65,8 @@ def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: i
     **Returns** `Quantity`; its derivatives exist in forward mode only; typical: the duration of the spin-up plus 2 to
     20 s. A value close to `until` shows that the motion has not settled.
 
-    **Raises** `InputError` for a `within` that is not between 0 and 1, and for a `spin_up` as for `peak_force`. A platform that
-    the machine does not have raises it when the quantity is computed.
+    **Raises** `InputError` for a `within` that is not between 0 and 1, and for a `spin_up` as for `peak_force`. For a platform
+    that the machine does not have, `InputError` is raised when the quantity is computed.
 
     >>> from optimize import settling_time
     >>> settling_time(until="20 s", spin_up="5 s").unit

@@ -115,7 +115,8 @@ def find(problem: Problem, options: Options, report: Progress) -> SearchResult |
 
 
 def _in_small_batches(problem: Problem, space: DesignSpace) -> Problem:
-    """Return the problem in another design space, with a small size of batches, which suits a few designs."""
+    """Return the problem for the design space `space`, with batches of `_STARTS_PER_BOUND` designs, because few designs are
+    evaluated."""
     return replace(problem, space=space, batch_size=_STARTS_PER_BOUND)
 
 
@@ -213,8 +214,8 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
     """Find the best design with catalogue values, by branch and bound on the continuous search.
 
     In each bounded problem the parameters vary continuously between two values of their catalogues. The problem with the best
-    design is divided next; the first one whose best design has values of the catalogues ends the search. Since each search is
-    local, the global optimum is not guaranteed. An interrupt (KeyboardInterrupt) ends the search with the nearest choice.
+    design is divided next. The search ends when the best design of such a problem has catalogue values only. Since each search
+    is local, the global optimum is not guaranteed. An interrupt (KeyboardInterrupt) ends the search with the nearest choice.
 
     **Returns** None if no choice meets all demands.
     """
@@ -232,14 +233,14 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
     try:
         while queue and nodes < _MAX_NODES:
             _, _, node, initial = heapq.heappop(queue)
-            where = problem.space.within(*node.bounds).numbers(node.point.z[node.best])
-            off = [_distance_to_catalogue(choice.values, where[choice.start]) for choice in choices]
-            if max(off) < 1e-9:
-                # All other nodes have larger bounds.
+            numbers = problem.space.within(*node.bounds).numbers(node.point.z[node.best])
+            distances = [_distance_to_catalogue(choice.values, numbers[choice.start]) for choice in choices]
+            if max(distances) < 1e-9:
+                # The objective of every other node is at least as large.
                 return node._replace(drawn=root.drawn, existing=root.existing, interrupted=False, nodes=nodes)
-            for low, high in _split_bounds(node, choices[int(np.argmax(off))], where):
+            for low, high in _split_bounds(node, choices[int(np.argmax(distances))], numbers):
                 nodes += 1
-                starts = np.concatenate([where[None], initial])[:_STARTS_PER_BOUND]
+                starts = np.concatenate([numbers[None], initial])[:_STARTS_PER_BOUND]
                 child = _solve_in_bounds(problem, low, high, starts, max(options.polishing, 20))
                 if child is None or child.violation[child.best] > 10.0 * FEASIBILITY_TOLERANCE:
                     continue
@@ -251,14 +252,14 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
     return None
 
 
-def _split_bounds(node: SearchResult, choice: Choice, where: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _split_bounds(node: SearchResult, choice: Choice, numbers: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield the two parts of the bounds of a node.
 
     The catalogue of `choice` is divided into the values up to the present value of this parameter, and the values above it.
-    `where` (d,) are the present free parameters, SI.
+    `numbers` (d,) are the present free parameters, SI.
     """
     allowed = [v for v in choice.values if node.bounds[0][choice.start] <= v <= node.bounds[1][choice.start]]
-    x = where[choice.start]
+    x = numbers[choice.start]
     for part in ([v for v in allowed if v <= x], [v for v in allowed if v > x]):
         if part:
             low, high = (b.copy() for b in node.bounds)
@@ -272,11 +273,11 @@ def _nearest_choice(problem: Problem, root: SearchResult) -> SearchResult:
 
     **Raises** `KeyboardInterrupt` if the objective does not exist for the rounded design.
     """
-    where = problem.space.within(*root.bounds).numbers(root.point.z[root.best])
+    numbers = problem.space.within(*root.bounds).numbers(root.point.z[root.best])
     low, high = (b.copy() for b in root.bounds)
     for choice in problem.space.choices:
-        low[choice.start] = high[choice.start] = min(choice.values, key=lambda v: abs(v - where[choice.start]))
-    result = _solve_in_bounds(problem, low, high, where[None], 0)
+        low[choice.start] = high[choice.start] = min(choice.values, key=lambda v: abs(v - numbers[choice.start]))
+    result = _solve_in_bounds(problem, low, high, numbers[None], 0)
     if result is None:
         raise KeyboardInterrupt
     return result._replace(drawn=root.drawn, existing=root.existing, interrupted=True)

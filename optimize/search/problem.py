@@ -129,8 +129,8 @@ class Point(NamedTuple):
     """Designs with their values and derivatives.
 
     **Attributes**: designs `z` (s, d); `values` (s, 1 + me + mi) and their derivatives `slopes` (s, 1 + me + mi, d); the
-    followed speeds `speeds` and their derivatives by z, `speed_slopes` (s, ..., d); the objective's `pieces` (s, p) and their
-    derivatives `piece_gradients` (s, p, d), empty for an objective of one piece.
+    followed speeds `speeds` and their derivatives with respect to z, `speed_slopes` (s, ..., d); the objective's `pieces`
+    (s, p) and their derivatives `piece_gradients` (s, p, d), empty for an objective of one piece.
     """
 
     z: np.ndarray
