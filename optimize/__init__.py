@@ -13,6 +13,7 @@ from optimize.pareto import Front, pareto
 from optimize.quantities.cases import expected, quantile, under, worst
 from optimize.quantities.exciters import (
     amplitude_spread,
+    conveying_speed,
     force_per_throw,
     least_torque,
     motion_spread,
@@ -34,7 +35,7 @@ from optimize.quantities.jams import (
     power,
 )
 from optimize.quantities.machine import product, spring_cost, static_deflection, support_frequency_squared, total, total_mass
-from optimize.quantities.motion import peak_force, settling_time
+from optimize.quantities.motion import peak_displacement, peak_force, settling_time
 from optimize.quantities.quantity import Demand, Quantity, largest, least
 from optimize.quantities.response import (
     fold_distance,
@@ -62,6 +63,7 @@ __all__ = [
     "acceleration",
     "amplitude",
     "amplitude_spread",
+    "conveying_speed",
     "expected",
     "fold_distance",
     "fold_margin",
@@ -77,6 +79,7 @@ __all__ = [
     "load_design",
     "motion_spread",
     "pareto",
+    "peak_displacement",
     "peak_force",
     "phase",
     "power",

@@ -205,9 +205,11 @@ class Evaluation:
         other."""
         self._runs["working" if motion == "working" else ("jam", motion)] = run
 
-    def start_up(self, until: float, spin_up: float) -> Run:
-        """Integrate the full equations from rest to the time `until`, s; the rotor speed rises during the time `spin_up`, s."""
-        integrate = partial(simulate, self.scene, until, start="spin_up", spin_up=spin_up, samples=_RUN_UP_SAMPLES)
+    def start_up(self, until: float, spin_up: float | None) -> Run:
+        """Integrate the full equations from rest to the time `until`, s; the rotor speed rises during the time `spin_up`, s, or
+        as the drives of the scene determine (None)."""
+        start = {"start": "rest"} if spin_up is None else {"start": "spin_up", "spin_up": spin_up}
+        integrate = partial(simulate, self.scene, until, samples=_RUN_UP_SAMPLES, **start)
         return self._run(("start_up", until, spin_up), integrate)
 
     def _run(self, key: Hashable, integrate: Callable[..., Run]) -> Run:

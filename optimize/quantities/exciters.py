@@ -19,14 +19,16 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.numerics.linalg import magnitude
+from jaxvib.steady.measures import conveying_speed_at
 from jaxvib.steady.points import Ellipse
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier, walk
-from optimize.quantities.user_inputs import number_in
+from optimize.quantities.user_inputs import Point, number_in, read_point
 
 __all__ = [
     "amplitude_spread",
+    "conveying_speed",
     "force_per_throw",
     "least_torque",
     "motion_spread",
@@ -48,17 +50,9 @@ _MAX_PASSED_RESONANCE = 0.95
 """Largest natural frequency, relative to the least no-load speed of the motors, that counts as a resonance that a run-up
 passes."""
 
-Point = tuple[float, float]
-
 
 class RegimeQuantity(BuiltinQuantity):
     """Quantity of the working regime of a machine with several exciters."""
-
-
-def _point(at: Sequence[Number], field: str) -> Point:
-    if not isinstance(at, (list, tuple)) or len(at) != 2:
-        raise InputError(field, f"is {quoted(at)}; it must be a point (x, y) of the body")
-    return number_in(at[0], "m", f"{field}[0]"), number_in(at[1], "m", f"{field}[1]")
 
 
 def _point_quantity(
@@ -71,7 +65,7 @@ def _point_quantity(
     tier: Tier,
     *settings: object,
 ) -> Quantity:
-    point = _point(at, "at")
+    point = read_point(at, "at")
     text = f"{text} at ({point[0]:g}, {point[1]:g}) m"
     return RegimeQuantity(name, unit, function, tier=tier, text=text, settings=(point, count(body, "body", low=0), *settings))
 
@@ -142,6 +136,33 @@ def throw_number(*, at: Sequence[Number] = (0.0, 0.0), slope: Number = 0.0, body
 
 def _throw_number(evaluation: Evaluation, tier: Tier, at: Point, body: int, slope: float) -> Array:
     return _ellipse(evaluation, tier, at, body, slope).throw_number
+
+
+@validated
+def conveying_speed(
+    *, at: Sequence[Number] = (0.0, 0.0), slope: Number = 0.0, body: int = 0, tier: Tier = "leading"
+) -> Quantity:
+    """Return the estimated mean speed of material at a point of a deck, m/s, positive up the deck, see
+    `jaxvib.conveying_speed`.
+
+    Its value is 0 for throw numbers of at most 1, and NaN above 3.297.
+
+    **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; `slope` of the deck, rad or text; typical: "-15 deg" to 0 (the
+    default).
+
+    **Returns** `Quantity`; typical: 0.1 to 0.5. **Raises** `InputError` for `at` that is not a point.
+
+    >>> from optimize import conveying_speed
+    >>> (conveying_speed(at=(0.0, 0.1)) > "0.25 m/s").words
+    'conveying speed at (0, 0.1) m at least 0.25 m/s'
+    """
+    along = number_in(slope, "rad", "slope")
+    return _point_quantity("conveying_speed", "m/s", _conveying_speed, "conveying speed", at, body, tier, along)
+
+
+def _conveying_speed(evaluation: Evaluation, tier: Tier, at: Point, body: int, slope: float) -> Array:
+    motion = evaluation.working(tier)
+    return conveying_speed_at(motion.deck([at], body).amplitude[0], jnp.abs(motion.harmonic().speed), jnp.asarray(slope))
 
 
 @validated
@@ -225,7 +246,7 @@ def _deck_quantity(
 ) -> Quantity:
     if not isinstance(points, (list, tuple)) or len(points) < 2:
         raise InputError("points", f"is {quoted(points)}; it must be a list of at least two points (x, y)")
-    places = tuple(_point(point, f"points[{k}]") for k, point in enumerate(points))
+    places = tuple(read_point(point, f"points[{k}]") for k, point in enumerate(points))
     return RegimeQuantity(name, "", function, tier=tier, text=text, settings=(places, count(body, "body", low=0)))
 
 

@@ -1,6 +1,8 @@
-"""Quantities of a run-up from rest, by time integration."""
+"""Quantities of a run from rest, by time integration."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -11,29 +13,33 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier
-from optimize.quantities.user_inputs import number_in
+from optimize.quantities.user_inputs import Point, number_in, read_point
 
-__all__ = ["peak_force", "settling_time"]
+__all__ = ["peak_displacement", "peak_force", "settling_time"]
 
 
-def _times(until: Number, spin_up: Number) -> tuple[float, float]:
-    end, up = number_in(until, "s", "until"), number_in(spin_up, "s", "spin_up")
-    if not 0.0 < up <= end:
+def _times(until: Number, spin_up: Number | None) -> tuple[float, float | None]:
+    end = number_in(until, "s", "until")
+    up = None if spin_up is None else number_in(spin_up, "s", "spin_up")
+    if not 0.0 < (end if up is None else up) <= end:
+        if up is None:
+            raise InputError("until", f"is {end:g} s; it must be greater than 0")
         raise InputError("spin_up", f"is {up:g} s; it must be greater than 0 and at most until, {end:g} s")
     return end, up
 
 
 @validated
-def peak_force(*, until: Number, spin_up: Number) -> Quantity:
-    """Return the largest foundation force, N, of a run in which the rotor is accelerated from rest (full equations).
+def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
+    """Return the largest foundation force, N, of a run from rest (full equations).
 
     **Arguments**
 
     - `until`: end of the integration, s or text; typical: 5 to 30
-    - `spin_up`: time during which the rotor speed rises smoothly, s or text; typical: 1 to 10
+    - `spin_up`: time during which the rotor speed rises smoothly, s or text; typical: 1 to 10. None (the default): the drives
+      of the scene accelerate and stop the rotors (motors, run-ups, `SpeedProfile`)
 
     **Returns** `Quantity`; its derivatives exist in forward mode only; typical: 500 N to 10 kN. **Raises** `InputError` for a
-    `spin_up` that is not positive, or longer than the run.
+    time that is not positive, and for a `spin_up` longer than the run.
 
     >>> from optimize import peak_force
     >>> (peak_force(until="20 s", spin_up="5 s") < "2 kN").words
@@ -43,10 +49,52 @@ def peak_force(*, until: Number, spin_up: Number) -> Quantity:
     return BuiltinQuantity("peak_force", "N", _peak, tier="time", tiers=("time",), text=text, settings=_times(until, spin_up))
 
 
-def _peak(evaluation: Evaluation, tier: Tier, until: float, spin_up: float) -> Array:
+def _peak(evaluation: Evaluation, tier: Tier, until: float, spin_up: float | None) -> Array:
     trajectory = evaluation.start_up(until, spin_up).trajectory
     assert trajectory is not None
     return jnp.sqrt(jnp.max(jnp.sum(trajectory.foundation_force**2, axis=1)))
+
+
+@validated
+def peak_displacement(
+    *, until: Number, at: int | Sequence[Number] | None = None, body: int = 0, spin_up: Number | None = None
+) -> Quantity:
+    """Return the largest displacement, m, of a point during a run from rest (full equations), for example while motors pass
+    the resonances.
+
+    **Arguments**
+
+    - `until` and `spin_up`: as for `peak_force`
+    - `at`: number of a platform, or a point (x, y) of a body, m or text, from its centre of mass; default: the centre of mass,
+      the platform of the exciter, or the axis of a rotor; typical: (1.5, 0.1)
+    - `body`: number of the body from 0; typical: 0 (the default)
+
+    **Returns** `Quantity`; its derivatives exist in forward mode only; typical: 5 to 30 mm, two to four times the amplitude at
+    working speed. **Raises** `InputError` for times as `peak_force`, and for a point that is not (x, y). A place that the
+    machine does not have raises it when the quantity is computed.
+
+    >>> from optimize import peak_displacement
+    >>> (peak_displacement(until="10 s", at=(1.5, 0.1)) < "15 mm").words
+    'largest displacement at (1.5, 0.1) m of a run from rest at most 15 mm'
+    """
+    place, where = at, ""
+    if isinstance(at, (list, tuple)):
+        place = read_point(at, "at")
+        where = f" at ({place[0]:g}, {place[1]:g}) m"
+    elif at is not None:
+        where = f" of platform {count(at, 'at')}"
+    text = f"largest displacement{where} of a run from rest"
+    settings = (*_times(until, spin_up), place, count(body, "body", low=0))
+    return BuiltinQuantity(
+        "peak_displacement", "m", _peak_displacement, tier="time", tiers=("time",), text=text, settings=settings
+    )
+
+
+def _peak_displacement(
+    evaluation: Evaluation, tier: Tier, until: float, spin_up: float | None, place: int | Point | None, body: int
+) -> Array:
+    moves = evaluation.start_up(until, spin_up).point(place, body, part="all").displacement
+    return jnp.sqrt(jnp.max(jnp.sum(moves**2, axis=1)))
 
 
 @validated
@@ -58,7 +106,7 @@ def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: i
 
     **Arguments**
 
-    - `until` and `spin_up`: as for `peak_force`
+    - `until` and `spin_up` (required): as for `peak_force`
     - `within`: the largest relative deviation from the final amplitude; typical: 0.02 to 0.1 (default 0.05)
     - `of`: number of the platform; typical: 1 (the default)
 
@@ -80,7 +128,7 @@ def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: i
     return BuiltinQuantity("settling_time", "s", _settling, tier="time", tiers=("time",), text=text, settings=settings)
 
 
-def _settling(evaluation: Evaluation, tier: Tier, until: float, spin_up: float, within: float, of: int) -> Array:
+def _settling(evaluation: Evaluation, tier: Tier, until: float, spin_up: float | None, within: float, of: int) -> Array:
     run = evaluation.start_up(until, spin_up)
     assert run.trajectory is not None
     state, time = run.trajectory.state, run.trajectory.time

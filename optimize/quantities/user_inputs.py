@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
+from jaxvib.errors import InputError, quoted
 from jaxvib.units import Number, number, unit_ratio
 from jaxvib.units.known import require_known
+
+Point = tuple[float, float]
+"""Point (x, y) of a body, m from its centre of mass."""
 
 
 def count_required_arguments(function: Callable[..., object]) -> int:
@@ -37,3 +41,10 @@ def number_in(value: Number, unit: str, name: str) -> float:
     converted = number(value, unit, name)
     require_known(converted, name, "a quantity", "make it outside")
     return float(converted)
+
+
+def read_point(at: Sequence[Number], field: str) -> Point:
+    """Return a point of a body. **Raises** `InputError` if `at` does not have two coordinates."""
+    if not isinstance(at, (list, tuple)) or len(at) != 2:
+        raise InputError(field, f"is {quoted(at)}; it must be a point (x, y) of the body")
+    return number_in(at[0], "m", f"{field}[0]"), number_in(at[1], "m", f"{field}[1]")

@@ -41,6 +41,7 @@ ARGUMENTS = {
     "amplitude": ({"mode": 3}, {"mode": 1, "of": 2, "tier": "exact"}),
     "foundation_force": ({"mode": 3}, {"mode": 1, "harmonic": 2, "tier": "exact"}),
     "peak_force": ({"until": 0.5, "spin_up": 0.2}, {"until": 0.4, "spin_up": 0.1}),
+    "peak_displacement": ({"until": 0.5, "at": 1}, {"until": 0.4, "at": 2, "spin_up": 0.1}),
     "product": ({"field": "machine.mass"}, {"field": "machine.stiffness"}),
     "spring_cost": ({"prices": [(1e4, 20.0), (1e5, 55.0)]}, {"prices": [(1e4, 20.0), (1e5, 55.5)], "unit": "USD"}),
     "static_deflection": ({}, {"of": 1}),

@@ -448,7 +448,7 @@ def balanced_intervals(
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.01, radius=0.1, drag=5.0), jv.ConstantSpeed(40.0))
     >>> balanced_intervals(scene, 20.0, 60.0, points=40)
-    270.103 .. 572.958 rpm
+    270.041 .. 572.958 rpm
     """
     low, high = (float(number(value, "rad/s", name)) for name, value in (("low", low), ("high", high)))
     if not 0.0 < low < high:

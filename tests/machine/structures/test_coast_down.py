@@ -3,9 +3,11 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.integrate
 
 import jaxvib as jv
+from optimize import peak_displacement, peak_force
 
 M, C, K, S, J, BEARING = 200.0, 600.0, 8e5, 0.4, 0.2, 0.05
 START = 100.0  # rad/s; the resonance is at 63 rad/s
@@ -39,3 +41,16 @@ def test_peak_of_a_coast_down_is_scipys():
     np.testing.assert_allclose(found, y, atol=1e-6 * np.max(np.abs(y)))
     np.testing.assert_allclose(run.largest_displacement[0], np.max(np.abs(y)), rtol=1e-6)
     np.testing.assert_allclose(run.largest_force, np.max(np.abs(K * y + C * v)), rtol=1e-6)
+
+
+def test_peaks_of_start_and_stop_are_quantities_of_designs():
+    stop = jv.SwitchedOff(jv.DCMotor(START, stall_torque=40.0, inertia=J), at="3 s", bearing=BEARING)
+    scene = jv.Scene(jv.one_mass(mass=M, stiffness=K, damping=C), exciters=[jv.Exciter(drive=stop, unbalance=S)])
+    run = jv.simulate(scene, "6 s", samples=20000)
+    np.testing.assert_allclose(peak_displacement(until="6 s")(scene), run.largest_displacement[0], rtol=1e-3)
+    np.testing.assert_allclose(peak_displacement(until="6 s", at=1)(scene), run.largest_displacement[0], rtol=1e-3)
+    np.testing.assert_allclose(peak_force(until="6 s")(scene), run.largest_force, rtol=1e-3)
+    with pytest.raises(jv.InputError, match="until is 0 s; it must be greater than 0"):
+        peak_displacement(until=0.0)
+    with pytest.raises(jv.InputError, match="at is"):
+        peak_displacement(until=1.0, at=(1.0,))

@@ -12,6 +12,7 @@ import jaxvib as jv
 from jaxvib.machine.files import SCREENS
 from optimize import (
     amplitude_spread,
+    conveying_speed,
     force_per_throw,
     foundation_force,
     least_torque,
@@ -77,6 +78,9 @@ def test_quantities_agree_with_an_independent_calculation(screen):
     np.testing.assert_allclose(foundation_force()(screen), total, rtol=1e-6)
     np.testing.assert_allclose(force_per_throw(**at)(screen), total / size.max(), rtol=1e-6)
     np.testing.assert_allclose(throw_number(**at)(screen), w**2 * abs(u[0][1]) / 9.80665, rtol=1e-6)
+    np.testing.assert_allclose(
+        conveying_speed(**at, slope="-5 deg")(screen), jv.conveying_speed(u[0], w, slope="-5 deg"), rtol=1e-6
+    )
     torques = [float(exciter.drive.torque(w)) for exciter in screen.exciters]
     np.testing.assert_allclose(power()(screen), w * sum(torques), rtol=1e-6)
     resonances = np.asarray(jv.natural_frequencies(screen))
@@ -98,6 +102,7 @@ def test_exact_motion_and_integration_confirm_the_quantities(screen):
 def test_derivatives_of_all_quantities_agree_with_differences(screen):
     quantities = [
         throw_stroke(at=DECK[0]), throw_angle(at=DECK[0]), throw_number(at=DECK[2], slope=-0.1), roundness(at=DECK[0]),
+        conveying_speed(at=DECK[1]),
         motion_spread(DECK), amplitude_spread(DECK), force_per_throw(), foundation_force(), power(), synchronization_margin(),
         resonance_distance(), least_torque(),
     ]  # fmt: skip
