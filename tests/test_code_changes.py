@@ -247,9 +247,11 @@ def peak_force(*args):
 
 
 def test_an_early_edit_reaches_the_next_process(tmp_path):
-    """The first process computes with the code that it imported, which is no longer that of the sources."""
+    """A process computes with the code that it imported, an edit after the import reaches later processes only."""
     for package in ("jaxvib", "optimize"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    source = tmp_path / "jaxvib" / "equations" / "linear.py"
+    original = source.read_text()
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "home")}
 
     def ask(*edit):
@@ -261,3 +263,7 @@ def test_an_early_edit_reaches_the_next_process(tmp_path):
     once, files = ask(EDIT)
     assert files == 0
     assert ask() == (2.0 * once, 1)
+    source.write_text(original)
+    assert ask() == (once, 2)
+    assert ask(EDIT) == (once, 2)  # the stored program of the original source is neither used nor replaced
+    assert ask() == (2.0 * once, 2)
