@@ -368,7 +368,7 @@ def plan_ensemble(
     number_of_steps, implicit = 0 if steps is None else count(steps.number, "steps"), False
     if known:
         # Refused runs do not influence the steps of other runs.
-        rates = [float(np.max(np.where(allowed, x, 0.0))) for x in (fastest, decay)]
+        rates = [float(np.max(np.where(allowed, x, 0.0))) for x in (np.maximum(fastest, _start_speed(states)), decay)]
         rates = rates if bool(np.any(allowed)) else [1.0, 0.0]
         step, implicit = equal_step_length(
             rates[0], rates[1], _EXPLICIT_STEPS_PER_RADIAN, float(end) / number_of_steps if number_of_steps else None
@@ -416,6 +416,12 @@ def _build_scenes(make: Callable[..., Scene | tuple[Scene, State]], values: PyTr
         return scene, with_spin(scene, state), jnp.asarray(True) if allowed is None else allowed
 
     return eqx.filter_vmap(build_scene)(values)
+
+
+def _start_speed(states: State) -> np.ndarray:
+    """Return the largest speed (runs,), rad/s, at which a load starts; a user may choose one above that of the rotor."""
+    speeds = [np.abs(exciter.rate[0]) for exciter in states.exciters if exciter.rate]
+    return np.max([np.max(np.where(np.isfinite(x), x, 0.0), axis=-1) for x in speeds] or [0.0], axis=0)
 
 
 @cached

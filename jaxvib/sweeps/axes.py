@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -27,8 +27,14 @@ _START = {"angle": "rad", "rate": "rad/s", "displacement": "m", "velocity": "m/s
 
 _KEYS = ["from", "to", "count", "scale"]
 
-_MAX_AXES_WITH_CORNERS = 10
-"""Maximum number of axes for which all corners are checked; with more axes only two opposite corners are checked."""
+_MAX_CORNERS = 1024
+"""Maximum number of corners with which the search for extreme cases begins: all corners of up to 10 axes."""
+
+_VALUES_TO_TRY = 9
+"""Number of values of an axis in the search for extreme cases: its ends and values between them."""
+
+_MAX_ROUNDS = 20
+"""Maximum number of rounds over all axes in the search for extreme cases; usually the second round changes nothing."""
 
 AxisSpec: TypeAlias = Sequence[Number] | np.ndarray | Mapping[str, Number | int | str]
 """A list of values, or a table of `from`, `to`, `count` and `scale`; without `count` the parameter is sampled."""
@@ -242,12 +248,40 @@ def put_start(state: State, targets: Sequence[Target], values: Array) -> State:
     return state
 
 
-def corners(axes: Sequence[Axis]) -> np.ndarray:
-    """Return the corners (corners, axes), SI, of the range of all axes."""
-    ends = np.asarray([[axis.low, axis.high] for axis in axes])
-    if len(axes) > _MAX_AXES_WITH_CORNERS:
-        return ends.T
-    return np.stack([mesh.ravel() for mesh in np.meshgrid(*ends, indexing="ij")], axis=1)
+def extreme_cases(axes: Sequence[Axis], rates: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return cases (rates, axes), SI, in the range of all axes: case k has the largest value of rate k.
+
+    `rates` returns the rates (cases, rates) of cases (cases, axes). The search begins at the best of all corners or, with more
+    than 10 axes, of 1024 random corners. It then changes one axis at a time to the best of its ends and 7 values between them,
+    until no change increases a rate.
+    """
+    tried = np.stack([_values_to_try(axis) for axis in axes])
+    number = len(axes)
+    if 2**number <= _MAX_CORNERS:
+        is_high = np.indices((2,) * number).reshape(number, -1).T
+    else:
+        is_high = np.random.Generator(np.random.Philox(key=0)).integers(0, 2, (_MAX_CORNERS, number))
+    corners = np.where(is_high, tried[:, -1], tried[:, 0])
+    best = corners[np.argmax(rates(corners), axis=0)]
+    which = np.arange(len(best))
+    for _ in range(_MAX_ROUNDS):
+        before = best
+        for k in range(number):
+            trials = np.repeat(best[:, None], 1 + _VALUES_TO_TRY, axis=1)  # the first is unchanged and wins if rates are equal
+            trials[:, 1:, k] = tried[k]
+            found = rates(trials.reshape(-1, number)).reshape(len(best), -1, len(best))[which, :, which]
+            best = trials[which, np.argmax(found, axis=1)]
+        if np.array_equal(best, before):
+            break
+    return best
+
+
+def _values_to_try(axis: Axis) -> np.ndarray:
+    """Return increasing values (9,) of an axis from its lower to its upper end; short lists have repeated values."""
+    shares = np.linspace(0.0, 1.0, _VALUES_TO_TRY)
+    if axis.values is None:
+        return axis.at(shares)
+    return np.sort(axis.values)[np.round(shares * (axis.values.size - 1)).astype(int)]
 
 
 def tile_of(shape: Sequence[int], max_cases: int) -> tuple[int, ...]:

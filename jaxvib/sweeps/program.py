@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.batch import PARTS_OF_RUN, BatchPlan, run_in_batch
@@ -19,7 +21,7 @@ from jaxvib.motion.stiffness import equal_step_length, fastest_decay
 from jaxvib.results.fields import Plain
 from jaxvib.runtime.operations import calls_python, program_text
 from jaxvib.runtime.programs import cached
-from jaxvib.sweeps.axes import Target, put, put_start
+from jaxvib.sweeps.axes import Axis, Target, extreme_cases, put, put_start
 from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, Study, digest
 from jaxvib.sweeps.measures import Measure, RunMeasure
 from optimize.quantities.evaluation import Evaluation
@@ -32,6 +34,9 @@ _STATES_PER_TURN = 8
 
 _SLOW_PERIODS = 20
 """Length of the window in periods of the lowest natural frequency, as in `simulate`."""
+
+_CASES_PER_BLOCK = 64
+"""Number of cases whose rates are computed together in the search for the fastest and the slowest case."""
 
 _MAX_STEPS = 1e9
 """Maximum number of steps of a run, about an hour of computation."""
@@ -98,27 +103,41 @@ def _measure_cases_compiled(scene: Scene, values: Array, program: str, *choices:
 
 
 @cached
-def _speeds(scene: Scene, values: Array, targets: tuple[Target, ...]) -> tuple[Array, Array, Array, Array]:
-    def bounds_of_case(value: Array) -> tuple[Array, Array, Array, Array]:
-        varied = put(scene, targets, value)
-        return (*frequency_bounds(varied), fastest_decay(varied), varied.top_speed)
+def _rates(scene: Scene, values: Array, targets: tuple[Target, ...]) -> Array:
+    """Return rates (cases, 5) of cases (cases, axes): fastest and -slowest rate, decay, rotor speed, and the sum of the squared
+    natural frequencies.
 
-    return jax.vmap(bounds_of_case)(values)
-
-
-def plan_runs_of_cases(
-    scene: Scene, corners: np.ndarray, targets: tuple[Target, ...], until: float, steps: int | None
-) -> BatchPlan:
-    """Return the plan of steps and window for all cases, from the fastest and the slowest of the `corners` (n, axes) of a
-    study.
-
-    Frequencies increase with each stiffness and decrease with each mass; therefore the extreme frequencies are in the corners.
+    If a motor is faster than all vibrations, no single axis changes the fastest rate; the sum changes with every stiffness.
     """
-    fastest, slowest, decay, rotor = (np.asarray(x) for x in _speeds(scene, jnp.asarray(corners), targets))
-    max_window = 2.0 * np.pi * _STATES_IN_WINDOW / (_STATES_PER_TURN * float(np.max(rotor)))
-    window = min(2.0 * np.pi * _SLOW_PERIODS / float(np.min(slowest)), max_window, until / 2.0)
+
+    def rates_of_case(value: Array) -> Array:
+        varied = put(scene, targets, value)
+        fastest, slowest = frequency_bounds(varied)
+        total = jnp.sum(estimated_frequencies(varied) ** 2)
+        return jnp.stack([fastest, -slowest, fastest_decay(varied), varied.top_speed, total])
+
+    return jax.vmap(rates_of_case)(values)
+
+
+def plan_runs_of_cases(scene: Scene, axes: Sequence[Axis], until: float, steps: int | None) -> BatchPlan:
+    """Return the plan of steps and window for all cases of a study, from the fastest and the slowest case in the range of the
+    axes, see `extreme_cases`."""
+    targets = tuple(axis.target for axis in axes)
+
+    def rates(values: np.ndarray) -> np.ndarray:
+        """Compute the rates in blocks of equal shape, for which one program is compiled."""
+        number = -(-len(values) // _CASES_PER_BLOCK)
+        filled = np.resize(values, (number * _CASES_PER_BLOCK, len(axes)))
+        blocks = [np.asarray(_rates(scene, jnp.asarray(block), targets)) for block in np.split(filled, number)]
+        return np.nan_to_num(np.concatenate(blocks)[: len(values)], nan=-np.inf)
+
+    fastest, minus_slowest, decay, rotor, _ = (float(x) for x in np.max(rates(extreme_cases(axes, rates)), axis=0))
+    # Loads that start faster than the rotor are the fastest motion of a run.
+    fastest = max(fastest, *(max(abs(a.low), abs(a.high)) for a in axes if a.target.field == "rate"), 0.0)
+    max_window = 2.0 * np.pi * _STATES_IN_WINDOW / (_STATES_PER_TURN * rotor)
+    window = min(2.0 * np.pi * _SLOW_PERIODS / -minus_slowest, max_window, until / 2.0)
     step_given = None if steps is None else until / min(steps, 10 * int(_MAX_STEPS))
-    step, implicit = equal_step_length(float(np.max(fastest)), float(np.max(decay)), 1.0, step_given)
+    step, implicit = equal_step_length(fastest, decay, 1.0, step_given)
     if until / step > _MAX_STEPS:
         name = "until" if steps is None else "steps"
         raise InputError(name, f"needs {until / step:.3g} steps for every run; give a shorter run or fewer steps")

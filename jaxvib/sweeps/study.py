@@ -16,7 +16,7 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.batch import BatchPlan
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.results.fields import Plain
-from jaxvib.sweeps.axes import SAMPLINGS, Axis, AxisSpec, Grid, axis_of, corners, require_disjoint, tile_of
+from jaxvib.sweeps.axes import SAMPLINGS, Axis, AxisSpec, Grid, axis_of, require_disjoint, tile_of
 from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.measures import Measure, RunMeasure, measure_of
 from jaxvib.sweeps.program import plan_runs_of_cases, traced_program
@@ -109,9 +109,9 @@ def _run_plan(
     steps: int | None,
 ) -> BatchPlan | None:
     """Return the plan of the runs of all cases, or None if no measure needs a run."""
-    runs, targets = [m for m in measures if isinstance(m, RunMeasure)], tuple(axis.target for axis in axes)
+    runs = [m for m in measures if isinstance(m, RunMeasure)]
     if not runs:
-        if until is not None or any(target.number is None for target in targets):
+        if until is not None or any(axis.target.number is None for axis in axes):
             field = "until" if until is not None else next(f"axes.{a.name}" for a in axes if a.target.number is None)
             problem = "applies to runs, but no quantity is measured in a run; measure for example run.regime"
             raise InputError(field, problem)
@@ -120,7 +120,7 @@ def _run_plan(
         raise InputError("until", f"is missing; {runs[0].name} is measured in a run; give the duration of the run")
     end = float(number(until, "s", "until", low=0.0, open_low=True))
     initial_state(scene, start, mode=mode, throw=False)  # raises an error for a start that the scene cannot have
-    return plan_runs_of_cases(scene, corners(axes), targets, end, None if steps is None else count(steps, "steps"))
+    return plan_runs_of_cases(scene, axes, end, None if steps is None else count(steps, "steps"))
 
 
 def _traced(study: Study) -> Study:

@@ -86,6 +86,16 @@ def test_error_of_a_run_is_independent_of_the_batch():
         assert 0.0 < error_of(loud, k, beside, exact) <= float(beside.error[k])
 
 
+def test_loads_that_start_fast_have_short_steps():
+    scene = published(speed=3.0, eps=0.05).scene()
+    still = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(1),), (jnp.zeros(1),))
+    rates = jnp.asarray([0.0, 150.0])
+    many = jv.ensemble(lambda rate: (scene, eqx.tree_at(lambda s: s.rate, still, (rate[None],))), rates, 2.0)
+    assert float(many.error.max()) < 1e-6
+    run = jv.simulate(scene, 2.0, start=eqx.tree_at(lambda s: s.rate, still, (rates[1:],)), save="window")
+    np.testing.assert_allclose(many.state.rate[0][1], run.window.state.rate[0][-1], rtol=1e-6)
+
+
 def test_number_of_steps_is_a_multiple_of_the_parts():
     found = {n: jv.ensemble(make, values(), 5.0, stepsize_controller=jv.EqualSteps(n)) for n in (86, 88, 44, 12, 8)}
     assert {n: int(many.steps) for n, many in found.items()} == {86: 88, 88: 88, 44: 44, 12: 12, 8: 8}
