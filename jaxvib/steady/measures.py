@@ -150,13 +150,15 @@ class VibrationMeasures(Readable):
     - `velocity` (nt,), m/s root mean square; typical: 50 to 300 mm/s
     - `exciter_force`, N zero to peak: resultant of the centrifugal forces
     - `transmissibility`: foundation force divided by `exciter_force`
+    - `foundation_load` (directions,), N zero to peak: force on the foundation in each direction, across and up for a body in a
+      plane or a rotor
     - `static_load` (ns,), N: weight that each support carries; NaN if the directions of the coordinates are unknown
     - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on each support
     - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive
     - `point` (2,) of a body in a plane, its `point_stroke`, m peak to peak along the long axis of its path, its
       `point_acceleration`, g, `throw_angle`, rad, and `throw_number`, see `Ellipse`, and `conveying_speed`, m/s, the estimate
       of `jaxvib.conveying_speed`; with a leading axis if several points were requested; None for other machines
-    - `coordinates` (nt,): names of the coordinates
+    - `coordinates` (nt,): names of the coordinates, and `directions` of the force on the foundation
     """
 
     speed: Array = eqx.field(metadata=in_unit("rad/s"))
@@ -165,6 +167,7 @@ class VibrationMeasures(Readable):
     velocity: Array = eqx.field(metadata=in_unit("m/s", "translation"))
     exciter_force: Array = eqx.field(metadata=in_unit("N"))
     transmissibility: Array = eqx.field(metadata=in_unit(""))
+    foundation_load: Array = eqx.field(metadata=in_unit("N", "direction"))
     static_load: Array = eqx.field(metadata=in_unit("N", "support"))
     dynamic_load: Array = eqx.field(metadata=in_unit("N", "support"))
     side_load: Array = eqx.field(metadata=in_unit("N", "support"))
@@ -177,6 +180,7 @@ class VibrationMeasures(Readable):
     throw_number: Array | None = eqx.field(metadata=in_unit(""), default=None)
     conveying_speed: Array | None = eqx.field(metadata=in_unit("m/s"), default=None)
     coordinates: tuple[str, ...] = eqx.field(static=True, default=())
+    directions: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def isolation_efficiency(self) -> Array:
@@ -220,6 +224,9 @@ class VibrationMeasures(Readable):
             named = zip(each, ("static", "dynamic", "to the sides"), strict=True)
             parts = [f"{load:.4g} N {word}" for load, word in named if load > _NEGLIGIBLE * np.nanmax(each)]
             lines += [f"support {k + 1}: {', '.join(parts)}"] if np.nansum(each) > 0.0 else []
+        if len(self.directions) > 1:
+            forces = zip(self.foundation_load, self.directions, strict=True)
+            lines.append(f"foundation: {', '.join(f'{float(force):.4g} N {name}' for force, name in forces)} (dynamic)")
         ratio = float(self.transmissibility)
         if ratio < _LARGEST_TRANSMISSIBILITY:
             passed = f"of the exciter's {quantity_text(self.exciter_force, 'N', 4)}, {100.0 * ratio:.3g} % reach the foundation"
@@ -333,7 +340,8 @@ def exciter_force(model: JammedModel, omega: Array) -> Array:
 @cached
 def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...], slope: Array) -> VibrationMeasures:
     model = linear_model(scene)
-    lengths = np.flatnonzero(np.asarray(model.carrier.units) == "m")
+    carrier = model.carrier
+    lengths = np.flatnonzero(np.asarray(carrier.units) == "m")
     amplitude, w = motion.amplitude[lengths], jnp.abs(motion.speed)
     static, dynamic, side = support_loads(model, w, motion.displacement)
     forced = motion.exciter_force > 0.0
@@ -345,12 +353,14 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
         velocity=rms_velocity_of(amplitude, w),
         exciter_force=motion.exciter_force,
         transmissibility=ratio,
+        foundation_load=magnitude((carrier.foundation_stiffness + 1j * w * carrier.foundation_damping) @ motion.displacement),
         static_load=static,
         dynamic_load=dynamic,
         side_load=side,
         torque=motion.torque,
         power=motion.power,
-        coordinates=tuple(model.carrier.coordinates[k] for k in lengths),
+        coordinates=tuple(carrier.coordinates[k] for k in lengths),
+        directions=carrier.foundation_directions,
     )
     if scene.machine.places != "plane":
         return measures

@@ -123,13 +123,13 @@ class NamePlateMotor(Motor):
 
     def torque(self, speed: Array) -> Array:
         """Return the torque of Kloss's formula, with the starting torque if it is known."""
-        slip, breakdown_slip = 1.0 - speed / self.speed, self.breakdown_slip
+        slip, largest, breakdown_slip = 1.0 - speed / self.speed, self.breakdown_torque, self.breakdown_slip
         if self.starting_ratio is not None:
             ratio = jnp.maximum(self.breakdown_ratio / self.starting_ratio, 1.0 + 1e-6)  # the root has a derivative
             at_standstill = ratio - jnp.sqrt(ratio**2 - 1.0)  # 1/u
             growth = (at_standstill - breakdown_slip) / (1.0 - breakdown_slip)
             breakdown_slip = breakdown_slip + growth * jnp.maximum(slip - breakdown_slip, 0.0)
-        return kloss_torque(slip, self.breakdown_torque, breakdown_slip)
+        return kloss_torque(slip, largest, breakdown_slip)
 
 
 def _require_starting_ratio(ratio: float, least: float, most: float) -> None:
