@@ -81,7 +81,12 @@ def status_of(fitted: Fitted, information: Information) -> tuple[FitStatus, floa
                 f"the rotor's angle in run {k + 1} has the standard error {error:.2g} rad between its pulses, and a fit may "
                 "end in a wrong minimum: use more pulses per turn, or sample them faster"
             )
-    is_inaccurate, has_fit = False, resembles(fitted)
+    is_inaccurate, has_fit = fitted.is_absorbed, resembles(fitted)
+    if fitted.is_absorbed:
+        notes.append(
+            "the residuals vibrate at natural frequencies of the machine, and no noise model separates them from its motion; "
+            "the noise is assumed to be white, and the intervals are too narrow: fit runs one by one, or record them again"
+        )
     for k, misfit in enumerate(fitted.misfits):
         if misfit > MISFIT:
             is_inaccurate = True

@@ -47,6 +47,10 @@ _STEADY_NOISE = 0.01
 _STEADY_VALUES = 0.05
 """Change of the unknowns in a pass, in standard errors, below which the influence of outliers and bounds is final."""
 
+_MAX_GROWTH = 1.2
+"""Standard deviation of residuals relative to that of a fit with white noise above which coloured noise takes up a part of the
+motion. It then has the frequencies of the machine, and a free decay is such noise as well as a motion."""
+
 _ANGLE_MATTERS = 0.03
 """Share of the noise due to the error of the rotor's angle above which the angle is fitted with the machine."""
 
@@ -69,6 +73,7 @@ class Fitted(NamedTuple):
     - `noise` (C,) of each run: standard deviation of the residuals
     - `outliers` (C,) of each run: share of the residuals that are outliers
     - `converged`: True if the last descent reached a minimum
+    - `is_absorbed`: True if coloured noise would take up a part of the motion; the noise of the fit is white then
     - `misfits` of each run: deviation of the rotor from its torque balance, relative to that from a smooth curve; empty if no
       number of a motor is unknown
     """
@@ -82,6 +87,7 @@ class Fitted(NamedTuple):
     noise: tuple[np.ndarray, ...]
     outliers: tuple[np.ndarray, ...]
     converged: bool
+    is_absorbed: bool = False
     misfits: tuple[float, ...] = ()
 
     @property
@@ -153,11 +159,14 @@ def project(problem: Problem, x: np.ndarray) -> _Trial:
     matrix, right, square = total[:-1, :-1], total[:-1, -1], total[-1, -1]
     if not np.all(np.isfinite(total)):
         return _Trial(x, np.zeros(len(right)), np.inf)
-    linear = solved(matrix, right)
+    damping = np.zeros(len(right))  # of the steps of known unbalances, whose angles may be undetermined
+    for k, known in enumerate(problem.unbalances):
+        damping[2 * k : 2 * k + 2] = 0.0 if known is None else 1.0 / known.value**2
+    linear = solved(matrix + np.diag(damping), right)
     if any(problem.unbalances):
         for _ in range(8):  # the right side of each step depends on the directions of the last unbalances, not on their sizes
             information, gradient, _ = unbalance_prior(problem, linear)
-            linear = linear + solved(matrix + information, right - matrix @ linear + gradient)
+            linear = linear + solved(matrix + information + np.diag(damping), right - matrix @ linear + gradient)
     data = square - 2.0 * linear @ right + linear @ matrix @ linear
     return _Trial(x, linear, max(float(data), 0.0) + known_cost(problem, x, linear))
 
@@ -428,7 +437,7 @@ def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
         return fitted._replace(converged=False)  # the model does not resemble the records, and their noise is unknown
     noise = [[Noise(np.ones(1), float(each)) for each in of_run] for of_run in fitted.noise]
     fitted = _pass(fitted.problem, noise, None, [fitted.x])
-    is_final = not any(np.any(each) for each in problem.bounds)
+    with_white_noise, is_final = fitted, not any(np.any(each) for each in problem.bounds)
     matters = [bool(np.any(each > _ANGLE_MATTERS)) for each in angle_shares(fitted)]
     if any(matters):
         problem, is_final = with_angle_errors(fitted.problem, matters), False
@@ -439,10 +448,22 @@ def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
             break
         before, noise = fitted.x, new
         fitted = _pass(fitted.problem, noise, fitted.differences, [before])
+        if _is_absorbed(noise, with_white_noise, fitted):
+            return with_white_noise._replace(is_absorbed=True)
         matrix = fitted.information + fitted.prior
         change = np.concatenate([fitted.x - before, np.zeros(fitted.linear.size)])
         is_final = bool(change @ matrix @ change < _STEADY_VALUES**2) or not _has_scores(problem, noise)
     return fitted
+
+
+def _is_absorbed(noise: Sequence[Sequence[Noise]], before: Fitted, after: Fitted) -> bool:
+    """Return True if the residuals of a channel with coloured `noise` have grown from a fit with white noise to another fit."""
+    triples = zip(noise, before.noise, after.noise, strict=True)
+    return any(
+        len(each.taps) > 1 and new > _MAX_GROWTH * old
+        for of_run, olds, news in triples
+        for each, old, new in zip(of_run, olds, news, strict=True)
+    )
 
 
 def _has_scores(problem: Problem, noise: Sequence[Sequence[Noise]]) -> bool:
@@ -497,13 +518,9 @@ def _pass(
     )
 
 
-def information_at(problem: Problem, unbalance: np.ndarray) -> Fitted:
-    """Return a fit without iterations, whose information is that at the first values of the unknowns.
-
-    **Arguments**: `unbalance`: components (a, b) of each unbalance; states and offsets are 0.
-    """
-    linear = np.zeros(_linear_count(problem))
-    linear[: unbalance.size] = unbalance
+def information_at(problem: Problem, linear: np.ndarray) -> Fitted:
+    """Return a fit without iterations, whose information is that at the first values of the unknowns x and at these linear
+    unknowns (L,)."""
     x = np.zeros(problem.unknowns.count)
     information, prior, _ = joint_equations(problem, x, linear)
     return Fitted(x, linear, problem, information, prior, (), (), (), True)

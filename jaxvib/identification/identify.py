@@ -24,7 +24,7 @@ from jaxvib.identification.directions import (
     information_of,
 )
 from jaxvib.identification.fit import Fitted, unknown_count
-from jaxvib.identification.jammed.start import with_first_motion
+from jaxvib.identification.jammed.start import first_states, with_first_motion
 from jaxvib.identification.likelihood import QUANTILE, profile_intervals
 from jaxvib.identification.problem import Problem, build_problem, natural
 from jaxvib.identification.run import MeasuredRun
@@ -68,6 +68,8 @@ class MachineFit(Result):
     - `frequency` (m,), rad/s, and `damping_ratio` (m,): natural frequencies and damping ratios of the damped modes
     - `gain_names` (g,) and `gains` (g,) of the channels
     - `phase`, rad: angle of the unbalance of each exciter ahead of the zero of the rotor's angle
+    - `first_states`, SI: of each run with loads on its rotor, the coordinates of the machine, their velocities, the angles of
+      the loads, their speeds and the angle of the rotor at the first sample; empty without loads
     - `channels`: names of the compared channels of each run
     - `noise`: standard deviation of the residuals of each run's channels, SI
     - `chance`: smallest probability, over the channels, that noise has vibrations at orders of the rotor's speed as strong as
@@ -90,6 +92,7 @@ class MachineFit(Result):
     gain_names: tuple[str, ...]
     gains: tuple[Estimate, ...] = eqx.field(metadata=in_unit("", "gain"))
     phase: np.ndarray = eqx.field(metadata=in_unit("rad", "exciter"))
+    first_states: tuple[np.ndarray, ...]
     channels: tuple[tuple[str, ...], ...]
     noise: tuple[np.ndarray, ...]
     chance: float = eqx.field(metadata=in_unit(""))
@@ -283,7 +286,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
     estimates = [
         each._replace(low=max(each.low, 0.0)) if own else each for each, own in zip(estimates, known.vanished, strict=True)
     ]
-    has_profiles = resembles(fitted) and not fitted.misfits and not problem.has_loads
+    has_profiles = resembles(fitted) and not fitted.misfits
     ends = profile_intervals(fitted, known) if has_profiles else {}
     for name, (low, high) in ends.items():
         i = known.names.index(name)
@@ -311,6 +314,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         gain_names=problem.unknowns.gains,
         gains=_gains(fitted),
         phase=np.array([math.atan2(*fitted.linear[2 * k : 2 * k + 2][::-1]) for k in range(exciters)]),
+        first_states=first_states(problem, fitted.linear) if problem.has_loads else (),
         channels=tuple(tuple(channel.name for channel in samples.channels) for samples in problem.runs),
         noise=fitted.noise,
         chance=chance,

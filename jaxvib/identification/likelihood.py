@@ -7,13 +7,14 @@ interval are the values at which the cost rises by 1.96^2.
 
 from __future__ import annotations
 
+import cmath
 import dataclasses
 import math
 from collections.abc import Mapping
 
 import numpy as np
 
-from jaxvib.identification.directions import Information, eliminate, free_unbalances, in_polar_unbalances
+from jaxvib.identification.directions import Information, eliminate, elimination, free_unbalances, in_polar_unbalances
 from jaxvib.identification.fit import Fitted, minimize, project
 from jaxvib.identification.problem import Known, Problem
 
@@ -38,9 +39,10 @@ class _Profile:
     """Profile of one number of a fit.
 
     **Attributes**: the `fitted` problem; `index` of the number in x, or of the exciter if `is_unbalance`; `center` and standard
-    error `spread` of the coordinate of the number (its entry of x, or the logarithm of the unbalance); `slopes` (p,): change of
-    x per change of the coordinate; `floor`: the least cost; `is_vanished`: True if the number is not
-    distinguishable from 0; distances are then multiples of the standard error of the number itself, not of its logarithm.
+    error `spread` of the coordinate of the number (its entry of x, or the logarithm of the unbalance); `slopes` (p + L,):
+    change of all unknowns per change of the coordinate, of the unbalances as (logarithm of the size, angle); `floor`: the least
+    cost; `is_vanished`: True if the number is not distinguishable from 0; distances are then multiples of the standard error of
+    the number itself, not of its logarithm.
     """
 
     fitted: Fitted
@@ -58,12 +60,18 @@ class _Profile:
 
     def rise(self, distance: float, is_exact: bool) -> float:
         """Return the rise of the cost at a `distance` in standard errors. If `is_exact`, all other unknowns are fitted;
-        otherwise only the linear ones are fitted, and the others follow the quadratic form."""
-        target = self.center + self.shift(distance)
+        otherwise only the linear ones are fitted, and the others follow the quadratic form. No unknown of a motion with loads
+        is linear."""
+        target, p = self.center + self.shift(distance), self.fitted.x.size
         problem, known_cost = self._fixed(target)
-        x = self.fitted.x + distance * self.spread * self.slopes
+        change = distance * self.spread * self.slopes
+        x = self.fitted.x + change[:p]
         if self.is_vanished:
             x[self.index] = target
+        if problem.linear is not None:
+            linear, pair = problem.linear + change[p:], complex(*problem.linear[:2]) * cmath.exp(complex(*change[p : p + 2]))
+            linear[:2] = pair.real, pair.imag
+            problem = problem._replace(linear=linear)
         trial = minimize(problem, x)[0] if is_exact else project(problem, x)
         return trial.cost + known_cost - self.floor
 
@@ -81,6 +89,11 @@ class _Profile:
         known_cost = float(precisions[self.index] * (target - means[self.index]) ** 2)
         means[self.index], precisions[self.index] = target, 1.0 / relative_error**2
         return problem._replace(means=means, precisions=precisions), known_cost
+
+    def is_quadratic(self, is_exact: bool) -> bool:
+        """Return True if the rises at two standard errors agree with the quadratic form; see `rise`."""
+        rises = [self.rise(side * _COMPARED_DISTANCE, is_exact) for side in (-1.0, 1.0)]
+        return max(abs(rise / _COMPARED_DISTANCE**2 - 1.0) for rise in rises) <= _MAX_DIFFERENCE
 
     def end(self, side: float) -> float:
         """Return the distance of an end of the interval from the center, in standard errors; infinite if there is no end.
@@ -124,14 +137,15 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
         place = p + i - number_count if is_unbalance else i
         index = free_exciters[i - number_count] if is_unbalance else i
         center = math.log(sizes[index]) if is_unbalance else float(fitted.x[i])
-        slopes, variance = covariance[:p, place] / covariance[place, place], covariance[place, place]
+        slopes, variance = elimination(data + prior, own[[place]])[:, 0], covariance[place, place]
         if is_vanished:  # its information may be below the accuracy of the pseudoinverse
-            slopes, variance = np.zeros(p), known.covariance[i, i]
+            slopes, variance = np.zeros(len(data)), known.covariance[i, i]
         profile = _Profile(fitted, index, is_unbalance, center, math.sqrt(variance), slopes, floor, is_vanished)
         if is_vanished:
             intervals[name] = -math.inf, profile.shift(profile.end(1.0))
             continue
-        rises = [profile.rise(side * _COMPARED_DISTANCE, is_exact=False) for side in (-1.0, 1.0)]
-        if max(abs(rise / _COMPARED_DISTANCE**2 - 1.0) for rise in rises) > _MAX_DIFFERENCE:
-            intervals[name] = -profile.spread * profile.end(-1.0), profile.spread * profile.end(1.0)
+        # Along the quadratic form, the cost of a motion with loads rises by more than with its other unknowns fitted.
+        if profile.is_quadratic(is_exact=False) or (problem.linear is not None and profile.is_quadratic(is_exact=True)):
+            continue
+        intervals[name] = -profile.spread * profile.end(-1.0), profile.spread * profile.end(1.0)
     return intervals

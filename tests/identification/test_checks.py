@@ -157,7 +157,9 @@ def outcome(monkeypatch, **changes):
         "chances": (0.5, 0.3),
         "shares": (0.0, 0.0),
     }
-    given |= {"errors": (0.01, 0.02), "outliers": (0.0, 0.0), "undetermined": 0, "misfits": (1.9,)} | changes
+    given |= (
+        {"errors": (0.01, 0.02), "outliers": (0.0, 0.0), "undetermined": 0, "misfits": (1.9,)} | {"absorbed": False} | changes
+    )
     chances = iter(given["chances"])
     monkeypatch.setattr(checks, "_contradictions", lambda fitted: given["contradictions"])
     monkeypatch.setattr(checks, "_disagreements", lambda fitted: given["disagreements"])
@@ -178,8 +180,9 @@ def outcome(monkeypatch, **changes):
         unknowns=unknowns, rotors=rotors, runs=runs, angles=[np.array([[7.0, 8.0]])], angle_errors=[0.05], has_loads=False
     )
     fitted = SimpleNamespace(
-        problem=problem, residuals=[two], outliers=[np.array(given["outliers"])], x=np.zeros(5), misfits=given["misfits"]
-    )
+        problem=problem, residuals=[two], outliers=[np.array(given["outliers"])], x=np.zeros(5), misfits=given["misfits"],
+        is_absorbed=given["absorbed"],
+    )  # fmt: skip
     status, least, notes = status_of(fitted, SimpleNamespace(undetermined=np.zeros((2, given["undetermined"]))))
     return status, least, notes
 
@@ -206,6 +209,7 @@ def outcome(monkeypatch, **changes):
         ),
         ({"shares": (0.0, 0.09)}, "found", 0.3, []),
         ({"misfits": (0.9, 2.1)}, "patterned", 0.3, ["run 2 deviates from the torque balance of its motor by 2.1"]),
+        ({"absorbed": True}, "patterned", 0.3, ["no noise model separates them from its motion; the noise is assumed to"]),
         ({"outliers": (0.02, 0.0)}, "found", 0.3, ["2.0% of the readings of channel 'a' in run 1 are outliers"]),
     ],
 )

@@ -12,9 +12,10 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.directions import covariance_of, eliminate, in_polar_unbalances
-from jaxvib.identification.fit import Fitted, information_at
+from jaxvib.identification.fit import Fitted, information_at, unknown_count
 from jaxvib.identification.identify import MachineFit
-from jaxvib.identification.problem import MOTIONS, Problem, build_problem, require_unbalances_only, with_noise
+from jaxvib.identification.jammed.start import is_jammed, with_jam
+from jaxvib.identification.problem import MOTIONS, Problem, build_problem, with_noise
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive
@@ -102,9 +103,11 @@ class Expected(NamedTuple):
 def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     """Return a planned run, evaluated with the numbers of a fit.
 
-    **Raises** `InputError` for a channel whose noise is unknown, and for a scene with several exciters or with loads.
+    A run with loads on the rotor begins with the motion of the first sample of the first run of the fit.
+
+    **Raises** `InputError` for a channel whose noise is unknown, for a scene with several exciters, and for loads that do not
+    stay jammed.
     """
-    require_unbalances_only(fit.scene, "plan_runs")
     # The spectral density of the noise is the same at all sampling rates. Deviations are stored per square root of the rate.
     deviations: dict[str, float] = {}
     for names, noise, time in reversed(list(zip(fit.channels, fit.noise, fit.time, strict=True))):
@@ -121,13 +124,22 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     exciter, count = fit.scene.exciters[0], len(fit.scene.exciters)
     if count > 1:
         raise InputError("fit.scene", f"has {count} exciters; plan_runs needs a scene with one exciter")
-    scene = eqx.tree_at(lambda s: s.exciters[0], fit.scene, exciter.with_parts(None, planned.drive))
+    scene = eqx.tree_at(lambda s: s.exciters[0], fit.scene, exciter.with_parts(exciter.loads, planned.drive))
     problem = build_problem(scene, [run], vibrating(fit), {})
     root = math.sqrt(float(problem.runs[0].step))
     problem = with_noise(problem, [[Noise(np.ones(1), float(deviations[c.name]) / root) for c in vibration_channels]])
     problem = problem._replace(precisions=own_precisions(fit, problem))
-    size = float(np.asarray(exciter.unbalance, float))
-    fitted = information_at(problem, size * np.array([np.cos(fit.phase[0]), np.sin(fit.phase[0])]))
+    linear = np.zeros(unknown_count(problem) - problem.unknowns.count)
+    size = 1.0 if exciter.unbalance is None else float(np.asarray(exciter.unbalance, float))
+    linear[:2] = size * np.cos(fit.phase[0]), size * np.sin(fit.phase[0])
+    if problem.has_loads:
+        problem, linear = with_jam(problem, linear, fit.first_states[0])
+        if not is_jammed(problem, linear):
+            raise InputError(
+                f"candidates: {planned.name}: drive",
+                "has a speed at which the loads do not stay jammed below the speed of the rotor; give a faster drive",
+            )
+    fitted = information_at(problem, linear)
     has_mark = any(channel.kind in ("pulses", "angle") for channel in planned.channels)
     return Expected(fitted, *shared_places(fit, problem, has_mark))
 

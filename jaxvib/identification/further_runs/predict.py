@@ -12,10 +12,11 @@ from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto
 from jaxvib.identification.checks import CHANCE, Disagreement, disagreement, pseudoinverse, residual_chance
 from jaxvib.identification.directions import eliminate, elimination, polar_unbalances
-from jaxvib.identification.fit import differences_of, linear_at, run_equations
+from jaxvib.identification.fit import differences_of, linear_at, minimize, run_equations
 from jaxvib.identification.further_runs.planned import own_precisions, shared_places, vibrating
 from jaxvib.identification.identify import MachineFit
-from jaxvib.identification.problem import EXACT, Known, Problem, build_problem, require_unbalances_only, with_noise
+from jaxvib.identification.jammed.start import with_first_motion
+from jaxvib.identification.problem import EXACT, Known, Problem, build_problem, with_noise
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.numerics.noise import Noise, noise_of
 from jaxvib.results.fields import in_unit
@@ -24,6 +25,9 @@ from jaxvib.results.result import Result
 _NOISE_RATIO = 1.5
 """Ratio of the residuals to the noise of the fit above which a note says that they are too large, and the status is
 `patterned`."""
+
+_NUMBER_ERROR = 1e-6
+"""Relative standard error at which the numbers of a motion with loads count as known exactly."""
 
 
 class PredictionStatus(eqx.Enumeration):
@@ -86,14 +90,16 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     """Return the prediction of a run that the fit did not use, and compare it with the readings.
 
     - The numbers and the gains are those of the fit. The motion at the first sample and the offsets are fitted to the run. The
-      zero of the rotor's angle is also fitted, unless the fit and the run both have the mark of a tachometer
+      zero of the rotor's angle is also fitted, unless the fit and the run both have the mark of a tachometer and no loads move
+      on the rotor
     - A likelihood-ratio test compares two hypotheses: the machine has the same numbers in the run as in the fit, or it has
       other numbers. The test accounts for the errors of the fit and the noise of the run. If the chance of the deviation is
-      below 1e-5, the run contradicts the fit, and a note names the number whose change explains most of the deviation
+      below 1e-5, the run contradicts the fit, and a note names the number whose change explains most of the deviation. In a run
+      with jammed loads, no number is named if the residuals are much larger than the noise
 
     **Arguments**: `fit` from `identify`; `run`: a `MeasuredRun`, with its own `change` of numbers.
 
-    **Returns** `RunPrediction`. **Raises** `InputError` for a run that cannot be used, and for a fit with loads.
+    **Returns** `RunPrediction`. **Raises** `InputError` for a run that cannot be used.
 
     >>> import numpy as np, jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
@@ -124,7 +130,11 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     status = PredictionStatus.patterned if notes else PredictionStatus.predicted
     if deviation.chance < CHANCE:
         status = PredictionStatus.contradicted
-        notes.append(deviation.sentence("the run"))
+        is_far = at.problem.has_loads and bool(np.any(ratio > _NOISE_RATIO))  # the motion of the loads is not linear
+        too_far = (
+            f"the run deviates from the fit by more than its errors (chance {deviation.chance:.1g}), too much to name a number"
+        )
+        notes.append(too_far if is_far else deviation.sentence("the run"))
     mask, raw = at.problem.masks[0], at.problem.raw[0]
     return RunPrediction(
         status=status,
@@ -156,27 +166,37 @@ class _Predicted(NamedTuple):
 
 
 def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
-    require_unbalances_only(fit.scene, "predict_run")
     problem = build_problem(fit.scene, [run], vibrating(fit), {})
-    sizes = np.array([float(np.asarray(exciter.unbalance, float)) for exciter in fit.scene.exciters])
+    unbalances = [1.0 if exciter.unbalance is None else exciter.unbalance for exciter in fit.scene.exciters]
+    sizes = np.array([float(np.asarray(each, float)) for each in unbalances])
     problem = problem._replace(unbalances=tuple(Known(size, EXACT * size) for size in sizes))
-    has_mark = len(sizes) == 1 and problem.marked and bool(fit.information[-1, -1] > 0.0)
+    has_mark = len(sizes) == 1 and problem.marked and bool(fit.information[-1, -1] > 0.0) and not problem.has_loads
     pairs = np.stack([sizes * np.cos(fit.phase), sizes * np.sin(fit.phase)], axis=1).ravel()
     x, first = np.zeros(problem.unknowns.count), len(problem.unknowns.numbers)
     for k, name in enumerate(problem.unknowns.gains):
         if name in fit.gain_names:
             x[first + k] = math.log(fit.gains[fit.gain_names.index(name)].value)
-    fixed = pairs if has_mark or len(sizes) > 1 else None
+    fixed, means, precisions = pairs if has_mark or len(sizes) > 1 else None, problem.means, problem.precisions
+    if problem.has_loads:  # the motion at the first sample is not linear in the readings; the numbers keep their values
+        problem = with_first_motion(problem._replace(means=x, precisions=np.full(x.size, _NUMBER_ERROR**-2)))[0]
 
-    def with_filters(noise: list[Noise], differences: list[np.ndarray] | None) -> tuple[Problem, np.ndarray, np.ndarray]:
+    def with_filters(
+        problem: Problem, noise: list[Noise], differences: list[np.ndarray] | None
+    ) -> tuple[Problem, np.ndarray, np.ndarray]:
         filtered = with_noise(problem, [[each._replace(deviation=each.deviation or 1.0) for each in noise]], differences)
-        linear = linear_at(filtered, x, fixed)
+        if filtered.has_loads:
+            linear = minimize(filtered, x)[0].linear
+            filtered = filtered._replace(linear=linear)
+        else:
+            linear = linear_at(filtered, x, fixed)
         return filtered, linear, differences_of(filtered, x, linear)[0]
 
-    _, _, left = with_filters([Noise(np.ones(1), float(np.std(each))) for each in problem.raw[0].T], None)
+    first_noise = [Noise(np.ones(1), float(np.std(each))) for each in problem.raw[0].T]
+    filtered, _, left = with_filters(problem, first_noise, None)
     mask = problem.masks[0]
     noise = [noise_of(each) for each in np.where(mask, left, np.nan).T]
-    filtered, linear, left = with_filters(noise, [left])
+    filtered, linear, left = with_filters(filtered, noise, [left])
+    filtered = filtered._replace(means=means, precisions=precisions)
     return _Predicted(filtered, x, linear, np.where(mask, left, np.nan), [each.taps for each in noise], has_mark)
 
 
@@ -186,6 +206,8 @@ def _deviation(fit: MachineFit, at: _Predicted) -> Disagreement:
     equations, turn = run_equations(problem, at.x, at.linear)[0], polar_unbalances(problem, at.linear)[0]
     matrix, slope = turn.T @ equations[:-1, :-1] @ turn, turn.T @ equations[:-1, -1]
     matrix[np.arange(p), np.arange(p)] += own_precisions(fit, problem)
+    if problem.load_spread is not None:
+        matrix[p:, p:] += problem.load_spread
     for k in range(len(fit.scene.exciters)):
         if f"exciters[{k}].unbalance" not in fit.names:  # known exactly
             matrix[p + 2 * k, p + 2 * k] += 1.0 / EXACT**2

@@ -36,7 +36,7 @@ from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.runtime.programs import cached
 
 
-class _ShiftedDrive(IdealDrive):
+class ShiftedDrive(IdealDrive):
     """Prescribed `drive` whose angle is larger by `phase`, rad; after the time `end` its angle, speed and acceleration keep
     their values at `end`."""
 
@@ -81,7 +81,7 @@ def _equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pai
         turn = 0.0 if samples.turn is None else x[unknowns.first.shape[0] + len(unknowns.gains) + samples.turn]
         phase = exciter.direction * (jnp.arctan2(pair[1], pair[0]) + turn)
         own = eqx.tree_at(lambda scene: scene.exciters[0].unbalance, own, jnp.hypot(pair[0], pair[1]))
-    shifted = _ShiftedDrive(drive=drive, phase=phase, end=samples.end, speed=drive.speed)
+    shifted = ShiftedDrive(drive=drive, phase=phase, end=samples.end, speed=drive.speed)
     own: Any = eqx.tree_at(lambda scene: scene.exciters[0].drive, own, shifted)
     model = assemble(own)
     gains = jnp.stack([jnp.asarray(unknowns.gain(x, channel.name)) for channel in samples.channels])

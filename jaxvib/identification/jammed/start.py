@@ -29,7 +29,7 @@ from jaxvib.identification.fit import (
     project,
     unknown_count,
 )
-from jaxvib.identification.jammed.motion import linearized, weighted_columns
+from jaxvib.identification.jammed.motion import ShiftedDrive, closed_motion, linearized, weighted_columns
 from jaxvib.identification.problem import Problem, channel_sizes, with_noise
 from jaxvib.identification.response import Unknowns, model_states
 from jaxvib.machine.loads import CircularLoads
@@ -112,7 +112,7 @@ def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
         if samples.turn is not None:
             turn = math.atan2(pair[1], pair[0]) - math.atan2(pairs[0][1], pairs[0][0])
             x[problem.unknowns.first.shape[0] + len(problem.unknowns.gains) + samples.turn] = turn
-    load_spread = _load_spread(problem, linear)
+    load_spread = load_spread_of(problem, linear)
     fitted = _shoot(weighted_problem._replace(load_spread=load_spread), x, linear, starts)
     angles = tuple(np.column_stack([turned, jam.angle]) for turned, jam in zip(problem.angles, jams, strict=True))
     return problem._replace(angles=angles, linear=fitted.linear, load_spread=load_spread), fitted.x
@@ -125,7 +125,38 @@ def _loads_of(scene: Scene) -> CircularLoads:
     return loads
 
 
-def _load_spread(problem: Problem, linear: np.ndarray) -> np.ndarray:
+def first_states(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the states of each run at the first sample, without those of filters: displacements, velocities, angles of the
+    loads, their rates; and the angle of the rotor."""
+    count = 2 * (len(problem.scene.machine.structure().coordinates) + _loads_of(problem.scene).count)
+    places = zip(linear_places(problem), problem.angles, strict=True)
+    return tuple(np.append(linear[place[:count]], angles[0, 0]) for place, angles in places)
+
+
+def with_jam(problem: Problem, linear: np.ndarray, state: np.ndarray) -> tuple[Problem, np.ndarray]:
+    """Return the problem of one planned run that begins with a state of `first_states`, and its linear unknowns.
+
+    **Arguments**: `linear` (L,) with the components of the unbalance.
+    """
+    places, samples = linear_places(problem)[0], problem.runs[0]
+    linear[places[: state.size - 1]] = state[:-1]
+    (drive,), begin = samples.drives, samples.begin
+    shifted = ShiftedDrive(drive=drive, phase=state[-1] - drive.rotor_angle(begin, None), end=samples.end, speed=drive.speed)
+    turned = dataclasses.replace(samples, drives=(shifted,))
+    return problem._replace(runs=(turned,), linear=linear, load_spread=load_spread_of(problem, linear)), linear
+
+
+def is_jammed(problem: Problem, linear: np.ndarray) -> bool:
+    """Return True if the loads of the first run turn slower than the rotor at the first sample of each stretch."""
+    samples, place = problem.runs[0], linear_places(problem)[0]
+    _, starts = closed_motion(problem.unknowns, samples, problem.scene, np.zeros(problem.unknowns.count), linear[place])
+    loads = _loads_of(problem.scene).count
+    rates = starts[:, 2 * len(problem.scene.machine.structure().coordinates) + loads :][:, :loads]
+    speed = np.abs(np.gradient(problem.angles[0][:, 0], float(samples.step)))[:: samples.stretches[1]]
+    return bool(np.all(np.abs(rates) < _BELOW_ROTOR * speed[: len(rates), None]))
+
+
+def load_spread_of(problem: Problem, linear: np.ndarray) -> np.ndarray:
     """Return the information (L, L) from the assumption that the loads of each run have nearly one angle and one speed at the
     first sample."""
     loads, mount = _loads_of(problem.scene), problem.scene.mounting

@@ -33,6 +33,12 @@ CASES = {
 """Options of `record` by the name of a case; `motor`: run-up of a motor in place of the prescribed speed; `balls`: records of
 `repeated_records.jammed`."""
 
+JAMMED_CASES = {
+    "two jammed balls, coloured noise, correlation 0.9": {"balls": True, "color": 0.9},
+    "two jammed balls, 2 % outliers": {"balls": True, "outliers": 0.02},
+    "two jammed balls, readings clipped at 60 %": {"balls": True, "full_scale": 0.6},
+}
+
 
 @dataclasses.dataclass
 class Repeated:
@@ -86,7 +92,7 @@ def repeated(count, seed=0, motor=False, balls=False, **options):
     In records of jammed balls, the mass and the drag of the balls are 10 % and 20 % off, the dampings 30 %, and the stiffnesses
     5 %.
     """
-    clean, turning = (None, None) if balls else run_up(motor)
+    clean, turning = (jammed.clean(), None) if balls else run_up(motor)
     if "full_scale" in options:
         options = options | {"full_scale": options["full_scale"] * np.max(np.abs(clean))}
     truth, scene = (jammed.TRUTH, jammed.scene_of) if balls else (TRUTH, scene_of)
@@ -112,6 +118,7 @@ def repeated(count, seed=0, motor=False, balls=False, **options):
         relative.append(found[0] / true - 1.0)
         statuses.append(fit.status_name)
         order = fit.names
+    options.pop("full_scale", None)
     least = jammed.bound(order, JAMMED_NOISE, **options) if balls else _bound(turning, **options)
     return Repeated(np.array(away), np.array(relative), least, np.array(statuses))
 

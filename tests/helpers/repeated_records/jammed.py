@@ -62,13 +62,17 @@ def accelerations(numbers, starts, phases):
 
 
 @functools.cache
-def clean(impact=0.1):
-    """Return the accelerations (n, 2) without noise."""
-    return accelerations([TRUTH], [first_state(impact)], [PHASE])[0]
+def clean(impact=0.1, added=0.0, drag=1.5):
+    """Return the accelerations (n, 2) without noise; `added`: mass on the first platform, kg; `drag` of the balls."""
+    numbers = TRUTH | {"machine.mass[0]": TRUTH["machine.mass[0]"] + added, "loads.drag": drag}
+    return accelerations([numbers], [first_state(impact)], [PHASE])[0]
 
 
-def bound(names, noise, impact=0.1):
-    """Return the Cramer-Rao bound of the relative standard errors of `names`; states, offsets and phase are free."""
+def bound(names, noise, impact=0.1, color=0.0, outliers=0.0):
+    """Return the Cramer-Rao bound of the relative standard errors of `names`; states, offsets and phase are free.
+
+    The noise is that of `record`, and the places of the outliers are known.
+    """
     step, numbers, starts, phases = 1e-5, [], [], []
     for sign in (1.0, -1.0):
         for name in names:
@@ -84,7 +88,10 @@ def bound(names, noise, impact=0.1):
         phases.append(PHASE + sign * step)
     high, low = np.split(accelerations(numbers, starts, phases), 2)
     columns = [*((high - low) / (2.0 * step)), *np.repeat(np.eye(2)[:, None], TIMES.size, axis=1)]
-    slopes = np.stack(columns, axis=-1).reshape(-1, len(columns)) / noise
+    slopes = np.stack(columns, axis=-1)
+    slopes[1:] -= color * slopes[:-1]
+    slopes[0] *= np.sqrt(1.0 - color**2)
+    slopes = slopes.reshape(-1, len(columns)) * np.sqrt((1.0 - outliers) / (1.0 - color**2)) / noise
     scale = np.linalg.norm(slopes, axis=0)
     covariance = np.linalg.inv((slopes / scale).T @ (slopes / scale)) / np.outer(scale, scale)
     return np.sqrt(np.diagonal(covariance)[: len(names)])
@@ -102,6 +109,6 @@ def scene_of(numbers):
     return jv.Scene(machine, exciters=[jv.Exciter(balls, motor, unbalance=numbers["exciters[0].unbalance"], at=2)])
 
 
-def jammed_record(noise, rng, impact=0.1, **options):
-    """Return a record of both accelerometers and the tachometer."""
-    return record(TIMES, clean(impact), noise, rng, turning=turning, **options)
+def jammed_record(noise, rng, impact=0.1, added=0.0, drag=1.5, **options):
+    """Return a record of both accelerometers and the tachometer; for `added` and `drag` see `clean`."""
+    return record(TIMES, clean(impact, added, drag), noise, rng, turning=turning, **options)

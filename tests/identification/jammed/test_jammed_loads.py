@@ -1,12 +1,13 @@
 """Machines with jammed balls: fits to records by SciPy, and scenes and records that are refused."""
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import numpy as np
 import pytest
-from repeated_records.fits import repeated
-from repeated_records.jammed import RADIUS, TIMES, TRUTH, clean, first_state, jammed_record, scene_of
+from repeated_records.fits import JAMMED_CASES, JAMMED_NOISE, NAMES, repeated
+from repeated_records.jammed import RADIUS, TIMES, TRUTH, bound, clean, first_state, jammed_record, scene_of
 
 import jaxvib as jv
 from jaxvib.identification.jammed.motion import closed_motion, linearized
@@ -106,11 +107,77 @@ def test_first_values_agree_with_a_record_without_noise():
     np.testing.assert_allclose(x, 0.0, atol=1e-4)
 
 
+def away_from(fit):
+    """Return (fitted - true)/error of each number."""
+    return np.array([(each.value - TRUTH[name]) / each.error for name, each in zip(fit.names, fit.estimates, strict=True)])
+
+
+def first_scene():
+    """Return the scene with first values away from the truth."""
+    factors = {"stiffness": 1.05, "damping": 1.0 / 1.3, "loads.mass": 1.1, "drag": 1.0 / 1.2}
+    factor = {name: next((f for word, f in factors.items() if word in name), 1.0) for name in TRUTH}
+    return scene_of({name: value * factor[name] for name, value in TRUTH.items()})
+
+
+@functools.cache
+def fitted():
+    run = jammed_record(JAMMED_NOISE, np.random.default_rng(0))
+    return jv.identify(first_scene(), run, unknown=[*NAMES, "loads.mass", "loads.drag"])
+
+
 def test_jammed_balls_and_unbalance_are_found():
-    found = repeated(1, balls=True)
-    assert found.statuses.tolist() == ["found"]
+    fit = fitted()
+    assert fit.status_name == "found" and fit.notes == ()
+    assert np.max(np.abs(away_from(fit))) < 3.5
+    np.testing.assert_allclose([e.error / e.value for e in fit.estimates], bound(fit.names, JAMMED_NOISE), rtol=0.15)
+
+
+def planned(drive, **options):
+    channels = jammed_record(JAMMED_NOISE, np.random.default_rng(0)).channels
+    return jv.PlannedRun("again", drive, 16.0, channels, rate=62.5, **options)
+
+
+def test_plan_repeats_a_run_with_jammed_loads():
+    """The candidate has the speed and the first motion of the record: the error of each number is divided by sqrt(2)."""
+    plan = jv.plan_runs(fitted(), [planned(jv.SpeedProfile([0.0, 16.0], [90.0, 122.0]))])
+    np.testing.assert_allclose(plan.errors[0] / plan.now, np.sqrt(0.5), rtol=0.02)
+
+
+def test_planned_runs_keep_their_jam():
+    with pytest.raises(jv.InputError, match="again: drive has a speed at which the loads do not stay jammed"):
+        jv.plan_runs(fitted(), [planned(jv.SpeedProfile([0.0, 16.0], [90.0, 40.0]))])
+    with pytest.raises(jv.InputError, match=r"fit\.scene has loads that move on the rotor; the optimization of the speed"):
+        jv.plan_runs(fitted(), [planned(jv.ConstantSpeed(100.0))], limits={"speed": 130.0, "acceleration": 5.0})
+
+
+def test_further_run_with_jammed_loads_is_predicted():
+    rng = np.random.default_rng(7)
+    found = jv.predict_run(fitted(), jammed_record(JAMMED_NOISE, rng, impact=-0.15))
+    assert found.status_name == "predicted" and found.chance > 1e-3
+    np.testing.assert_allclose(found.ratio, 1.0, atol=0.1)
+    other = jv.predict_run(fitted(), jammed_record(JAMMED_NOISE, rng, impact=-0.15, drag=1.52))
+    assert other.status_name == "contradicted"
+    assert other.notes[-1].endswith("too much to name a number") and np.min(other.ratio) > 5.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", JAMMED_CASES)
+def test_jammed_balls_are_found_with_other_noise(name):
+    found = repeated(2, **JAMMED_CASES[name])
+    assert found.statuses.tolist() == ["found"] * 2
     assert np.max(np.abs(found.away)) < 3.5
-    np.testing.assert_allclose(np.abs(found.relative / found.away / found.bound), 1.0, atol=0.15)
+    np.testing.assert_allclose(np.abs(found.relative / found.away / found.bound), 1.0, atol=0.25)
+
+
+@pytest.mark.slow
+def test_two_runs_with_an_added_mass_give_all_masses():
+    rng = np.random.default_rng(1)
+    first = jammed_record(JAMMED_NOISE, rng)
+    heavier = jammed_record(JAMMED_NOISE, rng, impact=-0.15, added=5.0, change={"machine.mass[0]": "+5 kg"})
+    fit = jv.identify(first_scene(), [first, heavier], unknown=["machine.mass", *NAMES, "loads.mass", "loads.drag"])
+    assert fit.status_name == "found" and fit.undetermined == ()
+    assert np.max(np.abs(away_from(fit))) < 3.5
+    assert fit.estimate("machine.mass[0]").error < 5.0
 
 
 def test_scene_without_a_jam_in_the_record_is_refused():

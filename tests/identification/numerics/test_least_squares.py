@@ -255,8 +255,8 @@ def test_masked_readings_are_not_numbers_in_the_residuals():
     mask = np.ones((N, CHANNELS), bool)
     mask[5, 1] = False
     problem = problem_with()._replace(masks=(mask, mask))
-    found = fit.information_at(problem, np.array([0.3, 0.4]))
-    assert found.linear.tolist() == [0.3, 0.4, *[0.0] * 8] and found.x.tolist() == [0.0, 0.0]
+    found = fit.information_at(problem, np.array([0.3, 0.4, *[0.0] * 8]))
+    assert found.x.tolist() == [0.0, 0.0]
     _, prior, _ = fit.joint_equations(problem, np.zeros(2), found.linear)
     np.testing.assert_allclose(found.prior, prior)
     left = found._replace(differences=(np.ones((N, CHANNELS)),) * 2).residuals[1]

@@ -132,10 +132,37 @@ def test_a_cost_not_quadratic_on_one_side_has_a_profile(monkeypatch, rises, is_q
     costs = {-2.0: rises[0], 2.0: rises[1]}
     monkeypatch.setattr(_Profile, "rise", lambda self, distance, is_exact: 9e9 if is_exact else costs[distance])
     monkeypatch.setattr(_Profile, "end", lambda self, side: 3.0 + side)
-    problem = SimpleNamespace(unknowns=SimpleNamespace(numbers=(1, 2)), unbalances=())
+    problem = SimpleNamespace(unknowns=SimpleNamespace(numbers=(1, 2)), unbalances=(), linear=None)
     known = SimpleNamespace(names=("mass", "damping"), determined=[False, True], vanished=[False] * 2)
     found = profile_intervals(SimpleNamespace(problem=problem, x=np.zeros(2)), known)
     assert found == ({} if is_quadratic else {"damping": (-0.5 * 2.0, 0.5 * 4.0)})
+
+
+@pytest.mark.parametrize(("bend", "expected"), [(0.0, [4.0, 4.0]), (2.0, [6.0, 6.0, 4.0, 4.0])])
+def test_states_of_loads_follow_the_quadratic_form(monkeypatch, bend, expected):
+    """The cost is quadratic in two numbers, the logarithm and the angle of the unbalance, and a state. With a bend, it rises by
+    the square of the distance only if all unknowns are fitted."""
+    slopes = np.random.default_rng(4).normal(size=(9, 5)) * np.array([20.0, 30.0, 15.0, 9.0, 2.0])
+    matrix, x, linear = slopes.T @ slopes, np.array([0.1, -0.2]), np.array([0.03, 0.04, 2.0])
+
+    def cost(problem, now):
+        size, angle = np.hypot(*problem.linear[:2]), np.arctan2(*problem.linear[1::-1])
+        y = np.array([*(now - x), np.log(size / 0.05), angle - np.arctan2(0.04, 0.03), problem.linear[2] - 2.0])
+        return SimpleNamespace(cost=y @ matrix @ y + bend * (now is not x))
+
+    monkeypatch.setattr(likelihood, "project", cost)
+    monkeypatch.setattr(likelihood, "minimize", lambda *_: (SimpleNamespace(cost=4.0),))
+    monkeypatch.setattr(likelihood, "in_polar_unbalances", lambda _: (0.75 * matrix, 0.25 * matrix, np.array([0.05])))
+    rises, rise = [], _Profile.rise
+    monkeypatch.setattr(_Profile, "rise", lambda *arguments: rises.append(rise(*arguments)) or rises[-1])
+    problem = Problem(*[None] * len(Problem._fields))._replace(
+        unknowns=SimpleNamespace(numbers=(1, 2)), means=np.zeros(2), precisions=np.zeros(2), unbalances=(None,), linear=linear
+    )
+    names = ("machine.damping", "machine.mass", "unbalance")
+    known = SimpleNamespace(names=names, determined=[True] * 3, vanished=[False] * 3)
+    assert profile_intervals(SimpleNamespace(problem=problem, x=x, linear=linear), known) == {}
+    np.testing.assert_allclose(rises, 3 * expected, rtol=1e-9)
+    assert linear.tolist() == [0.03, 0.04, 2.0]
 
 
 def test_known_values_count_in_the_rise():
