@@ -79,6 +79,9 @@ class RunStatus(eqx.Enumeration):
     overlapping = f"loads are inside each other, because they pass through each other without load_contact; {_CONTACT}"
 
 
+_SINGLE_PRECISION = '  in single precision (about 6 digits); for double precision: jax.config.update("jax_enable_x64", True)'
+"""Line of the summary of a run in single precision."""
+
 ENDS = ("done", "beating", "creeping", "would_separate", "overlapping")
 """Statuses of runs that reached their end."""
 
@@ -188,6 +191,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  {error}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
+                *([] if self.window.time.dtype.itemsize >= 8 else [_SINGLE_PRECISION]),
                 f"  {self._turning} turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)})"
                 + self._rotors_of_loads(),
                 f"  {self.amplitude_text(self.scene)}",

@@ -14,7 +14,7 @@ from jaxvib.machine.files import load_scene, misplaced_name, read_toml, suggest_
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.batch import BatchPlan
-from jaxvib.motion.start import Start, initial_state
+from jaxvib.motion.start import Start, initial_state, with_spin_up_drive
 from jaxvib.results.fields import Plain
 from jaxvib.sweeps.axes import SAMPLINGS, Axis, AxisSpec, Grid, axis_of, require_disjoint, tile_of
 from jaxvib.sweeps.definition import Study
@@ -53,6 +53,8 @@ def study(
 ) -> Study:
     """Return a validated study; for the arguments see `sweep`. **Raises** `InputError` for values that are not allowed."""
     scene = validate_scene(scene)
+    if start == "spin_up" and until is not None:
+        scene, start = with_spin_up_drive(scene, number(until, "s", "until", low=0.0, open_low=True), start, None), "rest"
     grid = _grid(scene, axes, samples, sampling, seed)
     names, measures = _name_measures(measure)
     _require_free_names(names, [axis.name for axis in grid.axes])

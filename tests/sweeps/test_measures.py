@@ -11,6 +11,7 @@ import jaxvib as jv
 from jaxvib.motion.batch import BatchPlan, run_in_batch
 from jaxvib.motion.start import initial_state
 from jaxvib.sweeps.measures import RUN_MEASURES
+from jaxvib.sweeps.study import study
 
 
 def watched(speeds, change=1e-4):
@@ -84,3 +85,15 @@ def test_runs_of_several_exciters_are_measured(tmp_path):
         jv.InputError, match=r"run.regime, which needs a scene with one exciter and loads; for other scenes use"
     ):
         jv.sweep(scene, {"exciters[0].unbalance": [1.0, 1.5]}, ["run.regime"], tmp_path / "regime.zarr", until=1.0)
+
+
+def test_a_spin_up_in_a_sweep_is_that_of_simulate(tmp_path):
+    table = jv.one_mass(mass=49.0, stiffness=4e4, damping=100.0)
+    scene = jv.Scene(table, jv.balls(count=1, mass=0.5, radius=0.1, drag=2.0), jv.ConstantSpeed(60.0))
+    found = jv.sweep(scene, {"drive.speed": [25.0, 60.0]}, ["run.load_speed"], tmp_path / "s.zarr", until=10.0, start="spin_up")
+    runs = [jv.simulate(jv.Scene(table, scene.loads, jv.ConstantSpeed(n)), 10.0, start="spin_up") for n in (25.0, 60.0)]
+    np.testing.assert_allclose(found.data["load_speed"].values, [run.omega for run in runs], rtol=1e-4)
+    assert float(found.scene.drive.duration) == 5.0
+    turning = jv.Scene(table, scene.loads, jv.SpinUp(60.0, duration=2.0))
+    with pytest.raises(jv.InputError, match="start is 'spin_up', but the drive is 'spin_up' already"):
+        study(turning, {"loads.drag": [1.0]}, ["run.load_speed"], until=9.0, start="spin_up")
