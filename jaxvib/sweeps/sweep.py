@@ -175,8 +175,8 @@ def sweep(
       "run.foundation_force", "run.settling_time", ...; or a mapping from names in the store to such measures
     - `store`: a folder, usually with the ending ".zarr"
     - `tier` of quantities of a jam: "leading", "exact" or "time"; default: that of each quantity
-    - `start`, `mode`: initial state of runs, "rest" (the default), "spin_up" (drives of constant speed are accelerated from rest
-      during half of the run), or "jam" for a start near the jam mode `mode`; axes may change its values
+    - `start`, `mode`: initial state of runs, "rest" (the default), "spin_up" (drives of constant speed are accelerated from
+      rest during half of the run), or "jam" for a start near the jam mode `mode`; axes may change its values
     - `until`: end of runs, s or text; typical: 5 to 60
     - `steps`: number of equal steps of a run, the same in all cases; default: one for each radian of the fastest motion
     - `samples`: number of samples; typical: 1000 to 100,000; `sampling`: "low_discrepancy" or "random"; `seed` of the samples
