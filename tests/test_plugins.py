@@ -12,6 +12,7 @@ from scenes import machines, published
 
 import jaxvib as jv
 from jaxvib.equations.averaged import averaged_field
+from jaxvib.machine.loads import CircularLoads
 from jaxvib.steady.jams.folds import jam_rotor_speed
 from jaxvib.study.audit.tiers import TIERS
 
@@ -26,6 +27,20 @@ def with_friction():
 def on_torus(count=2):
     loads = TorusPoints(0.4, 0.08, 0.02, 0.9, count)
     return jv.Scene(jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0), loads, jv.ConstantSpeed(90.0))
+
+
+class QuadraticDrag(CircularLoads):
+    """Balls whose drag grows with the square of the speed difference, which no balance of a viscous drag describes."""
+
+    def resistance(self, u, rate, speed):
+        slip = speed - rate[0]
+        return (self.drag * self.radius**2 * jnp.abs(slip) * slip,)
+
+
+def with_quadratic_drag():
+    balls = jv.balls(count=1, mass=0.4, radius=0.1, drag=1.0)
+    loads = QuadraticDrag(**{**vars(balls), "kind": "quadratic_ball"})
+    return jv.Scene(machines()["two_mass"], loads, jv.ConstantSpeed(90.0))
 
 
 def with_turbine():
@@ -132,6 +147,8 @@ def test_plugin_motor_turns_the_rotor_and_balances_power():
         (on_torus, lambda s: jv.jam_modes(s), r"loads.kind is 'torus_point'.*property circular"),
         (on_torus, lambda s: jv.jam_orbit(s, near=50.0), r"loads.kind is 'torus_point'.*property circular"),
         (on_torus, lambda s: jv.initial_state(s, "jam", mode=1), r"loads.kind is 'torus_point'.*property circular"),
+        (with_quadratic_drag, lambda s: jv.jam_modes(s), r"loads.kind is 'quadratic_ball'.*viscous drag .property circular"),
+        (with_quadratic_drag, lambda s: averaged_field(s), r"loads.kind is 'quadratic_ball'.*property circular"),
         (with_turbine, lambda s: jv.jam_modes(s), r"drive.kind is 'turbine'.*property ideal"),
         (with_turbine, lambda s: averaged_field(s), r"drive.kind is 'turbine'.*property ideal"),
     ],

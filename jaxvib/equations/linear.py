@@ -390,7 +390,7 @@ def require_circular(loads: Loads, drive: Drive) -> None:
     **Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`.
     """
     if not loads.circular:
-        needed = "this function needs loads on a circle (property circular): ball, roller, pendulum"
+        needed = "this function needs loads on a circle with viscous drag (property circular): ball, roller, pendulum"
         raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {needed}; use simulate for others")
     if not drive.ideal:
         raise InputError(

@@ -59,7 +59,8 @@ class Loads(Part):
     Arrays have one entry per load, or are scalars shared by all loads; functions act elementwise on (count,) arrays.
 
     A load has one or several coordinates u. The first is its angle about the rotor's axis, rad; its generalised force is the
-    torque that the load takes from the rotor.
+    torque that the load takes from the rotor. The analyses of jams and of balance accept `CircularLoads` only. A
+    subclass without `__init__` takes its arguments by name, because the fields of the base class come first.
 
     **Attributes**
 
@@ -96,11 +97,16 @@ class Loads(Part):
     count: eqx.AbstractVar[int]
     kind: eqx.AbstractVar[str]
 
-    circular: ClassVar[bool] = False
-    """True if the loads run on a circle about the rotor's axis and have no other coordinate, as `CircularLoads`."""
-
     one_sided: ClassVar[bool] = False
     """True if the track only pushes: a load whose normal force is negative would leave it."""
+
+    @property
+    def circular(self) -> bool:
+        """True if position and forces are those of `CircularLoads`, which the analyses of jams and of balance require; a
+        subclass does not change it."""
+        methods = ("position", "resistance", "spin_force", "drilling_spin")
+        own = type(self)
+        return isinstance(self, CircularLoads) and all(getattr(own, name) is getattr(CircularLoads, name) for name in methods)
 
     @property
     def has_bearing(self) -> bool:
@@ -211,8 +217,6 @@ class CircularLoads(Loads):
 
     Source: the antiphase paper, equations (1), (2), (6).
     """
-
-    circular = True
 
     mass: Array = eqx.field(metadata=MASS)
     radius: Array = eqx.field(metadata=unit("m", low=0.0, open_low=True, words="track radius", each="load"))
