@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,13 +22,12 @@ from jaxvib.cli.document import (
 )
 from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
+from jaxvib.machine.templates import SCREENS, TEMPLATES
 
 _START_HELP = "Initial state: rest (machine at rest, drive at its speed), jam (with --mode), or spin_up (smooth, from rest)."
 
-_SCREENS = ("linear-screen", "circular-screen", "feeder")
-_FILES = ("design", *(f"{kind}-design" for kind in _SCREENS), "identification", "measurement", "sweep")
-_MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "ball-balancer", "torus", *_SCREENS)
-"""Names of `TEMPLATES` and `SCREENS` in `jaxvib.machine`, repeated here because their import is slow."""
+_FILES = ("design", *(f"{kind.replace('_', '-')}-design" for kind in SCREENS), "identification", "measurement", "sweep")
+_MACHINES = tuple(kind.replace("_", "-") for kind in (*TEMPLATES, *SCREENS))
 
 
 @app.command("new", context_settings={"token_normalize_func": lambda word: word.replace("_", "-").lower()})
@@ -37,14 +37,11 @@ def new(kind: str, output: Output) -> None:
     """Print a commented scene file of a KIND of machine, or a file for `optimize`, `sweep`, `identify` or `plan`.
 
     \b
-    Machines: one-mass, two-mass, three-mass, network, planar-rotor, rotor,
-      ball-balancer, torus, linear-screen, circular-screen, feeder.
     For `optimize`: design, linear-screen-design, circular-screen-design,
       feeder-design.
     For `sweep`: sweep (a study). For `identify` and `plan`: identification
       (recorded runs of a machine). For `identify`: measurement (a swing)."""
     from jaxvib.exchange.recordings.fit_file import TEMPLATE as IDENTIFICATION
-    from jaxvib.machine.files import SCREENS, TEMPLATES
     from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT
     from jaxvib.sweeps.study import TEMPLATE as STUDY
     from optimize.files import TEMPLATES as DESIGNS
@@ -60,6 +57,9 @@ def new(kind: str, output: Output) -> None:
         raise InputError("--out", f"already contains {path.name}, which is not overwritten; give another folder")
     path.write_text(text, encoding="utf-8")
     output.done({"kind": kind, "toml": text}, lambda: f"a commented file for {kind}", "new")
+
+
+new.help = f"{inspect.cleandoc(new.help or '')}\n\nMachines: {', '.join(_MACHINES)}."
 
 
 @app.command("simulate")

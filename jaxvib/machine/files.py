@@ -6,7 +6,7 @@ import difflib
 import inspect
 import re
 import tomllib
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Container, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -22,11 +22,12 @@ from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor, Drive, Induction
 from jaxvib.machine.drives.electrical import DCMotorElectrical, InductionMotorCircuit, InductionMotorElectrical, NamePlateMotor
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS
-from jaxvib.machine.loads import ball_mass, balls, pendulums, rollers
+from jaxvib.machine.loads import Loads, ball_mass, balls, pendulums, rollers
 from jaxvib.machine.scene import Exciter, Scene, unbalance
 from jaxvib.machine.structures.plane_body import body, plane_body, plane_network, support
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.structures.rotor import planar_rotor, rotor
+from jaxvib.machine.templates import SCREENS, TEMPLATES, Templates
 from jaxvib.machine.torus import torus_balls
 from jaxvib.units.known import require_known, when_known
 from jaxvib.units.tables import csv_column
@@ -34,6 +35,8 @@ from jaxvib.units.tables import csv_column
 __all__ = [
     "DRIVES",
     "EFFECTS",
+    "LOADS",
+    "MACHINES",
     "SCREENS",
     "SECTIONS",
     "TEMPLATES",
@@ -50,7 +53,7 @@ __all__ = [
     "suggest_name",
 ]
 
-_MACHINES = {
+MACHINES: dict[str, Callable[..., Machine]] = {
     "one_mass": one_mass,
     "two_mass": two_mass,
     "three_mass": three_mass,
@@ -60,8 +63,8 @@ _MACHINES = {
     "planar_rotor": planar_rotor,
     "rotor": rotor,
 }
-_LOADS = {"ball": balls, "roller": rollers, "pendulum": pendulums, "torus_ball": torus_balls}
-DRIVES = {
+LOADS: dict[str, Callable[..., Loads]] = {"ball": balls, "roller": rollers, "pendulum": pendulums, "torus_ball": torus_balls}
+DRIVES: dict[str, Callable[..., Drive]] = {
     "constant_speed": ConstantSpeed,
     "spin_up": SpinUp,
     "run_up": RunUp,
@@ -77,7 +80,11 @@ DRIVES = {
     "converter": Converter,
     "speed_control": SpeedControl,
 }
-SECTIONS: dict[str, Mapping[str, Callable[..., Any]]] = {"machine": _MACHINES, "loads": _LOADS, "drive": DRIVES}
+SECTIONS: Mapping[str, Mapping[str, Callable[..., Any]]] = {"machine": MACHINES, "loads": LOADS, "drive": DRIVES}
+"""Parts by section and `kind`; each constructor takes the fields of the part's table in a scene file.
+
+A class in a user's file gets an entry by a line of this file such as `DRIVES["turbine"] = Turbine`.
+"""
 
 _ENTRIES: Mapping[str, Callable[..., Any]] = {"supports": support, "bodies": body}
 """Arguments that are lists of parts: for each name the constructor of one entry of the list."""
@@ -369,7 +376,7 @@ def _build_entries(build: Callable[..., object], tables: object, section: str) -
 def rebuild_part(part: Any, section: str) -> Any:
     """Construct a part of a scene again from its parameters, which validates them. Parts of types from outside the package are
     returned unchanged."""
-    build = {**_MACHINES, **_LOADS, **DRIVES, **EFFECTS}.get(part.kind)
+    build = {**MACHINES, **LOADS, **DRIVES, **EFFECTS}.get(part.kind)
     if build is None or not all(hasattr(part, name) for name in inspect.signature(build).parameters):
         return part
     return build_part(build, _fields(part, build), section)
@@ -459,37 +466,3 @@ def _fields(part: object, build: Callable[..., object]) -> Tables:
 def _plain(value: np.ndarray | float, *, unwrap: bool) -> float | list:
     array = np.asarray(value, dtype=float)
     return array.item() if array.ndim == 0 or (array.size == 1 and unwrap) else array.tolist()
-
-
-class Templates(Mapping[str, str]):
-    """Commented example files by name; each is read when it is used.
-
-    **Arguments**: the `folder` of the files; `parts`: for each name the files, without ".toml", whose texts are joined;
-    `speeds`: rotor speeds of examples that do not have the default, 1500 rpm.
-    """
-
-    def __init__(self, folder: Path, parts: Mapping[str, tuple[str, ...]], **speeds: str) -> None:
-        self._folder, self._parts, self._speeds = folder, parts, speeds
-
-    def __getitem__(self, name: str) -> str:
-        text = "\n".join((self._folder / f"{part}.toml").read_text(encoding="utf-8") for part in self._parts[name])
-        return text.replace("{speed}", self._speeds.get(name, "1500 rpm"))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._parts)
-
-    def __len__(self) -> int:
-        return len(self._parts)
-
-
-_FOLDER = Path(__file__).with_name("templates")
-_PLATFORMS = {name: (name, "platforms_end") for name in ("one_mass", "two_mass", "three_mass", "network")}
-_ROTORS = {name: (name, "rotors_end") for name in ("planar_rotor", "rotor")}
-
-TEMPLATES = Templates(
-    _FOLDER, {**_PLATFORMS, **_ROTORS, "ball_balancer": ("ball_balancer",), "torus": ("torus",)}, one_mass="600 rpm"
-)
-"""Scene files with comments for every kind of platforms and rotors, a ball balancer, and a rotor with balls in a torus."""
-
-SCREENS = Templates(_FOLDER, {name: (name,) for name in ("linear_screen", "circular_screen", "feeder")})
-"""Scene files of a linear screen, a circular screen and a feeder, with the numbers of a data sheet."""

@@ -7,6 +7,7 @@ import math
 import pathlib
 import re
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,7 +17,9 @@ from plugins.load import TorusPoints
 from plugins.machine import Beam
 
 import jaxvib as jv
+from jaxvib.machine import files
 from jaxvib.machine.numbers.named import numbers_of
+from jaxvib.report.arguments import arguments_of, builder_of
 
 ROOT = pathlib.Path(__file__).parents[2]
 PAGE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -141,6 +144,20 @@ def test_part_of_a_recipe_answers_without_registration(part):
 def test_files_refuse_a_part_without_an_entry(part):
     with pytest.raises(jv.InputError, match=r"kind is '\w+', which scene files do not describe; build it in Python"):
         jv.scene_to_toml(scene_with(part))
+
+
+SECTION = {"machine": "machine", "load": "loads", "drive": "drive", "effect": "effects"}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_one_line_in_a_users_file_makes_the_entry(part, monkeypatch):
+    scene = scene_with(part)
+    own = scene.all_effects[0] if part == "effect" else getattr(scene, SECTION[part])
+    entries = {"machine": files.MACHINES, "load": files.LOADS, "drive": files.DRIVES, "effect": files.EFFECTS}[part]
+    monkeypatch.setitem(entries, own.kind, type(own))
+    read = jv.scene_from_toml(jv.scene_to_toml(scene))
+    assert eqx.tree_equal(read, scene)
+    assert any(argument.unit for argument in arguments_of(builder_of(f"{part}s", own.kind)))
 
 
 def test_parameters_of_an_example_have_names_and_units():

@@ -2,11 +2,11 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from plugins.drive import Turbine
 from programs.golden import scenes as golden_scenes
 from rotors import machine as rotor_machine
 from scenes import BALLS, machines, scene
@@ -241,8 +241,22 @@ def test_zero_is_absent_only_where_it_means_that():
     assert sizes == {"machine.stations": 2, "machine.stiffness": 1, "loads.drag": 1}
 
 
+class Bare(jv.Motor):
+    """A motor whose fields have no metadata."""
+
+    speed: jax.Array
+    stall_torque: jax.Array
+    inertia: jax.Array
+    kind: str = eqx.field(static=True, default="bare", kw_only=True)
+
+    def torque(self, speed):
+        return self.stall_torque * (1.0 - speed / self.speed)
+
+
 def test_numbers_of_own_parts_are_named_without_metadata():
-    of = jv.Scene(machines()["two_mass"], jv.balls(**BALLS), Turbine(160.0, stall_torque=3.0, inertia=0.02))
+    values = dict(speed=160.0, stall_torque=3.0, inertia=0.02)
+    motor = Bare(**{name: jnp.asarray(value) for name, value in values.items()})
+    of = jv.Scene(machines()["two_mass"], jv.balls(**BALLS), motor)
     torque = find_number(of, "drive.stall_torque", "axes")
     assert torque.unit == "" and torque.words(of) == ["stall torque"]
     assert float(put_numbers(of, (torque,), jnp.array([4.0])).drive.stall_torque) == 4.0

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from jaxvib.machine.effects.base import Gravity, MomentImbalance, StaticImbalance
+from jaxvib.machine.effects.base import Effect, Gravity, MomentImbalance, StaticImbalance
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction
 from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.effects.spin import FreeSpin, Sliding
 from jaxvib.machine.effects.supports import CubicSupport, Stop
 
-EFFECTS = {
+EFFECTS: dict[str, type[Effect]] = {
     "gravity": Gravity,
     "static_imbalance": StaticImbalance,
     "moment_imbalance": MomentImbalance,
