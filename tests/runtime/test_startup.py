@@ -57,12 +57,26 @@ def test_a_folder_that_is_refused_stops_nobody(tmp_path):
     assert done.stdout.split() == [*FLAGS, "None"] and "programs are not cached" in done.stderr
 
 
+def run_clean(script, folder):
+    """The process of a script without settings of the environment, in which a warning is an error."""
+    unset = ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", "JAXVIB_AUTOMATIC")
+    clean = {name: value for name, value in os.environ.items() if name not in unset} | {"XDG_CACHE_HOME": str(folder)}
+    return subprocess.run([sys.executable, "-W", "error", "-c", script], env=clean, capture_output=True, text=True, timeout=300)
+
+
 def test_a_design_file_prepares_the_process(tmp_path):
     script = (
         "import jax, optimize; assert jax.config.jax_compilation_cache_dir is None; "
         "optimize.load_design('examples/antiphase/design.toml'); assert jax.config.jax_compilation_cache_dir is not None"
     )
-    unset = ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", "JAXVIB_AUTOMATIC")
-    clean = {name: value for name, value in os.environ.items() if name not in unset} | {"XDG_CACHE_HOME": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-W", "error", "-c", script], env=clean, capture_output=True, text=True, timeout=300)
+    done = run_clean(script, tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_part_of_a_users_file_prepares_the_process(tmp_path):
+    script = (
+        f"import sys; sys.path[:] = {sys.path!r}; from plugins.drive import Turbine; "
+        "Turbine(160.0, stall_torque=3.0, inertia=0.02); import jaxvib; jaxvib.balls"
+    )
+    done = run_clean(script, tmp_path)
     assert done.returncode == 0, done.stderr

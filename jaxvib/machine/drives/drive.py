@@ -25,7 +25,8 @@ class Drive(Part):
 
     **Attributes**
 
-    - `speed`: working speed, for a motor its no-load speed, rad/s; typical: 60 to 320 (600 to 3000 rpm)
+    - `speed`: working speed, for which steady states are computed, rad/s: the final speed of an ideal drive, the no-load speed
+      of a motor; typical: 60 to 320 (600 to 3000 rpm)
     - `kind`: its name in scene files
 
     An `IdealDrive` prescribes the rotor speed. With a `Motor` the rotor's angle and speed are states.
@@ -205,7 +206,8 @@ class Motor(Drive):
         J theta'' = T(theta') - torque of the loads on the rotor
 
     J (`inertia`) is the moment of inertia of the whole rotor about its axis. It includes the unbalance of the rotor but not
-    the loads; typical: 0.005 to 1 kg m^2.
+    the loads; typical: 0.005 to 1 kg m^2. A subclass without `__init__` takes its arguments by name, because the fields of the
+    base class come first.
 
     >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
     >>> class Turbine(jv.Motor):

@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
+from jaxvib.runtime.startup import start
 from jaxvib.units import Bounds, Numbers, number, numbers
 from jaxvib.units.known import when_known
 
@@ -105,6 +106,7 @@ def read_numbers(part: type[eqx.Module], section: str, length: int | None = None
         ...
     jaxvib.errors.InputError: drive.duration is 0 s; it must be greater than 0
     """
+    start()  # a part of a user's file may be the first array of a process
     specs = number_specs(part)
     return {name: _read(specs[name], value, f"{section}.{name}".lstrip("."), length) for name, value in values.items()}
 
