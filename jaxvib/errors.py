@@ -34,8 +34,8 @@ def legible(text: object) -> str:
     return _shortened(plain, _MAX_MESSAGE)
 
 
-def _shortened(text: str, most: int) -> str:
-    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
+def _shortened(text: str, longest: int) -> str:
+    return text if len(text) <= longest else f"{text[: longest // 2]} ... {text[-longest // 4 :]}"
 
 
 class InputError(ValueError):
@@ -209,22 +209,22 @@ def open_regular(path: str | Path) -> IO[bytes]:
         raise OSError(None, str(error)) from error
 
 
-def read_text(path: str | Path, what: str, most: int = MAX_TEXT_BYTES) -> str:
+def read_text(path: str | Path, what: str, max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Return the text of a file.
 
-    **Arguments**: `path`; `what`: expected file, for messages, such as "a TOML file"; `most`: largest size, bytes.
+    **Arguments**: `path`; `what`: expected file, for messages, such as "a TOML file"; `max_bytes`: largest size.
 
-    **Raises** `InputError` for a file that cannot be read, is not UTF-8 text, or is larger than `most`.
+    **Raises** `InputError` for a file that cannot be read, is not UTF-8 text, or is larger than `max_bytes`.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise InputError("path", f"is {quoted(path)}; give the path of {what}")
     try:
         with open_regular(path) as file:
-            content = file.read(most + 1)
+            content = file.read(max_bytes + 1)
     except OSError as error:
         raise InputError(str(path), f"cannot be read ({error.strerror}); give the path of {what}") from error
-    if len(content) > most:
-        raise InputError(str(path), f"is larger than {most >> 20} MB; give the path of {what}")
+    if len(content) > max_bytes:
+        raise InputError(str(path), f"is larger than {max_bytes >> 20} MB; give the path of {what}")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -232,7 +232,7 @@ def read_text(path: str | Path, what: str, most: int = MAX_TEXT_BYTES) -> str:
 
 
 class ComputationError(RuntimeError):
-    """Error for a computation that has no result although its input is allowed; `status` names the reason.
+    """Error for a computation with allowed input that has no result; `status` names the reason.
 
     Functions that raise it accept `throw=False`, which returns the status instead.
 

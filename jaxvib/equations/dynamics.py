@@ -83,7 +83,7 @@ class Dynamics(eqx.Module):
         (M + P^T W P) q'' = M q''_free - P^T g instead.
         """
         states = [stack_members(group.members, state.exciters) for group in self.groups]
-        speeds = self._each(lambda exciter, own: exciter.drive.rotor_speed(t, own.rotor), states)
+        speeds = self._each(lambda exciter, of_exciter: exciter.drive.rotor_speed(t, of_exciter.rotor), states)
         unforced = self._unforced(state, speeds)
         housings = self._each(lambda exciter: exciter.housing_speed(state.velocity))
         motions = self._each(lambda exciter, *given: exciter.motion(t, *given), states, speeds, housings)
@@ -110,7 +110,7 @@ class Dynamics(eqx.Module):
 
     def _each(self, function: Callable[..., Any], *values: Sequence[Any]) -> list[Any]:
         """Return function(exciter, *values) of each exciter, by group."""
-        return [group.each(function, *own) for group, *own in zip(self.groups, *values, strict=True)]
+        return [group.each(function, *of_group) for group, *of_group in zip(self.groups, *values, strict=True)]
 
     def at_rows(self, rows: Array) -> Dynamics:
         """Return the equations with the accelerations of P's rows and of further `rows` (k, nd) in place of the carrier's q''.
@@ -148,7 +148,7 @@ class Dynamics(eqx.Module):
             return self._solve_rows_of_groups(parts, unforced)
         ends = np.cumsum([len(part.reaction) for part in parts]).tolist()
         blocks = [range(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
-        own = [block for block in blocks for _ in block]
+        block_of_row = [block for block in blocks for _ in block]
         weights = [
             dict(zip(block, line, strict=True)) for part, block in zip(parts, blocks, strict=True) for line in part.added_mass
         ]
@@ -159,7 +159,7 @@ class Dynamics(eqx.Module):
 
         def row_coupling(i: int, k: int) -> Array | float:
             """Return the acceleration of row i per that of row k due to the added mass, which acts within an exciter."""
-            return sum(self.accelerance[i, j] * weights[j][k] for j in own[k])
+            return sum(self.accelerance[i, j] * weights[j][k] for j in block_of_row[k])
 
         n, free = ends[-1], times(self.rows, unforced)
         matrix = [[(1.0 if i == k else 0.0) + row_coupling(i, k) for k in range(n)] for i in range(n)]
@@ -170,7 +170,7 @@ class Dynamics(eqx.Module):
         return [[a[k] for k in block] for block in blocks], carrier
 
     def _solve_rows_of_groups(self, parts: Sequence[Eliminated], unforced: Array) -> tuple[list[list[Array]], Array]:
-        """Return the same as `_solve_rows`, from arrays over all rows.
+        """Return the result of `_solve_rows`, computed with arrays over all rows.
 
         If P has at most as many rows as there are coordinates, the unknowns are the forces f = W a + g:
         (1 + W accelerance) f = W a_free + g.
@@ -266,7 +266,11 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
 
 
 def _groups_of_directions(exciters: Sequence[RotorDynamics], directions: Sequence[int]) -> tuple[Group[RotorDynamics], ...]:
-    """Return the exciters in groups. Groups with both directions have them as an array; others have no operations for it."""
+    """Return the exciters in groups.
+
+    A group with both directions of rotation contains the directions as an array. In another group, the program has no
+    operations for the direction.
+    """
 
     def directed(part: RotorDynamics, direction: int) -> RotorDynamics:
         drive = part.drive.drive if isinstance(part.drive, Directed) else part.drive

@@ -2,11 +2,11 @@
 
 A load of mass m and inertia factor kappa (7/5 for balls) has the coordinates u, the position p(u) relative to the point that
 carries it, and the generalised forces Q_u. With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c, it
-obeys u'' = H^-1 (r - E a). Here a is the acceleration of the point that carries the load, and E is m J^T minus the factor of a
-in the friction on the load, if a friction is proportional to its normal force. The load exerts the force -(W a + g) on that
-point, with W = m 1 - m J H^-1 E (1 is the unit matrix) and g = m (J H^-1 r + c). The unbalanced rotor of a motor is one more
-such body. The added mass and the reaction of the exciter are the sums of W and g over all loads, with the levers of the loads
-on the rows of the mount. These two contain the whole effect of the exciter on the machine.
+obeys u'' = H^-1 (r - E a). Here a is the acceleration of the point that carries the load. E is m J^T; if a friction is
+proportional to the normal force of the load, the factor of a in this friction is subtracted. The load exerts the force
+-(W a + g) on that point, with W = m 1 - m J H^-1 E (1 is the unit matrix) and g = m (J H^-1 r + c). The unbalanced rotor of a
+motor exerts a force of the same form. The added mass and the reaction of the exciter are the sums of W and g over all loads,
+with the levers of the loads on the rows of the mount. These two contain the whole effect of the exciter on the machine.
 """
 
 from __future__ import annotations
@@ -245,8 +245,10 @@ class RotorDynamics(eqx.Module):
 
         def imbalance(angle: Array) -> tuple[Array, ...]:
             of_effects = [term.at(angle) for term in terms]
-            own = [] if self.unbalance is None else [(self.unbalance * jnp.cos(angle), self.unbalance * jnp.sin(angle))]
-            static = tuple(total(each[axis] for each in [*(each.static for each in of_effects), *own]) for axis in self.axes)
+            vectors = [each.static for each in of_effects]
+            if self.unbalance is not None:
+                vectors.append((self.unbalance * jnp.cos(angle), self.unbalance * jnp.sin(angle)))
+            static = tuple(total(each[axis] for each in vectors) for axis in self.axes)
             if self.row_count == 1:
                 return static
             moments = [[each.moment[axis] for each in of_effects] for axis in self.axes]
@@ -276,7 +278,7 @@ class RotorDynamics(eqx.Module):
         return self.unbalance * g[1] * jnp.cos(self.drive.rotor_angle(t, state.rotor))
 
     def _total(self, values: Array, *levers: Array | None) -> Array:
-        """Return the sum over all loads; a rotor without loads has none, and `values` are returned unchanged."""
+        """Return the sum of `values` over all loads; for a rotor without loads, return `values` unchanged."""
         return values
 
 
@@ -406,10 +408,10 @@ class ExciterDynamics(RotorDynamics):
         """
         m, axes, levers = self.loads.mass, self.axes, self.levers
         columns = {axis: [column[axis] for column in of_loads.columns] for axis in axes}
-        own = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(columns[i], response_to_carrier[k]) for i in axes for k in axes}
+        mass = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(columns[i], response_to_carrier[k]) for i in axes for k in axes}
         moments = {
-            (i, k, low, high): self._total(own[i, k], levers[low], levers[high])
-            for i, k in own
+            (i, k, low, high): self._total(mass[i, k], levers[low], levers[high])
+            for i, k in mass
             for low in range(len(levers))
             for high in range(low, len(levers))
         }
@@ -460,7 +462,7 @@ class ExciterDynamics(RotorDynamics):
 
 
 def depends_on_acceleration(contact: ContactSolution) -> bool:
-    """True if a friction is proportional to a normal force that depends on the accelerations."""
+    """Return True if a friction is proportional to a normal force that depends on the accelerations."""
     return any(each.normal is not None for each in contact.friction)
 
 

@@ -138,7 +138,7 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
 
 
 def _at_time(t: Array | float, state: State) -> Any:
-    """Return a time as an array, so that one program serves all times."""
+    """Return a time as an array. One compiled program then serves all times."""
     return t if isinstance(t, Array) else np.asarray(t, state.displacement.dtype)
 
 
@@ -148,18 +148,18 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
     q, v = state.displacement, state.velocity
     parts = [0.5 * (v @ model.carrier.mass @ v + q @ model.carrier.stiffness @ q)]
     t = jnp.asarray(t, q.dtype)
-    for exciter, mount, own in zip(scene.exciters, model.mounts, state.exciters, strict=True):
+    for exciter, mount, part in zip(scene.exciters, model.mounts, state.exciters, strict=True):
         drive = exciter.turning_drive
-        turn, rate = drive.rotor_angle(t, own.rotor), drive.rotor_speed(t, own.rotor)
+        turn, rate = drive.rotor_angle(t, part.rotor), drive.rotor_speed(t, part.rotor)
         effects = (*scene.effects, *exciter.effects)
         if exciter.loads is not None:
             effects = tuple(effect.prepare(exciter.loads, mount) for effect in effects)
-        parts += _load_energies(exciter.loads, mount, effects, v, own, rate)
+        parts += _load_energies(exciter.loads, mount, effects, v, part, rate)
         parts.append(rate * _imbalance_rate(exciter, mount, turn) @ v)
         weight = total_gravity(effects).get(1)
         if exciter.unbalance is not None and weight is not None:
             parts.append(exciter.unbalance * weight * jnp.sin(turn))
-        motor = drive.torque_and_inertia(t, rate, (own.rotor or ())[2:])
+        motor = drive.torque_and_inertia(t, rate, (part.rotor or ())[2:])
         if motor is not None:
             parts.append(0.5 * motor[1] * rate**2)
     supports = zip(terms_of(scene.effects, SupportForce), model.supports, strict=True)
@@ -176,14 +176,14 @@ def _load_energies(
     p_rate = jax.jvp(loads.position, state.angle, state.rate)[1]
     at_load = mount.load_rates(velocity)
     total = [rate + at_load.get(axis, 0.0) for axis, rate in enumerate(p_rate)]
-    own = loads.inertia_factor() - 1.0
-    parts = [jnp.sum(0.5 * loads.mass * (sum(w**2 for w in total) + own * sum(w**2 for w in p_rate)))]
+    rotation = loads.inertia_factor() - 1.0
+    parts = [jnp.sum(0.5 * loads.mass * (sum(w**2 for w in total) + rotation * sum(w**2 for w in p_rate)))]
     for term in terms_of(effects, LoadPotential, LoadInteraction):
         parts.append(jnp.sum(jnp.broadcast_to(term.energy(loads, state.angle), (loads.count,))))
     if state.spin is not None and state.spin.slip is not None:
         found = kinematics(loads, state.angle, state.rate)
         pairs = zip(state.spin.slip, found.columns, found.sizes, strict=True)
-        parts += [jnp.sum(own * loads.mass * c * (0.5 * c - dot(column, p_rate) / size)) for c, column, size in pairs]
+        parts += [jnp.sum(rotation * loads.mass * c * (0.5 * c - dot(column, p_rate) / size)) for c, column, size in pairs]
     if state.spin is not None and state.spin.drilling is not None:
         drilling = loads.drilling_spin(state.angle, state.rate, speed)
         assert drilling is not None
@@ -235,17 +235,17 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     field = dynamics_of(model)
     change = field(t, state)
     supplied, dissipated = [], [state.velocity @ model.carrier.damping @ state.velocity]
-    for exciter, dynamics, mount, own, own_change in zip(
+    for exciter, dynamics, mount, part, part_change in zip(
         scene.exciters, field.exciters, model.mounts, state.exciters, change.exciters, strict=True
     ):
-        turn, speed = dynamics.drive.rotor_angle(t, own.rotor), dynamics.drive.rotor_speed(t, own.rotor)
+        turn, speed = dynamics.drive.rotor_angle(t, part.rotor), dynamics.drive.rotor_speed(t, part.rotor)
         braking = jnp.zeros_like(speed)
         if isinstance(dynamics, ExciterDynamics):
-            braking, spun, losses = _load_power(dynamics, own, own_change, mount.load_rates(change.velocity), speed)
+            braking, spun, losses = _load_power(dynamics, part, part_change, mount.load_rates(change.velocity), speed)
             supplied.append(spun)
             dissipated += losses
         driven = speed if mount.turn is None else speed - mount.turn @ state.velocity
-        supplied.append(driven * _drive_torque(t, exciter, dynamics, mount, own, change.velocity, (turn, driven, braking)))
+        supplied.append(driven * _drive_torque(t, exciter, dynamics, mount, part, change.velocity, (turn, driven, braking)))
     for term, rows in zip(terms_of(scene.effects, SupportForce), model.supports, strict=True):
         x, v = rows @ state.displacement, rows @ state.velocity
         if term.resistance is not None:
@@ -283,17 +283,17 @@ def drive_torques(model: Model, field: Dynamics, t: Array, state: State) -> tupl
     slide is not included.
     """
     change, torques, powers = field(t, state), [], []
-    for exciter, dynamics, mount, own in zip(model.scene.exciters, field.exciters, model.mounts, state.exciters, strict=True):
-        turn, speed = dynamics.drive.rotor_angle(t, own.rotor), dynamics.drive.rotor_speed(t, own.rotor)
+    for exciter, dynamics, mount, part in zip(model.scene.exciters, field.exciters, model.mounts, state.exciters, strict=True):
+        turn, speed = dynamics.drive.rotor_angle(t, part.rotor), dynamics.drive.rotor_speed(t, part.rotor)
         braking = jnp.zeros_like(speed)
         if isinstance(dynamics, ExciterDynamics):
             loads = dynamics.loads
-            braking = jnp.sum(loads.resistance(own.angle, own.rate, speed)[0])
+            braking = jnp.sum(loads.resistance(part.angle, part.rate, speed)[0])
             for term in terms_of(dynamics.effects, ContactFriction):
-                friction = term.friction(loads, own.angle, own.rate, speed, total_gravity(dynamics.effects))
+                friction = term.friction(loads, part.angle, part.rate, speed, total_gravity(dynamics.effects))
                 braking = braking + jnp.sum(friction.forces(mount.load_rates(change.velocity))[0])
         driven = speed if mount.turn is None else speed - mount.turn @ state.velocity
-        torque = _drive_torque(t, exciter, dynamics, mount, own, change.velocity, (turn, driven, braking))
+        torque = _drive_torque(t, exciter, dynamics, mount, part, change.velocity, (turn, driven, braking))
         torques.append(exciter.direction * torque)
         powers.append(driven * torque)
     return jnp.stack(torques), jnp.stack(powers)
@@ -302,8 +302,8 @@ def drive_torques(model: Model, field: Dynamics, t: Array, state: State) -> tupl
 def _load_power(
     exciter: ExciterDynamics, state: ExciterState, change: ExciterState, at_load: Mapping[int, Array], speed: Array
 ) -> tuple[Array, Array, list[Array]]:
-    """Return the torque of the rotor on the loads, N m, its power to spinning and sliding loads, W, and the dissipated powers,
-    W."""
+    """Return the torque of the rotor on the loads, N m, the power of the rotor to spinning and sliding loads, W, and the
+    dissipated powers, W."""
     loads, g = exciter.loads, total_gravity(exciter.effects)
     of_rotor = loads.resistance(state.angle, state.rate, speed)
     sliding, (supplied, lost_in_contact) = _spin_power(exciter, state, change, at_load, speed)
@@ -357,7 +357,8 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
 
     z is the centrifugal acceleration of the motion of the load relative to the point that carries it, a the acceleration of
     this point, n the direction in which the load presses, g the acceleration of gravity, and e the unit vector against gravity.
-    If N is negative, the equations keep the load on its track, and friction that is proportional to N is 0.
+    If N is negative, the equations keep the load on its track. Its friction is then proportional to |N| on a circle and 0 in a
+    torus.
 
     **Arguments**
 
@@ -386,10 +387,10 @@ def _normal_force(scene: Scene, t: Array, state: State) -> Array:
     model = assemble(scene)
     acceleration = dynamics_of(model)(jnp.asarray(t, state.displacement.dtype), state).velocity
     forces = []
-    for exciter, mount, own in zip(scene.exciters, model.mounts, state.exciters, strict=True):
+    for exciter, mount, part in zip(scene.exciters, model.mounts, state.exciters, strict=True):
         if exciter.loads is None:
             continue
-        found = exciter.loads.normal_force(own.angle, own.rate, total_gravity(scene.effects))
+        found = exciter.loads.normal_force(part.angle, part.rate, total_gravity(scene.effects))
         if found is None:
             problem = f"is {exciter.loads.kind!r}, whose normal force on the track is not defined (Loads.normal_force)"
             raise InputError("loads.kind", problem)
@@ -398,8 +399,7 @@ def _normal_force(scene: Scene, t: Array, state: State) -> Array:
 
 
 def _imbalance_rate(exciter: Exciter, mount: Mount, turn: Array) -> Array:
-    """Return d'(theta).P (nd,) of the rotor's imbalance: the momentum along the coordinates of the carrier that it has per unit
-    of the rotor speed."""
+    """Return d'(theta).P (nd,) of the rotor's imbalance: its momentum along the coordinates of the carrier, per rotor speed."""
     static, moment = mount.rotor_rows(), mount.tilt
     row = jnp.zeros_like(static[0])
     for term in terms_of(exciter.effects, RotorImbalance):

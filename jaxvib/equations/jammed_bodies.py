@@ -25,7 +25,7 @@ Points = Array | np.ndarray
 class JammedBodies(eqx.Module):
     """Scene whose loads are G rigid bodies. It is assembled once for each analysis and passed on.
 
-    Identical loads are coincident and form one body. If loads differ, each of them is a body with an angle of its own.
+    Identical loads are coincident and form one body. If loads differ, each load is a separate body with a separate angle.
 
     **Attributes**
 
@@ -80,7 +80,7 @@ class JammedBodies(eqx.Module):
         return torque
 
     def torque(self, phi: Points, rate: Array, speed: Array, a: Array, of_each: Callable[..., Array] | None = None) -> Array:
-        """Return the torque on the bodies (G, M), N m, at their angles `phi` (G, M), without that of their inertia.
+        """Return the torque on the bodies (G, M), N m, at their angles `phi` (G, M), without inertia torques.
 
         It is the sum over the loads of each body of `of_each`, by default `torque_of_each`. `a` is (np, M).
         """

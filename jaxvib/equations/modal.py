@@ -94,13 +94,13 @@ def modal_response(
     """
     n, eps = frequencies.shape[0], jnp.finfo(frequencies.dtype).eps
     positive = jnp.where(frequencies > 0.0, frequencies, jnp.inf)
-    # q must follow from Omega q. A motion that is free to drift therefore gets a spring that is too soft to have an effect at
-    # any load speed.
-    free = jnp.where(jnp.isfinite(jnp.min(positive)), jnp.min(positive), 1.0) * eps ** (1 / 3)
-    stiff = jnp.where(frequencies > 0.0, frequencies, free)
+    # q must follow from Omega q. A motion that is free to drift (Omega = 0) therefore gets a spring. It is too soft to have an
+    # effect at any load speed.
+    drift_frequency = jnp.where(jnp.isfinite(jnp.min(positive)), jnp.min(positive), 1.0) * eps ** (1 / 3)
+    stiff = jnp.where(frequencies > 0.0, frequencies, drift_frequency)
     coupling, rounding = shapes.T @ damping @ shapes, jnp.abs(shapes.T) @ jnp.abs(damping) @ jnp.abs(shapes)
     coupling = jnp.where(jnp.abs(coupling) > 4.0 * n * eps * rounding, coupling, 0.0)
-    # With critical damping two poles share one eigenvector. A relative change of eps^(2/3) in the damping gives two.
+    # With critical damping two poles share one eigenvector. A relative change of the damping by eps^(2/3) separates them.
     critical = jnp.abs(jnp.diagonal(coupling) / (2.0 * stiff) - 1.0) < eps ** (2 / 3)
     coupling = coupling * (1.0 + eps ** (2 / 3) * jnp.diag(critical.astype(coupling.dtype)))
     blocks = jnp.zeros((n, 2, n, 2), coupling.dtype)  # the two states of a mode side by side

@@ -26,9 +26,12 @@ Part = TypeVar("Part")
 
 
 class Group(eqx.Module, Generic[Part]):
-    """One part of an exciter, or many of equal structure as one whose arrays have a leading axis over them.
+    """One part of an exciter, or the parts of several exciters if these parts have the same structure.
 
-    `members`: the numbers of their exciters.
+    **Attributes**
+
+    - `part`: the part; for several exciters, its arrays have a leading axis over the exciters
+    - `members`: the numbers of the exciters
     """
 
     part: Part

@@ -18,8 +18,8 @@ from jaxvib.machine.loads import Loads, NormalForce
 class Kinematics(NamedTuple):
     """Kinematics of loads: `columns` of J = dp/du, and `curvature` c = (dJ/dt) u'.
 
-    Each is (x, y), or (x, y, z) if the loads move along the axis. `lengths` contains the lengths of the columns if they are
-    constant along the track, see `Loads.tangent_lengths`; otherwise it is None.
+    Each column and the curvature have the components (x, y), or (x, y, z) if the loads move along the axis. `lengths` contains
+    the lengths of the columns if these lengths are constant along the track, see `Loads.tangent_lengths`; otherwise it is None.
     """
 
     columns: list[tuple[Array, ...]]
@@ -68,7 +68,7 @@ def contact_force(
 
         [kappa m J^T (J u'' + (dJ/dt) u') + m J^T a - Q]_i / |dp/du_i|
 
-    It is the force that the motion requires in addition to the generalised `force` Q.
+    The motion requires this force in addition to the generalised `force` Q.
 
     **Arguments**: `acceleration` u''; `a`, the acceleration of the points that carry the loads, by axis; `kappa`, which is 1
     for the mass without rotation.
@@ -140,7 +140,7 @@ def resolve_contact(
 def slip_rates(loads: Loads, u: Coordinates, rate: Coordinates, slip: Coordinates, change: Sequence[Array]) -> Coordinates:
     """Return the rate of the slip along each coordinate, m/s^2.
 
-    It is the tangential part `change` of c', minus a part due to the rotation of the tangents.
+    The rate is the tangential part `change` of c', minus a part due to the rotation of the tangents.
     """
 
     def tangents(*v: Array) -> list[list[Array]]:

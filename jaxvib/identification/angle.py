@@ -89,7 +89,7 @@ class RecordedDrive(IdealDrive):
     def with_errors(self, z: Array) -> RecordedDrive:
         """Return the drive whose angle has the errors `z` (m,)."""
         angle_table = self.table[:, :, :1] + (self.table[:, :, 1:] @ z)[:, :, None]
-        return eqx.tree_at(lambda own: own.table, self, jnp.concatenate([angle_table, self.table[:, :, 1:]], axis=2))
+        return eqx.tree_at(lambda drive: drive.table, self, jnp.concatenate([angle_table, self.table[:, :, 1:]], axis=2))
 
 
 class RotorSamples(NamedTuple):
@@ -147,7 +147,7 @@ class RotorAngle(NamedTuple):
         """Return the drive without the errors of its angle."""
         if not isinstance(self.drive, RecordedDrive):
             return self.drive
-        return eqx.tree_at(lambda own: own.table, self.drive, self.drive.table[:, :, :1])
+        return eqx.tree_at(lambda drive: drive.table, self.drive, self.drive.table[:, :, :1])
 
 
 def rotor_angles(scene: Scene, run: MeasuredRun) -> list[RotorAngle]:
@@ -205,7 +205,7 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
         spread = np.maximum(rough_speed, _MIN_SPEED * np.max(rough_speed))  # the errors of pulses are errors of their times
         spline, scatter = fit_spline(time, value, marks, spread)
         speed = spline(0.5 * (time[1:] + time[:-1]), 1)[:, 0]
-        is_fast = np.abs(speed[1:]) > 0.2 * np.max(np.abs(speed))  # slower rotors excite nothing
+        is_fast = np.abs(speed[1:]) > 0.2 * np.max(np.abs(speed))  # slower rotors excite almost no vibration
         change = float(np.max(np.abs(np.diff(speed) / speed[1:]), where=is_fast, initial=0.0))
         if change > _MAX_SPEED_CHANGE:
             notes.append(

@@ -89,7 +89,7 @@ class Unknowns(eqx.Module):
 
 
 class Samples(eqx.Module):
-    """Samples of a run on an even grid, in stretches, as a program needs them.
+    """Samples of a run on an even grid, in stretches: input of the compiled programs.
 
     **Attributes** (N stretches of n samples, C channels, E exciters)
 
@@ -99,8 +99,8 @@ class Samples(eqx.Module):
     - `weights` (N, n, C): 1/noise of each reading, 0 for readings that do not count
     - `taps` (m + 1, C): filter to white noise for the readings of the model
     - `step` h, s
-    - `amounts` by which the `actions` change the numbers `changed` of the scene in this run
-    - `channels` that are compared, `changed` and `actions`, `turn`: index of the run's unknown zero of the angle, or None
+    - `changed`: numbers of the scene that differ in this run; `actions` ("add", "scale" or "set") and `amounts` of the changes
+    - `channels` that are compared; `turn`: index of the run's unknown zero of the angle, or None
     - `errors`: place of the first error of the rotor's angle among the unknowns, and their number
     - `stretches` in which the motion of loads is integrated: their number, samples of each, steps per sample; (0, 0, 0) without
       loads
@@ -214,7 +214,7 @@ def _steps(scene: Scene, channels: tuple[Channel, ...], step: Array, turn: Array
 
 
 def _march(power: Array, forcing: Array, start: Array) -> tuple[Array, Array]:
-    """Return the states (n, ns, m) at the starts of n steps x' = power x + forcing, and the state at the end.
+    """Return the states (n, ns, m) at the starts of n steps x_{k+1} = power x_k + forcing_k, and the state at the end.
 
     **Arguments**: `forcing` (n, ns, m), `start` (ns, m); n is a multiple of the length of a block.
     """
@@ -240,8 +240,11 @@ def _march(power: Array, forcing: Array, start: Array) -> tuple[Array, Array]:
 
 
 def _readings(steps: _Steps, force: Array, start: Array) -> tuple[Array, Array]:
-    """Return the readings (n, C, ns + 2 E) per unit of the state at the first sample and of each component of the unbalances,
-    without offsets, from `start` (ns, ns + 2 E), and the states at the end."""
+    """Return the derivatives (n, C, ns + 2 E) of the readings by the state at the first sample and by the components of the
+    unbalances, and the derivatives of the state at the end.
+
+    **Arguments**: `start` (ns, ns + 2 E): derivatives of the state at the start of the stretch.
+    """
     ns = steps.power.shape[0]
     n, exciters = force.shape[0], steps.inputs.shape[2]
     parts = force.reshape(n, 4, exciters, 2)
@@ -275,9 +278,9 @@ def _filtered(taps: Array, before: Array, values: Array) -> tuple[Array, Array]:
 
 def _built(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> _Steps:
     """Return the steps of a run, with the gains of its channels, at the unknowns `x`."""
-    own = samples.scene(unknowns.scene(scene, x))
+    scene_of_run = samples.scene(unknowns.scene(scene, x))
     turn = 0.0 if samples.turn is None else x[unknowns.first.shape[0] + len(unknowns.gains) + samples.turn]
-    steps = _steps(own, samples.channels, samples.step, turn)
+    steps = _steps(scene_of_run, samples.channels, samples.step, turn)
     gains = jnp.stack([jnp.asarray(unknowns.gain(x, channel.name)) for channel in samples.channels])
     return steps._replace(outputs=gains[:, None] * steps.outputs, through=gains[:, None, None, None] * steps.through)
 
@@ -291,16 +294,16 @@ def _forces(samples: Samples, scene: Scene, x: Array, stretch: Array) -> tuple[A
     times = jnp.minimum(samples.begin + samples.step * places, samples.end).ravel()
     forces, changes = [], jnp.zeros((0, n, 4, 2))
     for drive, exciter in zip(samples.drives, scene.exciters, strict=True):
-        own = drive.with_errors(x[first : first + count]) if count and isinstance(drive, RecordedDrive) else drive
-        theta = jax.vmap(lambda t, own=own: own.rotor_angle(t, None))(times)
-        rate = jax.vmap(lambda t, own=own: own.rotor_speed(t, None))(times)
-        acceleration: Any = jax.vmap(own.rotor_acceleration)(times)
+        turned = drive.with_errors(x[first : first + count]) if count and isinstance(drive, RecordedDrive) else drive
+        theta = jax.vmap(lambda t, turned=turned: turned.rotor_angle(t, None))(times)
+        rate = jax.vmap(lambda t, turned=turned: turned.rotor_speed(t, None))(times)
+        acceleration: Any = jax.vmap(turned.rotor_acceleration)(times)
         turning = 1j * exciter.direction
         unit = jnp.exp(turning * theta)
         forces.append((rate**2 - turning * acceleration) * unit)
-        if count and isinstance(own, RecordedDrive):  # the scene has one exciter
+        if count and isinstance(turned, RecordedDrive):  # the scene has one exciter
             error, error_rate, error_acceleration = (
-                jax.vmap(lambda t, k=k, own=own: own.columns_at(t, k)[1:], out_axes=1)(times) for k in range(3)
+                jax.vmap(lambda t, k=k, turned=turned: turned.columns_at(t, k)[1:], out_axes=1)(times) for k in range(3)
             )
             change = 2.0 * rate[None] * error_rate - turning * error_acceleration
             found = change * unit[None] + turning * error * forces[0][None]
@@ -310,10 +313,11 @@ def _forces(samples: Samples, scene: Scene, x: Array, stretch: Array) -> tuple[A
 
 
 def _linear_columns(steps: _Steps, samples: Samples):
-    """Return the first carry and the function of a stretch that gives its linear columns (n, C, ns + 2 E + C)."""
+    """Return the initial carry of a scan over the stretches, and its function, which also returns the linear columns
+    (n, C, ns + 2 E + C) of a stretch."""
     ns, exciters, count = steps.power.shape[0], steps.inputs.shape[2], len(samples.channels)
-    own, m = ns + 2 * exciters, samples.taps.shape[0] - 1
-    first = jnp.concatenate([jnp.eye(ns), jnp.zeros((ns, 2 * exciters))], axis=1), jnp.zeros((m, count, own))
+    size, m = ns + 2 * exciters, samples.taps.shape[0] - 1
+    first = jnp.concatenate([jnp.eye(ns), jnp.zeros((ns, 2 * exciters))], axis=1), jnp.zeros((m, count, size))
     level = jnp.sum(samples.taps, axis=0)  # the filtered value of a constant offset
 
     def columns(carry: tuple[Array, Array], force: Array) -> tuple[tuple[Array, Array], Array]:

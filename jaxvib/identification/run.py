@@ -170,7 +170,7 @@ class MeasuredRun(Readable):
         return tuple(channel for channel in self.channels if channel.kind in kinds)
 
     def rate(self, name: str) -> float:
-        """Return the sampling rate, Hz, of the channel `name`: that of the median time step."""
+        """Return the sampling rate, Hz, of the channel `name`: the inverse of the median time step."""
         return 1.0 / float(np.median(np.diff(self.times[name])))
 
     def rotor_speed(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -233,7 +233,7 @@ def _read_channel(
         time, number, notes = number_pulses(time, where)
         return _Samples(time, number, np.zeros(time.size, bool), notes)
     value = _as_samples(values[name], where)
-    if channel.factor != 1.0 or value is values[name]:  # a copy, but no second one of a long recording
+    if channel.factor != 1.0 or value is values[name]:  # one copy only, because a recording may be long
         value = value * channel.factor
     if time.shape != value.shape:
         raise InputError(where, f"has {time.size} times but {value.size} values; each value needs its time")

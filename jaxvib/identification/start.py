@@ -1,8 +1,7 @@
 """First values of an identification: the steady amplitudes of the machine are fitted to the amplitudes of the records.
 
 In a run-up the machine does not reach its steady amplitudes, but their peaks over speed lie near the peaks of the record. The
-fit of the whole records starts from the resulting values, and a second time from the first values of the scene; the better fit
-counts.
+whole records are then fitted twice: from the resulting values, and from the values of the scene. The better fit is used.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 
 _WINDOWS = 128
-"""Largest number of stretches of a run, each of whole turns, for each of which one amplitude is computed."""
+"""Largest number of stretches of a run. A stretch has whole turns and gives one amplitude of each channel."""
 
 _PRIOR_WEIGHT = 0.05
 """Weight of the logarithm of the change of an unknown, relative to that of the logarithm of an amplitude."""
@@ -43,8 +42,8 @@ def amplitudes(
     (True, True, False)
     """
     turns = np.abs(angle - angle[0]) / (2.0 * np.pi)
-    each = max(1.0, np.ceil(turns[-1] / _WINDOWS))
-    cuts = np.searchsorted(turns, np.arange(0.0, turns[-1], each))
+    turns_of_stretch = max(1.0, np.ceil(turns[-1] / _WINDOWS))
+    cuts = np.searchsorted(turns, np.arange(0.0, turns[-1], turns_of_stretch))
     speeds, sizes, weights = [], [], []
     for begin, end in itertools.pairwise(cuts):
         if end - begin < 8:
@@ -58,9 +57,9 @@ def amplitudes(
                 weight.append(0.0)
                 continue
             found, *_ = np.linalg.lstsq(basis[counts], values[counts], rcond=None)
-            rest = float(np.var(values[counts] - basis[counts] @ found)) / np.count_nonzero(counts)
+            variance = float(np.var(values[counts] - basis[counts] @ found)) / np.count_nonzero(counts)
             size.append(float(np.hypot(found[1], found[2])))
-            weight.append(size[-1] ** 2 / (size[-1] ** 2 + 10.0 * rest + 1e-300))
+            weight.append(size[-1] ** 2 / (size[-1] ** 2 + 10.0 * variance + 1e-300))
         speeds.append((angle[end - 1] - angle[begin]) / (step * (end - 1 - begin)))
         sizes.append(size)
         weights.append(weight)
@@ -69,11 +68,11 @@ def amplitudes(
 
 def _steady(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, speeds: Array) -> Array:
     """Return the amplitudes (W, C) of the steady readings per unit of the unbalance."""
-    own = samples.scene(unknowns.scene(scene, x))
-    model = linear_model(own)
-    mount, exciter = model.mounts[0], own.exciters[0]
+    scene_of_run = samples.scene(unknowns.scene(scene, x))
+    model = linear_model(scene_of_run)
+    mount, exciter = model.mounts[0], scene_of_run.exciters[0]
     direction = mount.rotor_rows().T @ rotating_direction(mount, exciter.direction)
-    rows = sensor_rows(own, model.carrier, samples.channels)
+    rows = sensor_rows(scene_of_run, model.carrier, samples.channels)
 
     def at(w: Array) -> Array:
         moved = jnp.linalg.solve(model.dynamic_stiffness(w), w**2 * direction)
@@ -84,8 +83,8 @@ def _steady(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, speeds
 
 @cached
 def _track(unknowns: Unknowns, runs: tuple[Samples, ...], scene: Scene, data: tuple[tuple[Array, Array, Array], ...]) -> Array:
-    """Return the unknowns (p,) for which the steady amplitudes have the same shape over speed as those of the runs: a common
-    factor of all amplitudes of a run is free."""
+    """Return the unknowns (p,) with which the steady amplitudes over speed fit those of the runs best. A common factor of all
+    amplitudes of a run is free."""
 
     def residual(x: Array, _: None) -> Array:
         parts = [_PRIOR_WEIGHT * x]
@@ -101,7 +100,11 @@ def _track(unknowns: Unknowns, runs: tuple[Samples, ...], scene: Scene, data: tu
 
 
 def track_orders(problem: Problem) -> np.ndarray:
-    """Return first values of the unknowns from the amplitudes of the runs; those of the scene if there are too few turns."""
+    """Return first values x (p,) of the unknowns from the amplitudes of the runs.
+
+    x is 0, which means the values of the scene, for several unbalances, without unknown numbers of the scene, for runs with too
+    few turns, and if the fit fails.
+    """
     zero = np.zeros(problem.unknowns.count)
     if len(problem.unbalances) > 1 or not len(problem.unknowns.first):
         return zero

@@ -65,7 +65,7 @@ _FINE_ANGLE = 0.2
 _ACCURACY = 1e-5
 """Error of the predicted angle, rad: smallest noise of the rotor's angle in the fit, even if the pulses scatter less."""
 
-_OWN_PASSES = 2
+_JOINT_PASSES = 2
 """Number of fits of vibrations and rotor together: with the scatter of the pulses, then with the noise of the first fit.
 Before the first fit the deviations are mostly a drift of the prediction. A noise filter computed from them would remove this
 drift, and with it the information on the motor."""
@@ -73,13 +73,13 @@ drift, and with it the information on the motor."""
 
 @cached
 def _deviations(
-    unknowns: Unknowns, samples: Samples, rotor: RotorSamples, scene: Scene, x: Array, part: Array, own: Array
+    unknowns: Unknowns, samples: Samples, rotor: RotorSamples, scene: Scene, x: Array, part: Array, rotor_unknowns: Array
 ) -> tuple[Array, Array]:
     """Return the deviations (n,) of the predicted rotor from its samples, in units of their spread, and their derivatives.
 
     **Arguments**: `samples` of the accelerations of the rotor; `x`: see `Unknowns`; `part`: state at the first sample and
-    components of the unbalance; `own`: first angle, first speed, common delay of the pulses in standard errors, offsets of the
-    marks.
+    components of the unbalance; `rotor_unknowns`: first angle, first speed, common delay of the pulses in standard errors,
+    offsets of the marks.
     """
     nonlinear_count = x.shape[0] - unknowns.errors
     delay_error = rotor.scatter if rotor.kind == "pulses" else 0.0
@@ -101,7 +101,7 @@ def _deviations(
             predicted = angle[k] + u * (begin + u * (quadratic + u * cubic)) + offsets[rotor.marks]
         return (predicted - rotor.value) / rotor.spread
 
-    free = jnp.concatenate([x[:nonlinear_count], part, own])
+    free = jnp.concatenate([x[:nonlinear_count], part, rotor_unknowns])
     return deviations(free), jax.jacfwd(deviations)(free)
 
 
@@ -147,7 +147,7 @@ def _predicted(
 def _runge_kutta(
     acceleration: Callable[[Array, Array], Array], begin: Array, end: Array, angle: Array, speed: Array
 ) -> tuple[Array, Array]:
-    """Return angle and speed at the time `end`; a torque that jumps there has not yet jumped."""
+    """Return angle and speed at the time `end`. If the torque jumps at `end`, the torque before the jump is used."""
     h = end - begin
     k1 = acceleration(begin, speed)
     k2 = acceleration(begin + 0.5 * h, speed + 0.5 * h * k1)
@@ -160,14 +160,14 @@ class _Run(NamedTuple):
     """Run of a fit of vibrations and rotor.
 
     **Attributes**: `samples` with smaller steps; `rotor`: samples of the rotor; `places` (f,): places of the run's unknowns
-    among all unknowns; `own`: number of unknowns of this run only (first angle, first speed, delay, offsets of all marks but
-    the first); `noise` of the rotor.
+    among all unknowns; `rotor_count`: number of unknowns of this run's rotor (first angle, first speed, delay, offsets of all
+    marks but the first); `noise` of the rotor.
     """
 
     samples: Samples
     rotor: RotorSamples
     places: np.ndarray
-    own: int
+    rotor_count: int
     noise: Noise
 
 
@@ -180,10 +180,10 @@ class _Trial(NamedTuple):
 
 
 def fit_with_torques(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
-    """Return the fit of a problem from the unknowns `starts`; if a number of a motor is unknown, the vibrations and the speed
-    of the rotor are fitted together.
+    """Return the fit of a problem from the unknowns `starts`.
 
-    The fit is then repeated with the predicted angle of the rotor, which contains its ripple within each turn.
+    If a number of a motor is unknown, the vibrations and the speed of the rotor are fitted together. The fit is then repeated
+    with the predicted angle of the rotor, which contains its ripple within each turn.
     """
     fitted = fit_from(problem, starts)
     motor = [k for k, number in enumerate(problem.unknowns.numbers) if is_of_drive(number)]
@@ -192,9 +192,9 @@ def fit_with_torques(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
     fitted, drives = _with_torque_balance(fitted, motor)
     if not fitted.converged or max(fitted.misfits) > MISFIT:
         return fitted
-    rotors = tuple((own._replace(drive=drive),) for (own,), drive in zip(problem.rotors, drives, strict=True))
+    rotors = tuple((angle._replace(drive=drive),) for (angle,), drive in zip(problem.rotors, drives, strict=True))
     pairs = zip(problem.runs, rotors, strict=True)
-    runs = tuple(dataclasses.replace(samples, drives=(own.without_errors(),)) for samples, (own,) in pairs)
+    runs = tuple(dataclasses.replace(samples, drives=(angle.without_errors(),)) for samples, (angle,) in pairs)
     again = fit_from(problem._replace(rotors=rotors, runs=runs), [fitted.x[: problem.unknowns.count]])
     return _with_torque_balance(again, motor)[0] if again.converged else fitted
 
@@ -205,11 +205,11 @@ def _with_torque_balance(fitted: Fitted, motor: list[int]) -> tuple[Fitted, list
     **Arguments**: `fitted` to the vibrations alone; places of the numbers of the `motor` in x.
     """
     problem, p, size = fitted.problem, fitted.x.size, fitted.x.size + fitted.linear.size
-    runs, own = _runs(fitted)
-    y, all_places = np.concatenate([fitted.x, fitted.linear, own]), np.arange(size + own.size)
+    runs, of_rotors = _runs(fitted)
+    y, all_places = np.concatenate([fitted.x, fitted.linear, of_rotors]), np.arange(size + of_rotors.size)
     y = _minimum(problem, runs, y, np.concatenate([motor, all_places[size:]]).astype(int))[0].y
     converged, information = False, np.zeros((size, size))
-    for _ in range(_OWN_PASSES):
+    for _ in range(_JOINT_PASSES):
         trial, converged = _minimum(problem, runs, y, all_places)
         y, information = trial.y, eliminate(trial.equations[0], all_places[:size])
         runs = [run._replace(noise=_noise(run, _deviations_of(problem, run, y)[0])) for run in runs]
@@ -226,7 +226,7 @@ def _with_torque_balance(fitted: Fitted, motor: list[int]) -> tuple[Fitted, list
 
 
 def _runs(fitted: Fitted) -> tuple[list[_Run], np.ndarray]:
-    """Return the runs of a fit, and first values of their own unknowns."""
+    """Return the runs of a fit, and first values of the unknowns of the rotors."""
     problem, runs, first_values = fitted.problem, [], []
     nonlinear_count, size = fitted.x.size - problem.unknowns.errors, fitted.x.size + fitted.linear.size
     for samples, (angle,), place in zip(problem.runs, problem.rotors, linear_places(problem), strict=True):
@@ -243,21 +243,21 @@ def _runs(fitted: Fitted) -> tuple[list[_Run], np.ndarray]:
         scatter = jnp.asarray(max(rotor.scatter, _ACCURACY / float(np.max(rotor.spread))))
         sampled = {name: jnp.asarray(getattr(rotor, name)[used]) for name in ("time", "value", "marks", "spread")}
         rotor = rotor._replace(**sampled, scatter=scatter)
-        own = [drive.angle_at(samples.begin), drive.speed_at(samples.begin), *np.zeros(1 + int(np.max(rotor.marks)))]
+        of_rotor = [drive.angle_at(samples.begin), drive.speed_at(samples.begin), *np.zeros(1 + int(np.max(rotor.marks)))]
         states = 2 * len(problem.scene.machine.structure().coordinates)
         linear = np.concatenate([place[:states], place[-2 - len(samples.channels) : -len(samples.channels)]])
         places = np.concatenate(
-            [np.arange(nonlinear_count), fitted.x.size + linear, size + len(first_values) + np.arange(len(own))]
+            [np.arange(nonlinear_count), fitted.x.size + linear, size + len(first_values) + np.arange(len(of_rotor))]
         )
-        runs.append(_Run(fine, rotor, places, len(own), Noise(np.ones(1), float(scatter))))
-        first_values += map(float, own)
+        runs.append(_Run(fine, rotor, places, len(of_rotor), Noise(np.ones(1), float(scatter))))
+        first_values += map(float, of_rotor)
     return runs, np.array(first_values)
 
 
 def _parts(problem: Problem, run: _Run, y: np.ndarray) -> list[Array]:
-    """Return x, the state at the first sample with the unbalance, and the unknowns of this run only."""
+    """Return x, the state at the first sample with the unbalance, and the unknowns of the run's rotor."""
     x, linear = y[: problem.unknowns.count], y[run.places[problem.unknowns.count - problem.unknowns.errors :]]
-    return [jnp.asarray(each) for each in (x, linear[: -run.own], linear[-run.own :])]
+    return [jnp.asarray(each) for each in (x, linear[: -run.rotor_count], linear[-run.rotor_count :])]
 
 
 def _deviations_of(problem: Problem, run: _Run, y: np.ndarray) -> list[np.ndarray]:
@@ -268,8 +268,8 @@ def _deviations_of(problem: Problem, run: _Run, y: np.ndarray) -> list[np.ndarra
 
 def _predicted_drive(problem: Problem, run: _Run, rotor: RotorAngle, y: np.ndarray) -> RecordedDrive:
     """Return the drive that follows the predicted angle of a run, with the errors of the recorded angle."""
-    x, part, own = _parts(problem, run, y)
-    time, *found = map(np.asarray, _predicted(problem.unknowns, run.samples, problem.scene, x, part, own[:2]))
+    x, part, of_rotor = _parts(problem, run, y)
+    time, *found = map(np.asarray, _predicted(problem.unknowns, run.samples, problem.scene, x, part, of_rotor[:2]))
     return recorded_drive(time, [np.column_stack([each, rotor.spline(time, k)[:, 1:]]) for k, each in enumerate(found)])
 
 
@@ -308,9 +308,10 @@ def _trial(problem: Problem, runs: list[_Run], y: np.ndarray, free: np.ndarray) 
         both = np.concatenate([slopes, -deviations[:, None]], axis=1) / run.noise.deviation
         white = np.stack([np.convolve(each, taps, mode="valid") for each in both.T], axis=1)
         total[np.ix_(places, places)] += white.T @ white
-        delay_places = np.array([run.places[2 - run.own], y.size])  # the common delay, known as 0 with the standard error 1
+        # The common delay is known as 0 with the standard error 1.
+        delay_places = np.array([run.places[2 - run.rotor_count], y.size])
         row = np.array([1.0, -y[delay_places[0]]])
         total[np.ix_(delay_places, delay_places)] += np.outer(row, row)
-    own = np.ix_(free, free)
-    equations = total[:-1, :-1][own], prior[own], (total[:-1, -1] + gradient)[free]
+    block = np.ix_(free, free)
+    equations = total[:-1, :-1][block], prior[block], (total[:-1, -1] + gradient)[free]
     return _Trial(y, total[-1, -1] + cost, equations)

@@ -98,7 +98,7 @@ Tables: TypeAlias = dict[str, Any]
 def suggest_name(name: str, allowed: list[str], present: Container[str] = ()) -> str:
     """Return the end of an error message about an unknown name: the most similar allowed name, and all allowed names.
 
-    A name that is `present` beside the unknown one is not suggested, because it has its value already.
+    A name that is already `present` in the same table is not suggested.
     """
     similar = difflib.get_close_matches(name, [other for other in allowed if other not in present], n=1)
     question = f"did you mean {similar[0]!r}? " if similar else ""
@@ -209,7 +209,7 @@ def _with_torque_tables(value: Any, folder: Path) -> Any:
 
 @validated
 def save_scene(scene: Scene, path: str | Path) -> Path:
-    """Write a scene file that `load_scene` reads back bit for bit.
+    """Write a scene file from which `load_scene` returns the same scene, bit for bit.
 
     **Arguments**
 
@@ -425,8 +425,8 @@ def _fields_of_kind(section: str, part: Any, kinds: Mapping[str, Callable[..., o
 
 def _exciter_table(exciter: Exciter) -> Tables:
     at = exciter.position if exciter.platform is None else exciter.platform
-    own = {"at": at, "body": exciter.body or None, "unbalance": exciter.unbalance, "unbalance_mass": exciter.unbalance_mass}
-    table = {name: np.asarray(value).tolist() for name, value in own.items() if value is not None}
+    values = {"at": at, "body": exciter.body or None, "unbalance": exciter.unbalance, "unbalance_mass": exciter.unbalance_mass}
+    table = {name: np.asarray(value).tolist() for name, value in values.items() if value is not None}
     parts = {name: part for name in ("loads", "drive") if (part := getattr(exciter, name)) is not None}
     table |= {"direction": exciter.direction, **{name: _part_table(name, part) for name, part in parts.items()}}
     return {**table, "effects": _effect_tables(exciter.effects)} if exciter.effects else table

@@ -187,14 +187,14 @@ class Loads(Part):
 
 
 def ball_radius(loads: Loads, field: str = "loads.ball_radius") -> Array:
-    """Return the radius r of loads that have a size, m. **Raises** `InputError` for others, naming the `field`."""
-    own = getattr(loads, "ball_radius", None)
-    if own is None:
+    """Return the radius r of loads that have a size, m. **Raises** `InputError`, which names the `field`, for other loads."""
+    radius = getattr(loads, "ball_radius", None)
+    if radius is None:
         advice = "give balls or rollers their ball_radius"
         raise InputError(
             field, f"needs loads that roll and have a ball_radius, and these ({quoted(loads.kind)}) have none; {advice}"
         )
-    return own
+    return radius
 
 
 class CircularLoads(Loads):
@@ -324,9 +324,9 @@ def side_by_side(count: int, ratio: Array) -> Array:
 
 def require_side_by_side(count: int, radius: float, ball_radius: float) -> None:
     """**Raises** `InputError` if `count` loads of `ball_radius`, m, have no room side by side on a circle of `radius`, m."""
-    most = radius * (1.0 if count == 1 else math.sin(math.pi / count))
-    if not ball_radius < most:
-        problem = f"{count} side by side on a circle of {radius:.6g} m need a ball_radius below {most:.6g} m"
+    limit = radius * (1.0 if count == 1 else math.sin(math.pi / count))
+    if not ball_radius < limit:
+        problem = f"{count} side by side on a circle of {radius:.6g} m need a ball_radius below {limit:.6g} m"
         raise InputError("loads.ball_radius", f"is {ball_radius:.6g} m; {problem}")
 
 
@@ -398,7 +398,7 @@ def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radi
 def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radius: Number | None = None) -> CircularLoads:
     """Return cylindrical rollers in an annular track, kappa = 3/2.
 
-    **Arguments** as `balls`, with the same equation
+    **Arguments** as for `balls`; the equation is the same
 
     - `count` N; typical: 1 to 4
     - `mass` m, kg; typical: 0.1 to 2
@@ -406,13 +406,13 @@ def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_ra
     - `drag` b_W, N s/m; typical: 0.5 to 5
     - `ball_radius` r of a roller, m; typical: 0.01 to 0.03
 
-    **Returns** `CircularLoads`. **Raises** `InputError` as `balls`.
+    **Returns** `CircularLoads`. **Raises** `InputError` in the cases of `balls`.
 
     >>> import jaxvib as jv
     >>> float(jv.rollers(count=2, mass=1.0, radius=0.1, drag=1.0).inertia_factor())
     1.5
 
-    Source: as `balls`.
+    Source: as for `balls`.
     """
     return _circular("roller", count, mass, radius, drag, None, ball_radius)
 
@@ -420,7 +420,7 @@ def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_ra
 def pendulums(*, count: int, mass: Numbers, radius: Number, drag: Numbers, inertia: Numbers = 0.0) -> CircularLoads:
     """Return pendulums on the shaft, kappa = 1 + J_C/(m R^2).
 
-    **Arguments** as `balls`, with the same equation
+    **Arguments** as for `balls`; the equation is the same
 
     - `count` N; typical: 1 to 4
     - `mass` m, kg; typical: 0.05 to 1
@@ -429,12 +429,12 @@ def pendulums(*, count: int, mass: Numbers, radius: Number, drag: Numbers, inert
       that is mu from 3e-4 to 0.02 N m s at R = 0.08 m
     - `inertia` J_C about the centre of mass, kg m^2 (default 0: a point mass); typical: 0 to 0.5 m R^2
 
-    **Returns** `CircularLoads`. **Raises** `InputError` as `balls`.
+    **Returns** `CircularLoads`. **Raises** `InputError` in the cases of `balls`.
 
     >>> import jaxvib as jv
     >>> float(jv.pendulums(count=1, mass=2.0, radius=0.1, drag=1.0, inertia=0.01).inertia_factor())
     1.5
 
-    Source: as `balls`; on a rotor Artyunin 2013, equation (1).
+    Source: as for `balls`; on a rotor Artyunin 2013, equation (1).
     """
     return _circular("pendulum", count, mass, radius, drag, inertia)

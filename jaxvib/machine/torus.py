@@ -106,13 +106,13 @@ class TorusBalls(Loads):
         c_f and c_a are the slips along the coordinates, 0 for a rolling ball. A ball that does not rotate in space has s = w
         cos a.
         """
-        (_, a), (turn, climb), m, own = u, rate, self.mass, self.ball_radius
+        (_, a), (turn, climb), m, r = u, rate, self.mass, self.ball_radius
         arm, up = self._arm(a), jnp.sin(a)
-        lever = _ROLLING * m * own
+        lever = _ROLLING * m * r
         change = climb * (speed * arm - self.radius * turn)
         if slip is not None:
             change = change + slip[0] * climb - slip[1] * turn * up
-        return DrillingSpin(change / own, (lever * arm * climb, -lever * self.gap * up * turn), lever * own, speed * jnp.cos(a))
+        return DrillingSpin(change / r, (lever * arm * climb, -lever * self.gap * up * turn), lever * r, speed * jnp.cos(a))
 
     def normal_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> NormalForce:
         """Return N against the wall of the tube."""

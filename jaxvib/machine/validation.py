@@ -275,7 +275,7 @@ def _require_valid(key: _SceneKey) -> None:
 
 
 def make_scene(make: Callable[..., Scene], *values: object) -> Scene:
-    """Return the scene that a user's function `make` returns for `values`. **Raises** `InputError` as `validate_scene`.
+    """Return the scene that a user's function `make` returns for `values`. **Raises** the errors of `validate_scene`.
 
     >>> make_scene(lambda x: None, 1.0)
     Traceback (most recent call last):

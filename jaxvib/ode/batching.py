@@ -15,7 +15,7 @@ from jaxtyping import PyTree
 from jaxvib.ode.types import Batched, Tangents
 
 VECTOR = 8
-"""Number of values in a vector register of a processor; the number of tangents is padded to a multiple of it."""
+"""Number of values in a vector register of a processor. The number of tangents is padded to a multiple of this number."""
 
 X = TypeVar("X")
 Out = TypeVar("Out")
@@ -23,11 +23,11 @@ _WithTangents: TypeAlias = Callable[[PyTree, Tangents], tuple[PyTree[Array], Tan
 
 
 def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents], tuple[Out, Tangents]]) -> Callable[[X], Out]:
-    """`function` with forward derivatives by `jvp`, and without reverse derivatives.
+    """Return `function` with forward derivatives by `jvp`, and without reverse derivatives.
 
-    Under `jacfwd` JAX maps the derivative along one tangent over all tangents, whose axis precedes all others. Here `jvp` is
-    called once for all tangents, which lie along a last axis. Every number of the program is then a vector over the tangents,
-    contiguous in memory.
+    Under `jacfwd` JAX maps the derivative along one tangent over all tangents, and their axis is the first one. Here `jvp` is
+    called once for all tangents, and their axis is the last one. Every number of the program is then a vector over the
+    tangents, contiguous in memory.
 
     **Arguments**: `jvp(x, tangents)`: `function(x)` and its tangents; both tangents are `Tangents`.
 
@@ -59,9 +59,9 @@ def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents],
 
 
 def batch_last(function: Callable[[X], Out], batched: Callable[[X, Batched], Out]) -> Callable[[X], Out]:
-    """`function`, which under `vmap` is computed by `batched`; its derivatives of any kind are batched by JAX as usual.
+    """Return `function`, which under `vmap` is computed by `batched`. JAX batches its derivatives of any kind as usual.
 
-    JAX puts the batch before all other axes of the state of a loop. `batched` may keep it as the last axis: every number of the
+    JAX makes the batch the first axis of the state of a loop. `batched` may make the batch the last axis: every number of the
     program is then a vector over the batch, contiguous in memory.
 
     **Arguments**: `batched(x, is_batched)`: `function(x)` for the whole batch. The batch is the last axis of the arrays of x
@@ -101,7 +101,7 @@ def batch_last(function: Callable[[X], Out], batched: Callable[[X, Batched], Out
 
 
 def flat_tangents(tangents: Tangents, like: PyTree) -> list[Array | None]:
-    """Tangents of the leaves of `like`, in order."""
+    """Return the tangents of the leaves of `like`, in order."""
     return jax.tree.structure(like).flatten_up_to(tangents)  # pyright: ignore[reportAttributeAccessIssue]
 
 

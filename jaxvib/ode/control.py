@@ -41,7 +41,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
     - A step whose error is NaN is rejected with e = infinity. If no shorter step advances the time in its dtype, the run ends
       with `diffrax.RESULTS.dt_min_reached`
     - A run with more than `max_steps` steps, rejected ones included, ends with `diffrax.RESULTS.max_steps_reached`. The limit
-      is an input of the program, so that another limit needs no other program
+      is an input of the compiled program, which serves all limits
 
     **Attributes**
 
@@ -136,10 +136,14 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         return accept, start, end, False, (root, steps_left), result
 
 
-def step_success(accept: BoolScalarLike, start: RealScalarLike, before: RealScalarLike, end: RealScalarLike) -> diffrax.RESULTS:
-    """Return the outcome of a step: after a rejected step from `start` to `before`, the next step, which ends at `end`, must be
-    shorter."""
-    shorter = (end > start) & (end < before)
+def step_success(
+    accept: BoolScalarLike, start: RealScalarLike, last_end: RealScalarLike, end: RealScalarLike
+) -> diffrax.RESULTS:
+    """Return the outcome of a step that ended at `last_end`.
+
+    After a rejected step, the next step from `start` to `end` must be shorter: `end` must lie between `start` and `last_end`.
+    """
+    shorter = (end > start) & (end < last_end)
     return diffrax.RESULTS.where(accept | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)
 
 
@@ -150,7 +154,7 @@ class WrappedController(diffrax.AbstractAdaptiveStepSizeController):
 
     @property
     def rtol(self) -> RealScalarLike:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Tolerance of an implicit method; 0 if the inner controller has none, such as that of constant steps."""
+        """Tolerance of an implicit method; 0 if the inner controller has no tolerance, for example with constant steps."""
         return getattr(self.controller, "rtol", 0.0)
 
     @property

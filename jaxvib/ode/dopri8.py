@@ -101,7 +101,7 @@ class Dopri8Interpolation(StepInterpolation):
         return self.from_weights(share * span * weights)
 
     def from_weights(self, weights: Array) -> Y:
-        """y0 + sum_j weights_j k_j."""
+        """Return y0 + sum_j weights_j k_j."""
         return jax.tree.map(lambda y, change: y + change, self.y0, unravel(linear_combination(weights, self.stages), self.y0))
 
 
@@ -154,13 +154,13 @@ class UnrolledDopri8(AbstractDopri8):
     """Dormand and Prince's pair of order 8(7), its 13 stages and the rates at the end of a step written out one after another.
 
     The results are those of `diffrax.Dopri8`. There is no loop over stages and no array of stages, so that a small time loop
-    compiles into one piece of code. Each stage is fenced; otherwise XLA's fusion recomputes each stage for each use, and a
-    step of 900 multiplications needs 4500.
+    compiles into one piece of code. Each stage is fenced. Without the fences, XLA's fusion recomputes each stage for each use,
+    and a step of 900 multiplications needs 4500.
 
-    Compilation takes longer than for `LoopDopri8`, with derivatives several times as long.
+    Compilation takes longer than for `LoopDopri8`; with derivatives it takes several times as long.
 
-    A state of one vector takes less time than a tuple of scalars: the compiled step moves fewer values to and from memory. For
-    a batch, whose entries are arrays over many runs, a tuple of them takes less time.
+    For a single run, a state of one vector takes less time than a tuple of scalars: the compiled step moves fewer values to and
+    from memory. For a batch, a tuple of arrays over the runs takes less time than one array.
 
     **Arguments**: `wrap`: function that is applied to the state after each step, for example to remove whole turns from angles.
 

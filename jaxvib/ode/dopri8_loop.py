@@ -49,17 +49,17 @@ Numbers = TypeVar("Numbers", Array, tuple[Array, Array])
 
 
 class LoopDopri8(AbstractDopri8):
-    """Same method as `UnrolledDopri8` with a loop over the stages, which compiles in a fraction of the time.
+    """Method of `UnrolledDopri8` with a loop over the stages. It compiles in a fraction of the time.
 
-    Its program contains the equations once, for all stages.
+    The program of the loop contains the equations once, for all stages.
 
     **Arguments**
 
     - `tangents`: True if only forward derivatives are needed. The derivatives of a step are then computed along all tangents at
       once; eight tangents cost little more than one
     - `reuse`: True to use the last stage of a step as the first one of the next step, which saves one of fourteen evaluations.
-      The start of the loop is then known at run time only; therefore diffrax's adjoints cannot compute reverse derivatives. The
-      derivatives of `jaxvib.ode.replay` are not affected
+      The first stage of the loop is then known at run time only; therefore diffrax's adjoints cannot compute reverse
+      derivatives. The derivatives of `jaxvib.ode.replay` are not affected
     - `wrap` as in `UnrolledDopri8`
 
     >>> import diffrax, jax, jax.numpy as jnp
@@ -122,7 +122,7 @@ def _linear_combination_batched(inputs: tuple[Array, Array], is_batched: tuple[b
 
 
 class _BatchedInterpolation(Dopri8Interpolation):
-    """`Dopri8Interpolation` with its own rules for derivatives and batches."""
+    """`Dopri8Interpolation` with special rules for derivatives and batches."""
 
     combine: Callable[[tuple[Array, Array]], Array] = eqx.field(static=True)
 
@@ -148,7 +148,7 @@ def _advance(inputs: _Inputs) -> _Step:
 
 
 def _advance_batched(inputs: _Inputs, is_batched: Batched) -> _Step:
-    """`_advance` for a batch along a last axis."""
+    """Compute `_advance` for a batch along a last axis."""
     t0, dt, y0, known, args, terms = inputs
     t0_batched, dt_batched, y0_batched, known_batched, *others_batched = is_batched
     leaves, rest = jax.tree.flatten((t0, dt, args, terms))
@@ -183,7 +183,7 @@ _advance_batch_last = batch_last(_advance, _advance_batched)
 
 
 def _advance_jvp(inputs: _Inputs, tangents: Tangents) -> tuple[_Step, _Step]:
-    """`_advance` with the tangents of its results."""
+    """Compute `_advance` with the tangents of its results."""
     t0, dt, y0, known, args, terms = inputs
     dt0, ddt, dy0, dknown, *others = tangents
     leaves, rest = jax.tree.flatten((t0, dt, args, terms))
@@ -221,7 +221,7 @@ def _advance_jvp(inputs: _Inputs, tangents: Tangents) -> tuple[_Step, _Step]:
 
 
 def _weighted_sum(weights: Array | np.ndarray, stages: Array) -> Array:
-    """Sum of weights_j stages_j, unrolled, which is faster than a product in a loop."""
+    """Return sum_j weights_j stages_j as an unrolled sum, which in a loop is faster than a matrix product."""
     if isinstance(weights, np.ndarray):
         return functools.reduce(operator.add, (weights[j].astype(stages.dtype) * stages[j] for j in np.flatnonzero(weights)))
     return _written_sum(weights.astype(stages.dtype), stages)

@@ -21,10 +21,10 @@ class StepInterpolation(diffrax.AbstractLocalInterpolation):
 
     @abc.abstractmethod
     def at(self, share: Array, span: Array) -> Y:
-        """State at the fraction `share` of a step of length `span`."""
+        """Return the state at the fraction `share` of a step of length `span`."""
 
     def evaluate(self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True) -> Y:
-        """State at `t0`, or its change from `t0` to `t1`."""
+        """Return the state at `t0`; if `t1` is given, return the change of the state from `t0` to `t1`."""
         if t1 is not None:
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
         span = self.t1 - self.t0

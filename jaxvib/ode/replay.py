@@ -40,9 +40,9 @@ def solve(
     """Integrate by `diffrax.diffeqsolve` from time 0 to `end`; a failure is reported in the result, not raised.
 
     Reverse derivatives replay the steps that the run has taken. If the controller chose the steps again in the backward pass,
-    rounding would change them: after some hundred turns the steps would differ, and the derivatives would be inconsistent
-    (errors up to 1e-3). Therefore a run that is differentiated records the end of each step and some of the states. The
-    backward pass recomputes the states in between and transposes each step separately, from the last one to the first:
+    these steps would differ by rounding errors. After some hundred turns, the derivatives would not match the run (errors up to
+    1e-3). Therefore a run that is differentiated records the end of each step and some of the states. The backward pass
+    recomputes the states between the recorded states and transposes each step separately, from the last one to the first:
 
         (y_i+1, dense_i) = step(y_i, t_i, t_i+1, numbers),    saved(t) = within(dense_i, t_i, t_i+1, t)
 

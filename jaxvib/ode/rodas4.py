@@ -56,7 +56,7 @@ class _Interpolation(StepInterpolation):
 
         y = (1 - s) y0 + s (y1 + (1 - s) (c_0 + s c_1))
 
-    It does not use the rates at the ends of a step, which are not accurate for stiff equations.
+    The interpolation does not use the rates at the ends of a step, because these are not accurate for stiff equations.
     """
 
     y0: Array
@@ -70,7 +70,7 @@ class _Interpolation(StepInterpolation):
 
 class Rodas4(diffrax.AbstractAdaptiveSolver):
     """Hairer and Wanner's RODAS: a Rosenbrock method of order 4 with 6 stages, an embedded method of order 3 for the error
-    estimate, and its own interpolant. The method is L-stable and stiffly accurate.
+    estimate, and an interpolant of order 3. The method is L-stable and stiffly accurate.
 
         (1/(gamma h) - J) k_i = f(t + c_i h, y + sum_j a_ij k_j) + sum_j (c_ij / h) k_j + h d_i df/dt,   y_new = y + sum b_i k_i
 
@@ -116,7 +116,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
     ) -> StepResult:
         """Compute a step from t0 to t1."""
         h = t1 - t0
-        # A step that only fills up an array has the length 0; 1/h must not divide by 0.
+        # Arrays of steps are filled up with steps of length 0; 1/h must not divide by 0.
         per_step = 1.0 / jnp.where(h == 0.0, 1.0, h)
         shifted_inverse, time_derivative = (self.linearize or _dense_linearization)(terms, t0, y0, args)
         solve = shifted_inverse(per_step / _GAMMA)

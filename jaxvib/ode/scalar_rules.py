@@ -46,22 +46,22 @@ def to_scalars(value: ArrayLike) -> Scalars:
 
 
 def is_known(x: Scalar) -> bool:
-    """True if `x` is a constant of the program."""
+    """Return True if `x` is a constant of the program."""
     return isinstance(x, (np.generic, int, float, bool))
 
 
 def _is_zero(x: Scalar) -> bool:
-    """True if `x` is a 0 of the program itself, such as an entry of an identity matrix or of a direction of a derivative.
+    """Return True if `x` is a 0 that is a constant of the program, such as an entry of an identity matrix or of a tangent.
 
-    A product with it, and the operations that only this product needs, are left out. The result is then 0 even if the other
-    factor is infinite or NaN, for which the program on arrays would give NaN. The zeros of parameters and states of a scene
-    are traced, and are multiplied.
+    A product with this 0, and the operations that only this product needs, are left out. The result is then 0 even if the other
+    factor is infinite or NaN, for which the program on arrays would give NaN. Parameters and states of a scene are traced;
+    products with their zeros are computed.
     """
     return is_known(x) and x == 0
 
 
 class ComplexParts:
-    """Complex number as its two parts. One of them is often a known 0, with which XLA would multiply."""
+    """Complex number as its two parts. One of the parts is often a known 0; XLA would compute the products with it."""
 
     __slots__ = ("imag", "real")
 
@@ -276,7 +276,8 @@ def inlined() -> tuple[Primitive, ...]:
 def rules() -> dict[Primitive, Rule]:
     """The rule of each primitive that has one; primitives are found by tracing public functions, not by their names.
 
-    A function that consists of several operations in another version of JAX has no rule; programs with it stay on arrays.
+    A function that consists of several operations in another version of JAX has no rule. Programs with this function are not
+    rewritten on scalars.
     """
     x, v, yes = np.float32(1.0), np.ones((2, 2), np.float32), np.True_
     z = np.complex64(1.0)

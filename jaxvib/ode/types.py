@@ -23,7 +23,7 @@ Y: TypeAlias = PyTree[Array]
 """State of the integration, as any tree of arrays; its errors and changes are trees of the same structure."""
 
 VF: TypeAlias = PyTree[Array]
-"""The rates of a state: a tree like it."""
+"""The rates of a state: a tree with the structure of the state."""
 
 Args: TypeAlias = PyTree
 """Arguments of a vector field in addition to the time and the state."""
@@ -42,8 +42,9 @@ Norm: TypeAlias = Callable[[PyTree[Array]], RealScalarLike]
 """The size of a tree of numbers."""
 
 Tangents: TypeAlias = PyTree[Array | None]
-"""A tree like that of primal values, each array with a last axis over the tangent directions; None if all of them are 0."""
+"""A tree with the structure of the primal values. Each array has a last axis over the tangent directions; None replaces an
+array of zeros."""
 
 Batched: TypeAlias = PyTree[bool]
-"""A tree like that of values, with True for each value that has an axis over the batch (`in_batched` of
+"""A tree with the structure of some values: True for each value that has an axis over the batch (`in_batched` of
 `jax.custom_batching.custom_vmap`)."""

@@ -67,7 +67,8 @@ def animate(
     - `motion`: a `Run`, or an `Orbit` together with its `scene`
     - `path` of the file: a GIF (".gif") or one HTML page with embedded pictures (".html"); None writes no file
     - `begin`, `end`: the part that is shown, s or text; default: the last four periods of a run, or four periods of an orbit
-    - `seconds`: duration of the film; typical: 5 to 10; default: the rotor turns by about a tenth of a turn between pictures
+    - `seconds`: duration of the film; typical: 5 to 10; default: a duration with which the rotor turns by about a tenth of a
+      turn between pictures, at most 600 pictures
     - `fps`: pictures per second; typical: 20 (the default)
     - `magnify`: magnification of displacements relative to the circle of the loads, which the picture states; typical: 1 to 50;
       default: a factor with which the largest displacement is clearly visible

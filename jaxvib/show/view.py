@@ -42,7 +42,7 @@ def spring_text(stiffness: float, damping: float) -> str:
 
 
 class View(abc.ABC):
-    """Drawing of a scene in its own units of length.
+    """Drawing of a scene in units of the drawing.
 
     **Attributes**: `limits` (left, right, bottom, top) of the drawing; `scale`: units of the drawing per metre.
     """

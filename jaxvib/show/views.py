@@ -30,13 +30,13 @@ class Tie(NamedTuple):
     damping: float = 0.0
 
     @property
-    def exciter(self) -> bool:
+    def is_exciter(self) -> bool:
         """True if the tie represents the exciter."""
         return self.low == self.high
 
 
 def order_of_ties(ties: list[Tie], levels: int) -> list[int]:
-    """Return an order of the ties from left to right with which few ties cross other platforms and the platforms are short.
+    """Return an order of the ties from left to right in which few ties cross other platforms, and the platforms are short.
 
     Pairs of ties are swapped until no swap is an improvement.
 
@@ -81,18 +81,20 @@ class PlatformView(RotorView):
         super().__init__(scene, 0.6)
         n = self.mass.shape[0]
         self.rows = [np.asarray(scene.machine.rows_at(level))[0] for level in range(1, n + 1)]
-        self.exciter = int(np.argmax(self.rows @ np.asarray(self.mount.rows[0])[0])) + 1
+        self.exciter_level = int(np.argmax(self.rows @ np.asarray(self.mount.rows[0])[0])) + 1
         self.ties = [
             Tie(0, i + 1, float(self.foundation_stiffness[0, i]), float(self.foundation_damping[0, i])) for i in range(n)
         ]
         self.ties += [
             Tie(i + 1, j + 1, float(-self.stiffness[i, j]), float(-self.damping[i, j])) for j in range(n) for i in range(j)
         ]
-        self.ties = [tie for tie in self.ties if tie.stiffness > 0.0 or tie.damping > 0.0] + [Tie(self.exciter, self.exciter)]
+        self.ties = [tie for tie in self.ties if tie.stiffness > 0.0 or tie.damping > 0.0] + [
+            Tie(self.exciter_level, self.exciter_level)
+        ]
         order = order_of_ties(self.ties, n)
-        widths = [2.0 * self.wheel.rim + 0.2 if self.ties[k].exciter else self.lane for k in order]
+        widths = [2.0 * self.wheel.rim + 0.2 if self.ties[k].is_exciter else self.lane for k in order]
         starts = np.concatenate([[0.0], np.cumsum(widths)])
-        self.x = {k: float(starts[p] + (0.5 * widths[p] if self.ties[k].exciter else 0.45)) for p, k in enumerate(order)}
+        self.x = {k: float(starts[p] + (0.5 * widths[p] if self.ties[k].is_exciter else 0.45)) for p, k in enumerate(order)}
         self.spans = []
         for level in range(1, n + 1):
             places = [p for p, k in enumerate(order) if level in (self.ties[k].low, self.ties[k].high)]
@@ -107,7 +109,7 @@ class PlatformView(RotorView):
         """Return the foundation, the springs and dampers, the platforms, the exciter."""
         parts = [Part(ground((-0.2, 0.0), (self.width, 0.0)), FOUNDATION)]
         for k, tie in enumerate(self.ties):
-            if not tie.exciter:
+            if not tie.is_exciter:
                 low, high = (self._height(level, pose, reach) for level in (tie.low, tie.high))
                 low += 0.5 * self.thick if tie.low else 0.0
                 length = (tie.high - tie.low) * self.pitch - self.thick
@@ -116,20 +118,24 @@ class PlatformView(RotorView):
         for level, (left, right) in enumerate(self.spans, start=1):
             y = self._height(level, pose, reach)
             parts.append(Part(box(left, right, y - 0.5 * self.thick, y + 0.5 * self.thick), BODY, True))
-        return parts + self.wheel.parts((self.x[len(self.ties) - 1], self._height(self.exciter, pose, reach)), pose.rotors[0])
+        return parts + self.wheel.parts(
+            (self.x[len(self.ties) - 1], self._height(self.exciter_level, pose, reach)), pose.rotors[0]
+        )
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Return the masses on the platforms and the values beside the springs."""
         texts = []
         for k, tie in enumerate(self.ties):
-            if not tie.exciter:
+            if not tie.is_exciter:
                 middle = 0.5 * self.pitch * (tie.low + tie.high if tie.high - tie.low == 1 else 2 * tie.high - 1)
                 place = (self.x[k] + 0.42, middle)
                 texts.append(Text(*place, spring_text(tie.stiffness, tie.damping), {"va": "center", "fontsize": "small"}))
         for level, (left, right) in enumerate(self.spans, start=1):
             # The text is on the longer piece of the platform beside the exciter.
             x = self.x[len(self.ties) - 1]
-            edges = [(left, x - self.wheel.rim), (x + self.wheel.rim, right)] if level == self.exciter else [(left, right)]
+            edges = (
+                [(left, x - self.wheel.rim), (x + self.wheel.rim, right)] if level == self.exciter_level else [(left, right)]
+            )
             a, b = max(edges, key=lambda edge: edge[1] - edge[0])
             text = f"M{level} = {value_text(float(self.mass[level - 1, level - 1]), 'kg')}"
             place = (0.5 * (a + b), self._height(level, pose, reach))
@@ -218,9 +224,10 @@ class FrontView(RotorView):
         return [(0.0, -2.4), (-2.7, 0.0)]
 
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """Return the vertical component of T_K q + T_C q' as force on the foundation, the horizontal one as force on the wall.
+        """Return the forces on the foundation and on the wall.
 
-        T_K is `foundation_stiffness`, T_C is `foundation_damping`.
+        The force on the foundation is the vertical component of T_K q + T_C q'; the force on the wall is the horizontal
+        component. T_K is `foundation_stiffness`, T_C is `foundation_damping`.
         """
         force = self.foundation_stiffness @ pose.displacement + self.foundation_damping @ pose.velocity
         return np.array([[0.0, force[1]], [force[0], 0.0]])
@@ -235,11 +242,11 @@ class ShaftView(RotorView):
 
     def __init__(self, scene: Scene):
         super().__init__(scene, 0.8)
-        self.stands = scene.machine.shaft_supports() or []
+        self.shaft_supports = scene.machine.shaft_supports() or []
         self._rows = functools.cache(lambda s: np.asarray(scene.machine.rows_at(s)))
         loads = scene.exciter.loads
         self.stations = np.asarray(self.mount.distances(1 if loads is None else loads.count), float)
-        all_places = [0.0, *self.stations, *(s for s, _, _ in self.stands)]
+        all_places = [0.0, *self.stations, *(s for s, _, _ in self.shaft_supports)]
         low, high = min(all_places), max(all_places)
         half = 0.5 * (high - low) or 0.1
         self.middle, self.along = 0.5 * (low + high), 2.6 / half
@@ -255,7 +262,7 @@ class ShaftView(RotorView):
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """Return foundation, supports, shaft and body, a disc with loads at each station, and the rotor seen along its axis."""
         parts = [Part(ground((-3.2, -2.2), (3.2, -2.2)), FOUNDATION)]
-        for s, k, c in self.stands:
+        for s, k, c in self.shaft_supports:
             parts += tie_parts((self._x(s), -2.2), (self._x(s), self._y(s, pose, reach)), k, c)
         ends = [self.middle - 3.1 / self.along, self.middle + 3.1 / self.along]
         line = np.array([[self._x(s), self._y(s, pose, reach)] for s in ends])
@@ -284,7 +291,7 @@ class ShaftView(RotorView):
         if gyroscopic is not None:
             inertia += f"\nC = {value_text(float(np.max(np.abs(np.asarray(gyroscopic)))), 'kg m²')}"
         texts = [Text(self._x(0.0), 0.45, inertia, {**small, "ha": "center", "va": "bottom"})]
-        for s, k, c in self.stands:
+        for s, k, c in self.shaft_supports:
             text = f"{spring_text(k, c)}\nat {1e3 * s:+.4g} mm"
             right = s >= 0.0
             place = self._x(s) + (0.42 if right else -0.42)
@@ -297,15 +304,15 @@ class ShaftView(RotorView):
 
     def supports(self) -> list[tuple[float, float]]:
         """Return the lower ends of the supports."""
-        return [(self._x(s), -2.2) for s, _, _ in self.stands]
+        return [(self._x(s), -2.2) for s, _, _ in self.shaft_supports]
 
     def support_forces(self, pose: Pose) -> np.ndarray:
         """Return the upward component of k x + c x' of each support, which is visible from the side."""
-        rows = [self._rows(s)[1] for s, _, _ in self.stands]
+        rows = [self._rows(s)[1] for s, _, _ in self.shaft_supports]
         return np.array(
             [
                 [0.0, k * row @ pose.displacement + c * row @ pose.velocity]
-                for row, (_, k, c) in zip(rows, self.stands, strict=True)
+                for row, (_, k, c) in zip(rows, self.shaft_supports, strict=True)
             ]
         ).reshape(-1, 2)
 

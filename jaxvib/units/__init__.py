@@ -1,4 +1,4 @@
-"""Conversion to SI units, and checks, of the values that users pass. Texts and figures convert back, see `jaxvib.display`."""
+"""Conversion of the values that users pass to SI units, and checks of these values. `jaxvib.display` converts results back."""
 
 from __future__ import annotations
 
@@ -135,10 +135,10 @@ def number(
 
 
 def known_number(value: Number, unit: str, field: str, *, low: float = -math.inf, open_low: bool = False) -> Any:
-    """Return one number like `number`, but as a NumPy array unless it is a JAX array already.
+    """Return one number as `number` does; a number that is not a JAX array is returned as a NumPy array.
 
-    A compiled program that is called with a NumPy array copies it to the device itself, in a tenth of the time that a separate
-    copy before the call takes.
+    A compiled program that is called with a NumPy array copies this array to the device. A separate copy before the call takes
+    ten times as long.
     """
     return _number(value, unit, field, Bounds(low, open_low))
 
@@ -208,7 +208,7 @@ def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], boun
 
 
 def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], bounds: Bounds) -> Array | np.ndarray:
-    """Return the checked value in SI; NumPy converts a value that is not a JAX array, which avoids a compilation by JAX."""
+    """Return the checked value in SI. NumPy converts a value that is not a JAX array; JAX would compile a program for it."""
     try:
         if isinstance(value, jax.Array):
             array = jnp.asarray(value, dtype=float)
@@ -230,7 +230,7 @@ _MAX_COUNT = 2**31 - 1
 
 
 def count(value: object, field: str, *, low: int = 1, each: float = 0.0) -> int:
-    """Return a whole number of objects, at least `low`, each of which needs `each` bytes.
+    """Return a whole number of objects, at least `low`; one object needs `each` bytes.
 
     **Raises** `InputError` for any other value, and if the objects need more than half of this machine's memory.
 
@@ -262,18 +262,18 @@ def random_numbers(seed: object) -> np.random.Generator:
     return np.random.default_rng(count(seed, "seed", low=0))
 
 
-def validate_tolerance(value: float, name: str, dtype: np.dtype, least: float) -> float:
-    """Return a tolerance or an accuracy; it must be at least `least` times the rounding unit of the precision `dtype`.
+def validate_tolerance(value: float, name: str, dtype: np.dtype, roundings: float) -> float:
+    """Return a tolerance or an accuracy, which must be at least `roundings` rounding units of the precision `dtype`.
 
     **Raises** `InputError` for other values.
     """
     precision = float(jnp.finfo(dtype).eps)
     is_python_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not (is_python_number and least * precision <= value < 1.0):
+    if not (is_python_number and roundings * precision <= value < 1.0):
         # 5 % more, so that the value in the message, rounded to two digits, is allowed.
         raise InputError(
             name,
-            f"is {quoted(value)}; in {dtype} it must be at least {1.05 * least * precision:.2g} and less than 1"
+            f"is {quoted(value)}; in {dtype} it must be at least {1.05 * roundings * precision:.2g} and less than 1"
             + ("" if is_python_number else ", a Python number such as 1e-6")
             + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
         )

@@ -59,8 +59,9 @@ _TAIL = re.compile(r"^(?P<name>.+?)[\s_.:-]+(?P<tail>[^\W_]+|°)$")
 
 
 def unit_factor(unit: str, si: str) -> float | None:
-    """Return the factor from a unit in the head of a column, or from a multiple of a unit, to an SI unit; None for another
-    dimension or an unknown unit.
+    """Return the factor from a unit in the head of a column, or from a multiple of a unit, to an SI unit.
+
+    The result is None for a unit of another dimension and for an unknown unit.
 
     >>> unit_factor("G", "m/s^2"), unit_factor("mm/s", "m/s"), unit_factor("mm", "N"), unit_factor("50 kN", "N")
     (9.80665, 0.001, None, 50000.0)

@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def is_known(*trees: PyTree) -> bool:
-    """Return True if no value in the trees is traced. Modules that plan a computation call it once per computation.
+    """Return True if no value in the trees is traced. Modules that plan a computation call this function once.
 
     >>> is_known({"mass": 1.0}, None)
     True
@@ -34,7 +34,7 @@ def when_known(check: Callable[..., T], *values: PyTree) -> T | None:
 
 
 def require_if_known(allowed: Callable[..., object], *values: PyTree, field: str, problem: str) -> None:
-    """Raise `InputError` if `allowed(*values)` is not true of known values; `problem` is formatted with the values.
+    """Raise `InputError` if the values are known and `allowed(*values)` is False; `problem` is formatted with the values.
 
     >>> require_if_known(lambda gap, tube: gap < tube, 1.0, 2.0, field="gap", problem="is {:g} m; the tube has {:g} m")
     """

@@ -65,7 +65,8 @@ _JOINED = {
     "kgm": "kg m",
     "kgmm": "kg mm",
 }
-"""Products that are often written without a space. Without this list, pint would read "Nm" as a number of meters per gram."""
+"""Products that are often written without a space. Without this list, pint would read "Nm" as `number_meter`, meters per
+gram."""
 
 _JOINED_PATTERN = re.compile(rf"(?<![^\W\d_])({'|'.join(_JOINED)})((?:\^|\*\*)\d|[²³])?(?![^\W\d_])")
 
@@ -94,7 +95,7 @@ def _example(unit: str) -> str:
 
 
 def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray | np.number:
-    """Return the SI magnitude of `value` in `unit`; numbers without a unit are taken to be in `unit`.
+    """Return the magnitude of `value` in the SI unit `unit`; a number without a unit is already in `unit`.
 
     Strings and pint quantities are converted. If `unit` contains an angle, a frequency in hertz counts as revolutions per
     second (pint alone would convert 25 Hz to 25 rad/s), "1500 1/min" is 1500 rpm, and 1/s without an angle raises an error.

@@ -25,9 +25,11 @@ def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.nda
     - `unit`: SI unit of the returned numbers, such as "N/m", "rad/s", "N m"
     - `column`: name of the column; default: the only column with a unit of this dimension; typical: "rate"
 
-    **Returns** an array with a number for each row that has one. It can be used as `choices` of a design or as an argument of
-    `TorqueTable`. **Raises** `InputError` for a file that cannot be read, a column that is missing or not unique, a unit of
-    another dimension, and a cell that is not a number.
+    **Returns** the numbers of the column as an array; rows with an empty cell are left out. The array can be used as `choices`
+    of a design or as an argument of `TorqueTable`.
+
+    **Raises** `InputError` for a file that cannot be read, a column that is missing or not unique, a unit of another dimension,
+    and a cell that is not a number.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "springs.csv"
@@ -37,14 +39,14 @@ def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.nda
     """
     head, *rows = _rows(path)
     names = [split_head(each, unit) for each in head]
-    matching = [k for k, (name, own) in enumerate(names) if _matches(head[k], name, own, unit, column)]
+    matching = [k for k, (name, head_unit) in enumerate(names) if _matches(head[k], name, head_unit, unit, column)]
     if len(matching) != 1:
         wanted = f"with a unit such as {unit}" if column is None else f"{quoted(column)}"
         problem = f"has {len(matching) or 'no'} columns {wanted}"
         raise InputError(str(path), f"{problem}; name one as column, the columns are: {', '.join(map(quoted, head))}")
     (k,) = matching
-    own = names[k][1]
-    factor = 1.0 if not unit and own in ("", "-") else unit_factor(own, unit) if own else None
+    head_unit = names[k][1]
+    factor = 1.0 if not unit and head_unit in ("", "-") else unit_factor(head_unit, unit) if head_unit else None
     if factor is None:
         raise InputError(str(path), f"has the column {quoted(head[k])} without a unit of {unit}; write {names[k][0]} ({unit})")
     cells = [(line, row[k].strip()) for line, row in enumerate(rows, 2) if len(row) > k and row[k].strip()]
@@ -53,14 +55,14 @@ def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.nda
     return np.asarray([factor * _number(cell, f"{path}, row {line}") for line, cell in cells])
 
 
-def _matches(head: str, name: str, own: str, unit: str, column: str | None) -> bool:
+def _matches(head: str, name: str, head_unit: str, unit: str, column: str | None) -> bool:
     if column is not None:
         return column.strip().lower() in (head.lower(), name.lower())
-    return bool(own) and unit_factor(own, unit) is not None
+    return bool(head_unit) and unit_factor(head_unit, unit) is not None
 
 
 def _rows(path: str | Path) -> list[list[str]]:
-    """Return the rows of a CSV file, whose cells have a decimal point."""
+    """Return the rows of a CSV file. Decimal commas in the cells are replaced by decimal points."""
     text = read_text(path, "a CSV file")
     first = text.split("\n", 1)[0]
     separator = max(";\t,", key=lambda each: (first.count(each) > 0, each != ","))

@@ -198,9 +198,9 @@ def test_texts_of_more_than_16_mb_are_refused(tmp_path):
 def test_a_text_of_the_allowed_size_is_read_whole(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("0123456789")
-    assert read_text(path, "a file", most=10) == "0123456789"
+    assert read_text(path, "a file", max_bytes=10) == "0123456789"
     with pytest.raises(jv.InputError, match="is larger than 0 MB; give the path of a file"):
-        read_text(path, "a file", most=9)
+        read_text(path, "a file", max_bytes=9)
 
 
 def test_control_characters_never_reach_a_message(tmp_path):

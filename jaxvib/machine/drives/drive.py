@@ -107,17 +107,17 @@ class Directed(Drive):
     def _directed(self, value: Array) -> Array:
         return -value if self.direction is None else self.direction * value
 
-    def _own(self, rotor: Rotor) -> Rotor:
-        """Return the states of the rotor as `drive` sees them."""
+    def _undirected(self, rotor: Rotor) -> Rotor:
+        """Return the states of the rotor with the signs of `drive`."""
         return None if rotor is None else (self._directed(rotor[0]), self._directed(rotor[1]), *rotor[2:])
 
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
         """Return the speed of the drive in the direction."""
-        return self._directed(self.drive.rotor_speed(t, self._own(rotor)))
+        return self._directed(self.drive.rotor_speed(t, self._undirected(rotor)))
 
     def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
         """Return the angle of the drive in the direction."""
-        return self._directed(self.drive.rotor_angle(t, self._own(rotor)))
+        return self._directed(self.drive.rotor_angle(t, self._undirected(rotor)))
 
     def rotor_acceleration(self, t: Array) -> Array | None:
         """Return the acceleration of the drive in the direction."""

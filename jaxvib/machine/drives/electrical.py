@@ -33,12 +33,12 @@ class NamePlateMotor(Motor):
 
     Kloss's formula gives less torque at standstill than most cage motors have. Their bars are deep or double, so that the
     resistance of the rotor, to which s_b is proportional, grows with the frequency of its currents. With a `starting_ratio`,
-    s_b in the last formula is replaced at slips s above it by
+    s_b in the last formula is replaced, at slips s above s_b, by
 
         s_b + (s - s_b) (1/u - s_b) / (1 - s_b),    u = r + sqrt(r^2 - 1),    r = breakdown_ratio / starting_ratio
 
-    The torque decreases from T_b at the slip s_b to `starting_ratio` T_r at standstill; below s_b it does not change. A saddle
-    between (pull-up torque) is not included.
+    The torque then decreases from T_b at the slip s_b to `starting_ratio` T_r at standstill; at slips below s_b it does not
+    change. A minimum of the torque between standstill and s_b (pull-up torque) is not included.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -99,9 +99,9 @@ class NamePlateMotor(Motor):
         self.kind = "name_plate_motor"
         when_known(_require_plate, self.rated_speed, self.frequency, self.breakdown_ratio, self.speed, self.breakdown_slip)
         if starting_ratio is not None:
-            least = self.torque(jnp.zeros_like(self.speed)) * self.rated_speed / self.power
+            kloss_ratio = self.torque(jnp.zeros_like(self.speed)) * self.rated_speed / self.power
             self.starting_ratio = read_numbers(NamePlateMotor, "drive", starting_ratio=starting_ratio)["starting_ratio"]
-            when_known(_require_starting_ratio, self.starting_ratio, least, self.breakdown_ratio)
+            when_known(_require_starting_ratio, self.starting_ratio, kloss_ratio, self.breakdown_ratio)
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -132,11 +132,11 @@ class NamePlateMotor(Motor):
         return kloss_torque(slip, largest, breakdown_slip)
 
 
-def _require_starting_ratio(ratio: float, least: float, most: float) -> None:
+def _require_starting_ratio(ratio: float, low: float, high: float) -> None:
     """**Raises** `InputError` for a starting torque below that of Kloss's formula or above the breakdown torque."""
-    if not least * (1.0 - 1e-6) <= ratio < most:
+    if not low * (1.0 - 1e-6) <= ratio < high:
         problem = (
-            f"is {ratio:.4g}; it must be at least {least:.4g}, that of Kloss's formula, and below breakdown_ratio {most:.4g}"
+            f"is {ratio:.4g}; it must be at least {low:.4g}, that of Kloss's formula, and below breakdown_ratio {high:.4g}"
         )
         raise InputError("drive.starting_ratio", f"{problem}; leave it out, or give a torque_table")
 

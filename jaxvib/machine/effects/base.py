@@ -46,7 +46,7 @@ def terms_of(effects: Iterable[Effect], *kinds: type[T]) -> list[T]:
 
 
 def has_term(effects: Iterable[Effect], *kinds: type[Term]) -> bool:
-    """True if an effect adds a term of one of these `kinds`."""
+    """Return True if an effect adds a term of one of these `kinds`."""
     return bool(terms_of(effects, *kinds))
 
 
@@ -60,7 +60,7 @@ def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
 
 
 def has_half_turn_symmetry(effects: Iterable[Effect]) -> bool:
-    """True if phi -> phi + pi, q -> -q leaves the equations with these `effects` unchanged.
+    """Return True if phi -> phi + pi, q -> -q leaves the equations with these `effects` unchanged.
 
     The deviation of the load angle in a jam then has even harmonics only. Some friction laws keep this symmetry. Gravity on the
     loads, an imbalance and forces between loads break it. For every effect other than friction the result is False.
@@ -258,8 +258,10 @@ class MomentImbalance(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """Return the moment imbalance of `BALANCE_GRADE` with its masses at the radius of gyration on both sides; None if the
-        machine cannot tilt."""
+        """Return the moment imbalance of `BALANCE_GRADE` with its masses at the radius of gyration on both sides.
+
+        The result is None if the machine cannot tilt.
+        """
         mass, inertia = _moved_inertia(machine)
         if inertia is None:
             return None

@@ -41,7 +41,7 @@ class LoadContact(Effect):
 
     if zeta <= 1, otherwise e = exp(-2 gamma coth gamma) with cosh gamma = zeta. The two loads lose the share 1 - e^2 of the
     energy of their relative motion, including that of rolling; friction between loads is neglected. A contact lasts about
-    pi sqrt(mu/k), which steps must resolve: equal steps need ten per contact, the default of `ensemble` and `capture`.
+    pi sqrt(mu/k). Equal steps must resolve this time with ten steps per contact, the default of `ensemble` and `capture`.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -96,8 +96,8 @@ class LoadContact(Effect):
     def validate_start(self, loads: Loads, u: Coordinates, stations: np.ndarray | None = None) -> None:
         """**Raises** `InputError` if the `loads` cannot start at the coordinates `u`.
 
-        Loads on a circle must be in order within one turn, those of each of the `stations` (count,) for themselves. Other loads
-        must not overlap.
+        Loads on a circle must be in order within one turn, separately for each of the `stations` (count,). Other loads must not
+        overlap.
         """
         if not loads.circular:
             self._require_distances(loads, u, stations)
@@ -256,23 +256,23 @@ def _clearances(loads: Loads, u: tuple[Array, ...], tracks: Tracks | None) -> li
     The k-th array contains the distances of each load to the k-th load after it; each pair occurs once. On a circle there is
     only k = 1, the next load on the same track.
     """
-    own = ball_radius(loads)
+    r = ball_radius(loads)
     if isinstance(loads, CircularLoads):
         (phi,) = u
         if tracks is None:
             ahead = jnp.concatenate([phi[1:], phi[:1] + 2.0 * jnp.pi])
         else:
             ahead = phi[tracks.follower] + 2.0 * jnp.pi * tracks.turns
-        return [2.0 * loads.radius * jnp.sin(0.5 * jnp.clip(ahead - phi, -jnp.pi, jnp.pi)) - 2.0 * own]
+        return [2.0 * loads.radius * jnp.sin(0.5 * jnp.clip(ahead - phi, -jnp.pi, jnp.pi)) - 2.0 * r]
     n, place = loads.count, loads.position(*u)
     clearances = []
     for k in range(1, n // 2 + 1):
         pairs = n // 2 if 2 * k == n else n
         square = sum((jnp.concatenate([x[k:], x[:k]])[:pairs] - x[:pairs]) ** 2 for x in place)
-        same = square == 0.0
-        distance = jnp.where(same, 0.0, jnp.sqrt(jnp.where(same, 1.0, square)))
+        coincident = square == 0.0
+        distance = jnp.where(coincident, 0.0, jnp.sqrt(jnp.where(coincident, 1.0, square)))
         if tracks is not None:
-            is_same = jnp.roll(tracks.stations, -k)[:pairs] == tracks.stations[:pairs]
-            distance = jnp.where(is_same, distance, jnp.inf)
-        clearances.append(distance - 2.0 * own)
+            on_one_track = jnp.roll(tracks.stations, -k)[:pairs] == tracks.stations[:pairs]
+            distance = jnp.where(on_one_track, distance, jnp.inf)
+        clearances.append(distance - 2.0 * r)
     return clearances or [jnp.ones_like(u[0])]

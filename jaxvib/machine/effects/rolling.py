@@ -25,14 +25,15 @@ Direction = Literal["along", "each"]
 class RollingFriction(Effect):
     """Coulomb's rolling friction: a moment k N at the contact against the rolling of a load on the rotor's wall.
 
-        Q_u = - (k/r) max(N, 0) J^T d,    v = J (u' - (w, 0, ...)),    d = v tanh(|v|/width)/|v|
+        Q_u = - (k/r) |N| J^T d,    v = J (u' - (w, 0, ...)),    d = v tanh(|v|/width)/|v|
 
     - J = dp/du. v is the velocity of the load's centre along the wall relative to the rotor, which turns at w
-    - N is the normal force (`Loads.normal_force`), solved together with the accelerations; r is the radius of the load. There
-      is no friction on a load that does not press
+    - N is the normal force (`Loads.normal_force`), solved together with the accelerations; r is the radius of the load
+    - In a torus max(N, 0) replaces |N|: a ball that does not press on the wall has no friction. The track of loads on a circle
+      can also pull, and then has the same friction
     - With the exact sign, a load does not move if the force on it is the fraction s < 1 of the largest friction. With the
       smooth sign it creeps at the speed width artanh(s), which tends to 0 with the width
-    - Whether N is positive is decided by the motion without this friction
+    - The sign of N is that of the motion without this friction
 
     **Arguments** (SI, or strings with a unit)
 
@@ -89,10 +90,10 @@ class RollingFriction(Effect):
             levers = [self._lever(loads, u, i, x) for i, x in enumerate(slip)]
         else:
             v = jax.jvp(loads.position, u, slip)[1]
-            speed_ = _length(v)
+            size = _length(v)
             # tanh(x)/x, with its limit at x = 0.
-            moving = speed_ > 1e-6 * self.width
-            share = jnp.where(moving, sliding_sign(speed_, self.width) / jnp.where(moving, speed_, 1.0), 1.0 / self.width)
+            moving = size > 1e-6 * self.width
+            share = jnp.where(moving, sliding_sign(size, self.width) / jnp.where(moving, size, 1.0), 1.0 / self.width)
             levers = jax.vjp(loads.position, *u)[1](tuple(share * x for x in v))
         first, *others = (-scale * lever for lever in levers)
         return Friction(first, normal_force.reaction, normal_force.normal, tuple(others), loads.one_sided)

@@ -21,8 +21,8 @@ class FreeSpin(Effect):
 
         J s' = J a' (w B - R f') / r,    Q = (2/5) m r s (B a', - rho sin a f'),    J = (2/5) m r^2
 
-    - The symbols f, a, B, R, rho, r, w and n (the normal, from the tube's middle to the ball) are those of `TorusBalls`; Omega
-      is here the angular velocity of the ball, a vector
+    - The symbols f, a, B, R, rho, r, w and n (the normal, from the tube's middle to the ball) are those of `TorusBalls`. Omega
+      is the vector of the angular velocity of the ball
     - s, the spin of a ball about the normal relative to the wall, is an additional velocity of each ball
       (`State.spin.drilling`, default: 0 at the start); typical: up to the rotor speed, 140 rad/s
     - The forces Q act on the ball's two coordinates in addition to those of `TorusBalls`, where the contact keeps s = 0
@@ -34,8 +34,8 @@ class FreeSpin(Effect):
 
     The effect needs an ideal drive; the acceleration of the wall when w changes is neglected, as in `TorusBalls`.
 
-    **Raises** nothing itself. A scene with it raises `InputError` for loads that are not coupled to such a spin, such as those
-    on a plane track, and for a motor.
+    **Raises** nothing. A scene with this effect raises `InputError` for a motor, and for loads that are not coupled to this
+    spin, for example loads on a plane track.
 
     >>> import jaxvib as jv
     >>> jv.FreeSpin().terms()
@@ -69,9 +69,10 @@ class FreeSpin(Effect):
 class Sliding(Effect):
     """Sliding of rolling loads beyond Coulomb's limit of their contact.
 
-        |F_t| <= mu max(N, 0);    while it slides F_t = - mu N c/|c|,    (kappa - 1) m (c')_t = F_t - F_r
+        |F_t| <= mu |N|;    while it slides F_t = - mu |N| c/|c|,    (kappa - 1) m (c')_t = F_t - F_r
 
     - F_t is the force of the contact on the load along the track; the index t denotes the part tangential to the track
+    - In a torus max(N, 0) replaces |N|: a ball that does not press on the wall has no friction
     - F_r is here the force with which the load would roll at the actual acceleration of its centre
     - c is the velocity of the point of contact relative to the track along each coordinate of a load (`State.spin.slip`,
       default: 0 at the start; `with_spin(scene, state, "none")` for loads that do not rotate yet)
@@ -81,10 +82,10 @@ class Sliding(Effect):
 
     If |c| is below `width`, the force is
 
-        F_t = F_r - mu N c/width
+        F_t = F_r - mu |N| c/width
 
-    with F_r that of the motion in which the load rolls. If F_t exceeds the limit, its size is reduced to the limit and its
-    direction is kept. The remaining slip then decays as exp(- kappa/(kappa-1) mu N t/(m width)). Steps must resolve this decay:
+    with F_r of the motion in which the load rolls. If F_t exceeds the limit, its size is reduced to the limit and its direction
+    is kept. The remaining slip then decays as exp(- kappa/(kappa-1) mu |N| t/(m width)). Steps must resolve this decay:
     about kappa/(kappa-1) mu R w^2/width steps per second. `RollingFriction` still acts against the motion of the centre of a
     sliding load.
 

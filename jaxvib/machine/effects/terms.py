@@ -83,7 +83,7 @@ class LoadResistance:
 @final
 @dataclass(frozen=True)
 class LoadInteraction:
-    """Forces between loads, which cancel in the torque on coincident loads. With them the order of the loads matters.
+    """Forces between loads, which cancel in the torque on coincident loads. With these forces, the order of the loads matters.
 
     **Attributes**
 
@@ -146,7 +146,7 @@ class Friction(NamedTuple):
     - `reaction` (count,) N
     - `normal`: two (count,) arrays (horizontal, up) in kg, or None if N does not depend on accelerations
     - `others`: levers of a load's further coordinates, if friction acts on them
-    - `one_sided`: True if there is no friction while N is negative
+    - `one_sided`: if True, the friction is 0 while N is negative
     """
 
     lever: Array

@@ -85,7 +85,7 @@ class NamedNumber(NamedTuple):
         return tuple(self._replace(name=f"{self.name}[{k}]", entry=k, size=1) for k in range(self.size))
 
     def keeps_zeros(self, scene: Scene) -> bool:
-        """True for a whole array in which an entry 0 stands for a spring or a damper that the machine does not have."""
+        """Return True for a whole array in which an entry 0 stands for a spring or a damper that the machine does not have."""
         return self.entry is None and self.spec.zero_is_absent and np.ndim(self.leaf(scene)) > 0
 
     def words(self, scene: Scene) -> list[str]:
@@ -156,7 +156,7 @@ def numbers_of(scene: Scene) -> dict[str, NamedNumber]:
 
 
 def _is_continuous(value: object) -> bool:
-    """True for a floating-point number or an array of such numbers, also if it is traced."""
+    """Return True for a floating-point number or an array of such numbers, also if it is traced."""
     is_numeric = isinstance(value, (float, np.generic, np.ndarray, jax.Array))
     return is_numeric and jnp.issubdtype(jnp.result_type(value), jnp.floating)
 

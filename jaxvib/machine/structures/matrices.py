@@ -114,9 +114,9 @@ def from_matrices(
     force = jnp.zeros((2, 1, size), m.dtype) if foundation is None else _read_foundation(foundation, size)
     for name, matrix in (("machine.mass", m), ("machine.stiffness", k)):
         when_known(lambda matrix, name=name: _require_definite(matrix, name), matrix)
-    most = size if reduce is None else count(reduce, "machine.reduce")
-    if size > most:
-        modes = _lowest_modes(m, k, most)
+    limit = size if reduce is None else count(reduce, "machine.reduce")
+    if size > limit:
+        modes = _lowest_modes(m, k, limit)
         m, c, k, g = (None if x is None else modes.T @ x @ modes for x in (m, c, k, g))
         rows, force = rows @ modes, force @ modes
     parts = {"mass": m, "damping": c, "stiffness": k, "gyroscopic": g, "places_rows": rows, "foundation": force}

@@ -225,7 +225,7 @@ def three_mass(
     - `link_damping` (3,) of these links, N s/m; typical: as `damping`
     - `exciter`: the number of the platform with the auto-balancer, 1 to 3 (default: 2)
 
-    **Returns** `Platforms`. **Raises** `InputError` as `two_mass`.
+    **Returns** `Platforms`. **Raises** `InputError` in the cases of `two_mass`.
 
     >>> import jaxvib as jv
     >>> jv.three_mass(mass=(10.0, 20.0, 10.0), stiffness=(0.0, 4e4, 0.0), damping=(0.0, 20.0, 0.0),
@@ -263,7 +263,8 @@ def network(
     - `link_damping` (L,), N s/m; typical: as `damping`
     - `exciter`: the number of the platform with the auto-balancer
 
-    **Returns** `Platforms`. **Raises** `InputError` as `two_mass`, and for a link to a platform that does not exist.
+    **Returns** `Platforms`. **Raises** `InputError` in the cases of `two_mass`, and for a link to a platform that does not
+    exist.
 
     >>> import jaxvib as jv
     >>> chain = jv.network(mass=[5.0] * 4, stiffness=[1e4, 0, 0, 1e4], damping=[5, 0, 0, 5], links=[(1, 2), (2, 3), (3, 4)],
