@@ -23,6 +23,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.run import Run
 from jaxvib.show.sketch import drawable_scene, fit
+from jaxvib.show.view import ARROWS_NOTE
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose, RotorPose
 from jaxvib.steady.orbits.describe import Orbit
@@ -188,7 +189,7 @@ def _film(
     artists = [put(stage, part) for part in parts(0)]
     clock = stage.set_title("t", loc="left", family="monospace", fontsize="medium")
     slower = (film_motion.time.size / fps) / (film_motion.time[-1] - film_motion.time[0])
-    note = f"slowed down {slower:.3g} x, displacements drawn {magnification:.3g} x as large"
+    note = f"slowed down {slower:.3g} x, displacements drawn {magnification:.3g} x as large\n{ARROWS_NOTE}"
     stage.text(1.0, 0.0, note, transform=stage.transAxes, ha="right", va="top", fontsize="x-small", color="#555555")
     # Texts that are wider than the picture must not reduce the size of the drawing.
     for text in stage.texts:

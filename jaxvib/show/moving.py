@@ -8,6 +8,7 @@ from jaxvib.draw.machine.svg import svg
 from jaxvib.errors import ComputationError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.sketch import drawable_scene
+from jaxvib.show.view import ARROWS_NOTE
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose, RotorPose, at_rest, caption, places_of
 from jaxvib.steady.jams.jam import Jam
@@ -61,7 +62,7 @@ def moving_svg(scene: Scene, jam: Jam) -> str:
     slower = _PERIOD_SECONDS * omega / (2.0 * np.pi)
     head = (
         f"{caption(scene)}\njam mode {int(jam.mode)}, {jam.judgement}: slowed down {slower:.3g} x, displacements drawn "
-        f"{magnified:.3g} x as large, longest arrow {largest_force:.3g} N"
+        f"{magnified:.3g} x as large; {ARROWS_NOTE}, longest {largest_force:.3g} N"
     )
     return svg(
         view.limits, frames, [view.texts(pose, reach) for pose in poses], head, _PERIOD_SECONDS, float(jam.rotor_speed) / omega

@@ -112,6 +112,10 @@ class View(abc.ABC):
         ]
 
 
+ARROWS_NOTE = "arrows: forces of the supports on the foundation (black: their sum)"
+"""Meaning of the arrows, written below films."""
+
+
 class RotorView(View):
     """Drawing of a machine with one exciter; `wheel` is its rotor with the loads, `mount` its place on the machine."""
 
