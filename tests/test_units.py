@@ -41,6 +41,7 @@ from jaxvib.units.reading import _FACTORS
         ("25 cps", "rad/s", 50 * np.pi),
         ("25 rps", "rad/s", 50 * np.pi),
         ("25hz", "rad/s", 50 * np.pi),
+        ("60 Kg", "kg", 60.0),
         ("600 rpm", "Hz", 10.0),
         ("600 1/min", "1/s", 10.0),
         ("3 m rad^2/s^2", "m/s^2", 3.0),

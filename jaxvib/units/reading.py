@@ -46,11 +46,12 @@ _COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*(?:[^\W\d_%°][^,;()]*)?")
 _SPELLINGS = {
     **dict.fromkeys(("RPM", "Rpm", "r/min", "U/min", "rev/min"), "rpm"),
     **dict.fromkeys(("cps", "rps", "r/s", "U/s", "rev/s"), "turn/s"),
+    "Kg": "kg",
     "hz": "Hz",
     "HZ": "Hz",
     "khz": "kHz",
 }
-"""Other spellings of units of speed, as on rating plates and in catalogues."""
+"""Other spellings of units, as on rating plates and in catalogues."""
 
 _PER_MINUTE = ("1/min", "min^-1", "min**-1", "min⁻¹")
 """Spellings of revolutions per minute, if the argument is a speed."""
