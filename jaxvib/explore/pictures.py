@@ -22,7 +22,7 @@ from jaxvib.steady.branches import branches
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.whirl import critical_speeds, whirl
 
-ABOUT = """The sliders of springs, dampers, masses and drags of loads range from a tenth to ten times the value in the file. The
+ABOUT = """The sliders of masses, springs, dampers, radii and drags range from a tenth to ten times the value in the file. The
 arrow keys move a slider by one step. Each number of loads needs its own compiled program. The programs for the seven numbers
 next to the number in the file are compiled while the page is open; any other takes one or two seconds the first time and is
 then stored.

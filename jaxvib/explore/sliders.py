@@ -19,10 +19,11 @@ from jaxvib.machine.scene import Scene
 COUNT = "loads.count"
 """Name of the slider that changes the number of loads."""
 
-_MACHINE_NUMBERS = ("machine.stiffness", "machine.link_stiffness", "machine.damping", "machine.link_damping")
-"""Numbers of a machine that have sliders."""
+_LOAD_NUMBERS = ("loads.mass", "loads.radius", "loads.drag")
+_MACHINE_NUMBERS = ("machine.mass", "machine.stiffness", "machine.link_stiffness", "machine.damping", "machine.link_damping")
+"""Numbers of loads and of a machine that have sliders."""
 
-_MAX_SINGLE_SLIDERS = 12
+_MAX_SINGLE_SLIDERS = 15
 """Maximum number of sliders for single parameters of a machine. A machine with more parameters has one slider for all of a
 field, such as all stiffnesses."""
 
@@ -58,7 +59,7 @@ class Slider(NamedTuple):
 def sliders_of(scene: Scene) -> list[Slider]:
     """Return the sliders of a scene; the sliders of the drive and the loads come first.
 
-    - springs and dampers, masses and drags of the loads: a tenth to ten times the scene's values
+    - masses, springs and dampers of the machine, masses, radii and drags of the loads: a tenth to ten times the scene's values
     - rotor speed: a hundredth to three times the scene's value
     - number of loads, if all loads have equal parameters
 
@@ -76,7 +77,7 @@ def sliders_of(scene: Scene) -> list[Slider]:
     if _has_equal_loads(scene):
         counts = tuple(range(1, min(256, max(8, 2 * scene.loads.count)) + 1))
         sliders.append(Slider(COUNT, "number of loads", "", counts, scene.loads.count, None))
-    numbers = [find_number(scene, name, "slider") for name in ("loads.mass", "loads.drag") if _is_adjustable(scene, name)]
+    numbers = [find_number(scene, name, "slider") for name in _LOAD_NUMBERS if _is_adjustable(scene, name)]
     arrays = [find_number(scene, name, "slider") for name in _MACHINE_NUMBERS if _is_adjustable(scene, name)]
     single = [entry for array in arrays for entry in array.single(scene) if np.any(entry.read(scene))]
     numbers += single if len(single) <= _MAX_SINGLE_SLIDERS else arrays

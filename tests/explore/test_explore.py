@@ -59,14 +59,15 @@ def test_each_slider_moves_its_number_alone():
         (place,) = np.flatnonzero(after != before)
         assert after[place] / before[place] == pytest.approx(3.0 if each.name == "drive.speed" else 10.0, rel=1e-3)
         moved.append(place)
-    assert len(set(moved)) == len(moved) == 9  # four springs and dampers of supports, two of the link, mass, drag, speed
+    # Two masses, four springs and dampers of supports, two of the link; mass, radius and drag of the loads; speed.
+    assert len(set(moved)) == len(moved) == 12
     assert scene_at(scene, {COUNT: 5}).loads.count == 5
     counts = [sliders_of(scene_at(scene, {COUNT: n}))[1].steps for n in (2, 5)]
     assert [(steps[0], steps[-1]) for steps in counts] == [(1, 8), (1, 10)]  # twice as many as there are, 8 at least
     with pytest.raises(jv.InputError, match=r"loads\.ball_radius .* side by side"):
         scene_at(scene, {COUNT: 256})
     with pytest.raises(jv.InputError, match=r"machine\.mass is not a slider of this scene; the sliders are: drive\.speed"):
-        scene_at(scene, {"machine.mass": 3.0})
+        scene_at(scene, {"machine.mass": 3.0})  # one slider for each platform
 
 
 def test_what_no_factor_can_move_has_no_slider():
