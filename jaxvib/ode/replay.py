@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple, TypeAlias
+import functools
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import PyTree
 
+from jaxvib.errors import InputError
 from jaxvib.ode.batching import flat_tangents
 from jaxvib.ode.types import Args, Y
 from jaxvib.runtime.compat import fast_diffrax_loop_end, no_host_checks
+from jaxvib.runtime.primitive import CAN_DEFINE_PRIMITIVES, primitive
 
 _Inputs: TypeAlias = tuple[Array, Array | None, Y, Args, diffrax.SaveAt, diffrax.ODETerm]
 """Differentiated arguments: the end, the first step, the initial state, the arguments, the saved times, the equations."""
@@ -61,6 +65,7 @@ def solve(
     if adjoint is not None:
         return _solve(inputs, controller, adjoint, *rest)
     numbers, others = eqx.partition(controller, eqx.is_array)
+    inputs = _require_reverse(inputs)
     return _with_replay(inputs, eqx.combine(jax.lax.stop_gradient(numbers), others), *rest)
 
 
@@ -90,6 +95,49 @@ def _solve(
         throw=False,
         progress_meter=progress,
     )
+
+
+def _require_reverse(inputs: _Inputs) -> _Inputs:
+    """Return the inputs; a program that contains their forward derivatives raises `InputError` when it is compiled or run.
+
+    JAX reports such a program by an error of its own, `can't apply forward-mode autodiff to a custom_vjp function`, and only
+    when it is compiled, because `linearize` may be the beginning of a reverse derivative.
+    """
+    if not CAN_DEFINE_PRIMITIVES:
+        return inputs
+    numbers, others = eqx.partition(inputs, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(numbers)
+    return eqx.combine(jax.tree.unflatten(structure, _reverse_only(leaves)), others)
+
+
+@jax.custom_jvp
+def _reverse_only(numbers: list[Array]) -> list[Array]:
+    return numbers
+
+
+@functools.partial(_reverse_only.defjvp, symbolic_zeros=True)
+def _reverse_only_jvp(primals: Any, tangents: Any) -> tuple[list[Array], list[Any]]:
+    (numbers,), (slopes,) = primals, tangents
+    nonzero = iter(_reverse_tangents(*(slope for slope in slopes if not isinstance(slope, SymbolicZero))))
+    return numbers, [slope if isinstance(slope, SymbolicZero) else next(nonzero) for slope in slopes]
+
+
+def _refuse_forward(*_: Any) -> Any:
+    raise InputError(
+        "adjoint",
+        "supports reverse-mode derivatives only; for jvp, jacfwd and linearize of a run use adjoint=diffrax.ForwardMode()",
+    )
+
+
+_reverse_tangents = primitive(
+    "reverse_tangents",
+    impl=_refuse_forward,
+    batching_rule=_refuse_forward,
+    transpose=lambda cotangents, *_: cotangents,
+    lowering=_refuse_forward,
+    abstract_eval=lambda *types: types,
+)
+"""Primitive that returns tangents and can only be transposed."""
 
 
 @eqx.filter_custom_vjp

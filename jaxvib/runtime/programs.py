@@ -18,7 +18,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.code_changes import code_state
-from jaxvib.errors import InputError
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import primal_of, traced
 from jaxvib.runtime.devices import arrays_on_device
@@ -71,16 +70,7 @@ class CachedFunction(Generic[P, T]):
         tracers = [leaf for leaf in leaves if traced(leaf)]
         if not tracers:
             return self.stored(leaves, treedef)
-        try:
-            return self._transformed(tracers, arrays_on_device(leaves), treedef, args, kwargs)
-        except TypeError as error:
-            if "forward-mode" not in str(error):
-                raise
-            # JAX raises this error for forward derivatives of a run with the default adjoint, which replays its steps.
-            raise InputError(
-                "adjoint",
-                "supports reverse-mode derivatives only; for jvp and jacfwd of a run use adjoint=diffrax.ForwardMode()",
-            ) from error
+        return self._transformed(tracers, arrays_on_device(leaves), treedef, args, kwargs)
 
     def is_ready(self, *args: P.args, **kwargs: P.kwargs) -> bool:
         """Return True if a call does not have to load or compile a stored program.

@@ -262,6 +262,28 @@ def test_forward_derivatives_name_the_adjoint_they_need(question):
         jax.jvp(function, (k,), (k,))
 
 
+@pytest.mark.parametrize(
+    "transformation",
+    [
+        lambda f: jax.jit(lambda x: jax.jvp(f, (x,), (x,))),
+        lambda f: lambda x: jax.linearize(f, x)[1](x),
+        lambda f: lambda x: jax.jit(jax.linearize(jax.jit(f), x)[1])(x),
+        lambda f: jax.jacfwd(jax.jit(f)),
+    ],
+    ids=["jit of jvp", "linearize", "linearize of jit", "jacfwd of jit"],
+)
+def test_every_forward_derivative_names_the_adjoint(transformation):
+    function, k = of_stiffness(lambda s: jv.simulate(s, 0.2).omega)
+    with pytest.raises(jv.InputError, match=r"adjoint .* use adjoint=diffrax.ForwardMode\(\)"):
+        transformation(function)(k)
+
+
+def test_linearized_runs_can_be_transposed():
+    function, k = of_stiffness(lambda s: jv.simulate(s, 0.2).omega)
+    transposed = jax.linear_transpose(jax.linearize(function, k)[1], k)
+    np.testing.assert_allclose(transposed(1.0)[0], jax.grad(function)(k), rtol=1e-9)
+
+
 @pytest.mark.parametrize("transformation", [jax.jit, jax.grad, lambda f: lambda x: jax.vmap(f)(x[None])])
 @pytest.mark.parametrize("question", [lambda s: jv.settle(s).omega, lambda s: jv.growth(s, 5.0).rate])
 def test_what_decides_in_python_says_so_under_jax(question, transformation):
