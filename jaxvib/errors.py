@@ -18,6 +18,9 @@ MAX_TEXT_BYTES = 2**24
 CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 """Characters that control a terminal or change the direction of writing, except line breaks and tabs."""
 
+_MAX_PATH_CHARACTERS = 4096
+"""Largest number of characters of a path, as in Linux."""
+
 _MAX_WORD, _MAX_MESSAGE = 300, 2000
 """Largest numbers of characters of a word and of a message. In longer ones, the middle is replaced by " ... "."""
 
@@ -125,8 +128,13 @@ def require_path(value: object, field: str) -> Path:
     if not isinstance(value, (str, os.PathLike)) or isinstance(os.fspath(value), bytes):
         raise InputError(field, f"is {quoted(value)}; it must be the path of a file")
     text = os.fspath(value)
-    if not text or "\0" in text or len(text) > 4096 or any("\ud800" <= character <= "\udfff" for character in text):
-        raise InputError(field, f"is {quoted(value)}; it must be the path of a file, without the character NUL")
+    if not text:
+        raise InputError(field, "is empty; it must be the path of a file")
+    if len(text) > _MAX_PATH_CHARACTERS:
+        problem = f"has {len(text)} characters and begins with {quoted(value)}; a path has {_MAX_PATH_CHARACTERS} at most"
+        raise InputError(field, problem)
+    if "\0" in text or any("\ud800" <= character <= "\udfff" for character in text):
+        raise InputError(field, f"is {quoted(value)}; a path cannot contain the character NUL or a lone surrogate")
     return Path(value)
 
 

@@ -58,7 +58,9 @@ def question(
         ({"side": None}, "side is None; it must be 'left' or 'right'"),
         ({"side": ["left"]}, "side is ['left']; it must be 'left' or 'right'"),
         ({"path": 3}, "path is 3; it must be the path of a file"),
-        ({"path": "a\0b"}, r"path is 'a\x00b'; it must be the path of a file, without the character NUL"),
+        ({"path": "a\0b"}, r"path is 'a\x00b'; a path cannot contain the character NUL or a lone surrogate"),
+        ({"path": ""}, "path is empty; it must be the path of a file"),
+        ({"path": "x" * 5000}, f"path has 5000 characters and begins with '{'x' * 55} ...; a path has 4096 at most"),
         ({"make": 3}, "make is 3; it must be a function"),
         ({"sizes": 3.0}, "sizes is 3.0; it must be a list of numbers"),
         ({"sizes": "12"}, "sizes is '12'; it must be a list of numbers"),
@@ -160,7 +162,7 @@ def test_numbers_and_paths_are_known_by_their_kind():
     assert not any(map(is_real, (True, 1j, "1", None, np.datetime64("2020"), np.asarray([True], dtype=object))))
     assert not is_whole(True) and not is_whole(np.timedelta64(1, "s")) and not is_whole(1.0)
     for wrong in (b"a", "", "a\0", "\ud800", "a\ud800", 5000 * "a", None, ["a"]):
-        with pytest.raises(jv.InputError, match=r"^path is .*; it must be the path of a file"):
+        with pytest.raises(jv.InputError, match=r"^path (is|has) .*; (it must be the path of a file|a path)"):
             require_path(wrong, "path")
 
 

@@ -90,6 +90,8 @@ def load(path: str | Path) -> Any:
         return result
     except FileNotFoundError as error:
         raise InputError("path", f"is {quoted(str(path))}; there is no such file") from error
+    except OSError as error:
+        raise InputError("path", f"is {quoted(str(path))}, which cannot be read ({error.strerror or error})") from error
     except _READ_ERRORS as error:
         raise InputError("path", f"is {quoted(str(path))}; it is not a result written by save") from error
 

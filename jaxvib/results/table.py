@@ -59,6 +59,8 @@ class TextTable(NamedTuple):
         try:
             mark = None if self.mark == _ONE_COLUMN_MARK else self.mark
             found = np.loadtxt(self._texts(), delimiter=mark, usecols=places, comments=None, quotechar='"', ndmin=2)
+        except InputError:
+            raise
         except ValueError:
             found = None
         if found is not None and np.all(np.isfinite(found)):
@@ -70,7 +72,11 @@ class TextTable(NamedTuple):
         return next(itertools.islice(self._rows(), row, None))[0]
 
     def _rows(self) -> Iterator[tuple[int, str]]:
-        return itertools.islice(_content(self.path), self.first, None)
+        for line, text in itertools.islice(_content(self.path), self.first, None):
+            if '"' in text and text.count('"') % 2:  # it would extend a cell over all lines that follow
+                problem = "has a quotation mark without its partner; delete it"
+                raise InputError(f"{self.path} line {line}", problem)
+            yield line, text
 
     def _texts(self) -> Iterator[str]:
         """Yield the rows for NumPy. **Raises** `ValueError` for a row with another number of columns."""

@@ -179,6 +179,7 @@ def text(head="time (s),frame (g)\n", rows=40):
 @pytest.mark.parametrize(
     ("content", "says"),
     [
+        (text().replace("0.3,", '0.3,"'), "line 5 has a quotation mark without its partner"),
         (text().replace("0.3,", "0.3,7,"), "line 5 has 3 columns; the lines above have 2"),
         (text("time (s),frame (g),base (g)\n"), "line 2 has 2 columns; the lines above have 3"),
         (text().replace("0.3,-0.10", "0.3,oops"), "line 5 has 'oops' where the frame should be; a finite number is needed"),
