@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -30,7 +31,7 @@ from jaxvib.identification.fit import (
     unknown_count,
 )
 from jaxvib.identification.jammed.motion import ShiftedDrive, closed_motion, linearized, weighted_columns
-from jaxvib.identification.problem import Problem, channel_sizes, with_noise
+from jaxvib.identification.problem import Problem, channel_sizes, natural, with_noise
 from jaxvib.identification.response import Unknowns, model_states
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
@@ -60,6 +61,13 @@ changes no reading. The second is for all other loads."""
 _GAP_SIZE = 0.01
 """Gap between two stretches, relative to the size of each state (angles: rad), that costs as much as a reading whose residual
 is one standard deviation."""
+
+_UNEXPLAINED = 0.25
+"""Cost per reading, relative to the variance of the readings, above which a motion does not resemble the records."""
+
+_ABOVE_JAM, _SAME_STIFFNESS = 1.04, 0.01
+"""Natural frequency of a resonance relative to the speed of a jam at it, and change of the logarithm of the stiffnesses below
+which their first values are not replaced."""
 
 _MAX_TURN = 0.7
 """Largest change of the angle of a load in one step, rad."""
@@ -92,18 +100,43 @@ def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     """Return the problem of a motion with loads, in which the first values of the linear unknowns are set, and the first values
     of x.
 
+    If the motion with the first values of the scene does not resemble the records, it is computed again with other stiffnesses,
+    see `_stiffnesses_of_jam`.
+
     **Raises** `InputError` for a run without a vibration below the speed of the rotor.
     """
     noise = [[Noise(np.ones(1), size) for size in of_run] for of_run in channel_sizes(problem)]
-    weighted_problem, jams, places = (
-        with_noise(problem, noise),
-        [_jam_of(problem, r) for r in range(len(problem.runs))],
-        linear_places(problem),
-    )
-    x, linear = np.zeros(problem.unknowns.count), np.zeros(unknown_count(problem) - problem.unknowns.count)
+    weighted_problem, jams = with_noise(problem, noise), [_jam_of(problem, r) for r in range(len(problem.runs))]
+    fitted, load_spread = _first_fit(weighted_problem, jams, np.zeros(problem.unknowns.count))
+    is_found = fitted.cost < _UNEXPLAINED * sum(int(np.count_nonzero(mask)) for mask in problem.masks)
+    other = None if is_found else _stiffnesses_of_jam(problem, jams)
+    if other is not None:
+        again = _first_fit(weighted_problem, jams, other)
+        fitted, load_spread = min((fitted, load_spread), again, key=lambda each: each[0].cost)
+    angles = tuple(np.column_stack([turned, jam.angle]) for turned, jam in zip(problem.angles, jams, strict=True))
+    return problem._replace(angles=angles, linear=fitted.linear, load_spread=load_spread), fitted.x
+
+
+def _stiffnesses_of_jam(problem: Problem, jams: Sequence[_Jam]) -> np.ndarray | None:
+    """Return x with the unknown stiffnesses multiplied by one number, such that the natural frequency nearest the speed of the
+    jam is slightly above it, as in a jam; None if no stiffness is unknown, or if the number is nearly 1."""
+    speed, frequency = float(np.median(np.abs(jams[0].speed))), natural(problem.scene)[0]
+    names = [number.name for number in problem.unknowns.numbers]
+    own = [k for k in positive_places(problem) if "stiffness" in names[k] and problem.precisions[k] == 0.0]
+    if not own or not frequency.size:
+        return None
+    nearest = frequency[np.argmin(np.abs(np.log(frequency / speed)))]
+    x = np.zeros(problem.unknowns.count)
+    x[own] = 2.0 * math.log(_ABOVE_JAM * speed / nearest)
+    return None if abs(x[own[0]]) < _SAME_STIFFNESS else x
+
+
+def _first_fit(problem: Problem, jams: Sequence[_Jam], x: np.ndarray) -> tuple[_Trial, np.ndarray]:
+    """Return the motion of all runs that is found from the values x, and the information of `load_spread_of`."""
+    x, linear = x.copy(), np.zeros(unknown_count(problem) - problem.unknowns.count)
     starts, pairs = [], []
-    for r, (jam, place) in enumerate(zip(jams, places, strict=True)):
-        states, pair, offsets = _linear_motion(weighted_problem, r, jam)
+    for r, (jam, place) in enumerate(zip(jams, linear_places(problem), strict=True)):
+        states, pair, offsets = _linear_motion(problem, r, jam, x)
         linear[place] = np.concatenate([states[0], pair, offsets])
         starts.append(states)
         pairs.append(pair)
@@ -113,9 +146,7 @@ def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
             turn = math.atan2(pair[1], pair[0]) - math.atan2(pairs[0][1], pairs[0][0])
             x[problem.unknowns.first.shape[0] + len(problem.unknowns.gains) + samples.turn] = turn
     load_spread = load_spread_of(problem, linear)
-    fitted = _shoot(weighted_problem._replace(load_spread=load_spread), x, linear, starts)
-    angles = tuple(np.column_stack([turned, jam.angle]) for turned, jam in zip(problem.angles, jams, strict=True))
-    return problem._replace(angles=angles, linear=fitted.linear, load_spread=load_spread), fitted.x
+    return _shoot(problem._replace(load_spread=load_spread), x, linear, starts), load_spread
 
 
 def _loads_of(scene: Scene) -> CircularLoads:
@@ -204,10 +235,11 @@ def _jam_of(problem: Problem, r: int) -> _Jam:
     return _Jam(drive, spline(time)[:, 0], spline(time, 1)[:, 0])
 
 
-def _linear_motion(problem: Problem, r: int, jam: _Jam) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the states (J, ns) at the starts of the stretches of a run, the pair of its unbalance, and its offsets."""
+def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the states (J, ns) at the starts of the stretches of a run, the pair of its unbalance, and its offsets, at the
+    values `x`."""
     samples = problem.runs[r]
-    own = samples.scene(problem.scene)
+    own = samples.scene(problem.unknowns.scene(problem.scene, x))
     exciter, loads = own.exciters[0], _loads_of(own)
     place: dict[str, Any] = {"at": exciter.at, "body": exciter.body, "direction": exciter.direction}
     mass = np.sum(np.broadcast_to(loads.mass, loads.count))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import equinox as eqx
 import numpy as np
@@ -11,15 +12,17 @@ from repeated_records.jammed import RADIUS, TIMES, TRUTH, bound, clean, first_st
 
 import jaxvib as jv
 from jaxvib.identification.jammed.motion import closed_motion, linearized
-from jaxvib.identification.jammed.start import with_first_motion
-from jaxvib.identification.problem import build_problem, with_noise
+from jaxvib.identification.jammed.start import _stiffnesses_of_jam, with_first_motion
+from jaxvib.identification.problem import build_problem, natural, with_noise
 from jaxvib.numerics.noise import Noise
 
-UNKNOWN = ["machine.stiffness", "exciters[0].unbalance", "loads.mass", "loads.drag"]
+UNKNOWN = ["machine.stiffness", "machine.link_stiffness", "exciters[0].unbalance", "loads.mass", "loads.drag"]
 
 
-def jammed_problem(unknown=UNKNOWN):
-    return build_problem(scene_of(TRUTH), [jammed_record(1e-9, np.random.default_rng(0))], unknown, {})
+def jammed_problem(stiffness=1.0):
+    """Return the problem of a record without noise, with first values of all stiffnesses that are off by a factor."""
+    first = {name: value * (stiffness if "stiffness" in name else 1.0) for name, value in TRUTH.items()}
+    return build_problem(scene_of(first), [jammed_record(1e-9, np.random.default_rng(0))], UNKNOWN, {})
 
 
 def true_own(offset=0.1):
@@ -102,9 +105,21 @@ def test_motion_of_pendulums_is_that_of_simulate():
     np.testing.assert_allclose(readings[:, 1], across, atol=1e-6 * np.max(np.abs(across)))
 
 
-def test_first_values_agree_with_a_record_without_noise():
-    _, x = with_first_motion(jammed_problem())
-    np.testing.assert_allclose(x, 0.0, atol=1e-4)
+@pytest.mark.parametrize("stiffness", [1.0, 1.1])
+def test_first_values_agree_with_a_record_without_noise(stiffness):
+    """With natural frequencies that are 5 % too high, the motion follows from the stiffnesses of the jam only."""
+    _, x = with_first_motion(jammed_problem(stiffness))
+    np.testing.assert_allclose(x, -np.log(stiffness) * np.array([1.0, 1.0, 1.0, 0.0, 0.0]), atol=1e-4)
+
+
+def test_stiffnesses_of_a_jam_are_below_the_resonance():
+    problem, jams = jammed_problem(1.2), [SimpleNamespace(speed=np.array([62.0, 61.0, 62.0]))]
+    x = _stiffnesses_of_jam(problem, jams)
+    second = natural(problem.scene)[0][1]
+    np.testing.assert_allclose(x[:3], 2.0 * np.log(1.04 * 62.0 / second), rtol=1e-12)
+    assert not np.any(x[3:])
+    assert _stiffnesses_of_jam(problem, [SimpleNamespace(speed=np.array([second / 1.04]))]) is None
+    assert _stiffnesses_of_jam(problem._replace(precisions=np.ones(5)), jams) is None
 
 
 def away_from(fit):
