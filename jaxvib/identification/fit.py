@@ -173,10 +173,16 @@ def project(problem: Problem, x: np.ndarray) -> _Trial:
 
 def _with_loads(problem: Problem, x: np.ndarray, linear: np.ndarray) -> _Trial:
     """Return the unknowns of a motion with loads, and their cost."""
-    cost = known_cost(problem, x, linear)
-    for samples, place in zip(problem.runs, linear_places(problem), strict=True):
-        cost += float(np.sum(motion_differences(problem.unknowns, samples, problem.scene, x, linear[place]) ** 2))
+    cost = known_cost(problem, x, linear) + float(np.sum(differences_with_loads(problem, x, linear) ** 2))
     return _Trial(x, linear, cost if np.isfinite(cost) else np.inf)
+
+
+def differences_with_loads(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Return the weighted differences, readings minus model, of a motion with loads, those of all runs in one array."""
+    pairs = zip(problem.runs, linear_places(problem), strict=True)
+    return np.concatenate(
+        [motion_differences(problem.unknowns, each, problem.scene, x, linear[place]) for each, place in pairs]
+    )
 
 
 def known_cost(problem: Problem, x: np.ndarray, linear: np.ndarray) -> float:
@@ -206,7 +212,7 @@ def linear_at(problem: Problem, x: np.ndarray, unbalance: np.ndarray | None) -> 
 def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
     """Return the normal equations (p + L + 1, p + L + 1) of each run: of all unknowns and the residuals."""
     if problem.has_loads:
-        return [columns.T @ columns for columns in _columns_with_loads(problem, x, linear)]
+        return [columns.T @ columns for columns in columns_with_loads(problem, x, linear)]
     p, size, of_runs = x.size, x.size + linear.size, []
     for samples, place in zip(problem.runs, linear_places(problem), strict=True):
         parts = problem.unknowns, samples, problem.scene
@@ -216,7 +222,7 @@ def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[n
     return of_runs
 
 
-def _columns_with_loads(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
+def columns_with_loads(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
     """Return the columns (n C, p + L + 1) of each run: derivatives with respect to all unknowns, and the residuals."""
     p, size, of_runs = x.size, x.size + linear.size, []
     for samples, place in zip(problem.runs, linear_places(problem), strict=True):
@@ -273,7 +279,7 @@ def _minimize_with_loads(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.nd
 
     def equations(trial: _Trial) -> Equations:
         nonlocal columns
-        columns = np.concatenate(_columns_with_loads(problem, trial.x, trial.linear))
+        columns = np.concatenate(columns_with_loads(problem, trial.x, trial.linear))
         return _joined(problem, trial.x, trial.linear, columns.T @ columns)
 
     def stepped(trial: _Trial, step: np.ndarray) -> _Trial:
@@ -282,12 +288,8 @@ def _minimize_with_loads(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.nd
 
     def bend(trial: _Trial, step: np.ndarray) -> np.ndarray:
         new, linear = trial.x + step[:p], trial.linear + step[p:]
-        left = [
-            motion_differences(problem.unknowns, samples, problem.scene, new, linear[place])
-            for samples, place in zip(problem.runs, linear_places(problem), strict=True)
-        ]
         slopes = columns[:, :-1]
-        return slopes.T @ (np.concatenate(left) - columns[:, -1] + slopes @ step)
+        return slopes.T @ (differences_with_loads(problem, new, linear) - columns[:, -1] + slopes @ step)
 
     start = project(problem, x)
     count = p + start.linear.size

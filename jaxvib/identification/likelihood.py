@@ -15,7 +15,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from jaxvib.identification.directions import Information, eliminate, elimination, free_unbalances, in_polar_unbalances
-from jaxvib.identification.fit import Fitted, minimize, project
+from jaxvib.identification.fit import (
+    Fitted,
+    columns_with_loads,
+    differences_with_loads,
+    known_cost,
+    minimize,
+    prior_equations,
+    project,
+    solved,
+)
 from jaxvib.identification.problem import Known, Problem
 
 QUANTILE = 1.959964
@@ -26,6 +35,9 @@ _COMPARED_DISTANCE = 2.0
 
 _MAX_DIFFERENCE = 0.1
 """Relative difference from the quadratic form above which an interval follows from the profile."""
+
+_VALLEY_STEPS, _SMALL_REDUCTION = 6, 0.05
+"""Number of steps into a curved valley of the cost, and reduction of the cost below which they end."""
 
 _TIGHT_ERROR = 1e-3
 """A number is fixed by a known value. Its standard error is this fraction of the standard error of the number in the fit."""
@@ -42,7 +54,7 @@ class _Profile:
     error `spread` of the coordinate of the number (its entry of x, or the logarithm of the unbalance); `slopes` (p + L,):
     change of all unknowns per change of the coordinate, of the unbalances as (logarithm of the size, angle); `floor`: the least
     cost; `is_vanished`: True if the number is not distinguishable from 0; distances are then multiples of the standard error of
-    the number itself, not of its logarithm.
+    the number itself, not of its logarithm; `columns` (n, p + L + 1) of a motion with loads, see `columns_with_loads`.
     """
 
     fitted: Fitted
@@ -53,6 +65,7 @@ class _Profile:
     slopes: np.ndarray
     floor: float
     is_vanished: bool = False
+    columns: np.ndarray | None = None
 
     def shift(self, distance: float) -> float:
         """Return the change of the coordinate at a `distance` in standard errors."""
@@ -60,8 +73,8 @@ class _Profile:
 
     def rise(self, distance: float, is_exact: bool) -> float:
         """Return the rise of the cost at a `distance` in standard errors. If `is_exact`, all other unknowns are fitted;
-        otherwise only the linear ones are fitted, and the others follow the quadratic form. No unknown of a motion with loads
-        is linear."""
+        otherwise only the linear ones are fitted, and the others follow the quadratic form; for a motion with loads, in which
+        no unknown is linear, see `_in_valley`."""
         target, p = self.center + self.shift(distance), self.fitted.x.size
         problem, known_cost = self._fixed(target)
         change = distance * self.spread * self.slopes
@@ -71,9 +84,26 @@ class _Profile:
         if problem.linear is not None:
             linear, pair = problem.linear + change[p:], complex(*problem.linear[:2]) * cmath.exp(complex(*change[p : p + 2]))
             linear[:2] = pair.real, pair.imag
+            x, linear = self._in_valley(problem, x, linear)
             problem = problem._replace(linear=linear)
         trial = minimize(problem, x)[0] if is_exact else project(problem, x)
         return trial.cost + known_cost - self.floor
+
+    def _in_valley(self, problem: Problem, x: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the unknowns of a motion with loads after a few steps of the method of Gauss and Newton with the derivatives
+        at the fit. The valley of the cost is curved, and far away the quadratic form leaves it."""
+        assert self.columns is not None
+        slopes, p, best, last = self.columns[:, :-1], x.size, (x, linear), math.inf
+        for _ in range(_VALLEY_STEPS):
+            left = differences_with_loads(problem, x, linear)
+            cost = float(left @ left) + known_cost(problem, x, linear)
+            if not cost < last - _SMALL_REDUCTION:
+                break
+            best, last = (x, linear), cost
+            prior, gradient = prior_equations(problem, x, linear)
+            step = solved(slopes.T @ slopes + prior, slopes.T @ left + gradient)
+            x, linear = x + step[:p], linear + step[p:]
+        return best
 
     def _fixed(self, target: float) -> tuple[Problem, float]:
         """Return the problem with the number fixed at `target`, and the cost of the difference between
@@ -129,7 +159,9 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
     free_exciters = free_unbalances(problem)
     own = np.array([*range(p), *(p + 2 * k for k in free_exciters)], int)
     covariance = np.linalg.pinv(eliminate(data + prior, own), rcond=1e-13, hermitian=True)
-    floor, intervals = project(problem, fitted.x).cost, {}
+    floor, intervals, columns = project(problem, fitted.x).cost, {}, None
+    if problem.linear is not None:
+        columns = np.concatenate(columns_with_loads(problem, fitted.x, problem.linear))
     for i, name in enumerate(known.names):
         if not known.determined[i]:
             continue
@@ -140,11 +172,12 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
         slopes, variance = elimination(data + prior, own[[place]])[:, 0], covariance[place, place]
         if is_vanished:  # its information may be below the accuracy of the pseudoinverse
             slopes, variance = np.zeros(len(data)), known.covariance[i, i]
-        profile = _Profile(fitted, index, is_unbalance, center, math.sqrt(variance), slopes, floor, is_vanished)
+        spread = math.sqrt(variance)
+        profile = _Profile(fitted, index, is_unbalance, center, spread, slopes, floor, is_vanished, columns)
         if is_vanished:
             intervals[name] = -math.inf, profile.shift(profile.end(1.0))
             continue
-        # Along the quadratic form, the cost of a motion with loads rises by more than with its other unknowns fitted.
+        # Without an exact fit, the cost of a motion with loads may rise by more than in its profile.
         if profile.is_quadratic(is_exact=False) or (problem.linear is not None and profile.is_quadratic(is_exact=True)):
             continue
         intervals[name] = -profile.spread * profile.end(-1.0), profile.spread * profile.end(1.0)

@@ -152,6 +152,8 @@ def test_states_of_loads_follow_the_quadratic_form(monkeypatch, bend, expected):
 
     monkeypatch.setattr(likelihood, "project", cost)
     monkeypatch.setattr(likelihood, "minimize", lambda *_: (SimpleNamespace(cost=4.0),))
+    monkeypatch.setattr(likelihood, "columns_with_loads", lambda *_: [np.zeros((3, 6))])
+    monkeypatch.setattr(_Profile, "_in_valley", lambda self, problem, x, linear: (x, linear))
     monkeypatch.setattr(likelihood, "in_polar_unbalances", lambda _: (0.75 * matrix, 0.25 * matrix, np.array([0.05])))
     rises, rise = [], _Profile.rise
     monkeypatch.setattr(_Profile, "rise", lambda *arguments: rises.append(rise(*arguments)) or rises[-1])
@@ -163,6 +165,26 @@ def test_states_of_loads_follow_the_quadratic_form(monkeypatch, bend, expected):
     assert profile_intervals(SimpleNamespace(problem=problem, x=x, linear=linear), known) == {}
     np.testing.assert_allclose(rises, 3 * expected, rtol=1e-9)
     assert linear.tolist() == [0.03, 0.04, 2.0]
+
+
+def test_steps_lead_into_a_curved_valley(monkeypatch):
+    """Two states follow parabolas over the first number, which is fixed at 0.5; the least cost is 0.25."""
+
+    def differences(problem, x, linear):
+        return np.array([20.0 * (linear[0] - x[0] - x[0] ** 2), 20.0 * (linear[1] + x[1] - 0.4 * x[0] ** 2), x[0], x[1], 0.0])
+
+    slopes = np.array([[20.0, 0.0, -20.0, 0.0], [0.0, -20.0, 0.0, -20.0], [-1.0, 0, 0, 0], [0, -1.0, 0, 0], [0, 0, 0, 0]])
+    monkeypatch.setattr(likelihood, "differences_with_loads", differences)
+    prior = np.diag([1e6, 0.0, 0.0, 0.0])
+    monkeypatch.setattr(likelihood, "known_cost", lambda problem, x, linear: 1e6 * (x[0] - 0.5) ** 2)
+    monkeypatch.setattr(
+        likelihood, "prior_equations", lambda problem, x, linear: (prior, -1e6 * np.array([x[0] - 0.5, 0.0, 0.0, 0.0]))
+    )
+    profile = _Profile(None, 0, False, 0.0, 0.25, np.zeros(4), 0.0, columns=np.column_stack([slopes, np.zeros(5)]))
+    x, linear = profile._in_valley(None, np.array([0.5, 0.0]), np.array([0.5, 0.0]))
+    left = differences(None, np.array([0.5, 0.0]), np.array([0.5, 0.0]))
+    assert left @ left > 20.0 and np.sum(differences(None, x, linear) ** 2) == pytest.approx(0.25, abs=1e-3)
+    assert x[0] == pytest.approx(0.5, abs=1e-6)
 
 
 def test_known_values_count_in_the_rise():
