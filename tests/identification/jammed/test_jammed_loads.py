@@ -107,7 +107,7 @@ def test_motion_of_pendulums_is_that_of_simulate():
 
 @pytest.mark.parametrize("stiffness", [1.0, 1.1])
 def test_first_values_agree_with_a_record_without_noise(stiffness):
-    """With natural frequencies that are 5 % too high, the motion follows from the stiffnesses of the jam only."""
+    """Natural frequencies that are 5 % too high lead to the motion with the stiffnesses of the jam only."""
     _, x = with_first_motion(jammed_problem(stiffness))
     np.testing.assert_allclose(x, -np.log(stiffness) * np.array([1.0, 1.0, 1.0, 0.0, 0.0]), atol=1e-4)
 
