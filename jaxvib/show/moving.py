@@ -62,7 +62,7 @@ def moving_svg(scene: Scene, jam: Jam) -> str:
     slower = _PERIOD_SECONDS * omega / (2.0 * np.pi)
     head = (
         f"{caption(scene)}\njam mode {int(jam.mode)}, {jam.judgement}: slowed down {slower:.3g} x, displacements drawn "
-        f"{magnified:.3g} x as large\n{ARROWS_NOTE}, longest {largest_force:.3g} N"
+        f"{magnified:.3g} x as large\n{ARROWS_NOTE}, longest {largest_force:.4g} N"
     )
     return svg(
         view.limits, frames, [view.texts(pose, reach) for pose in poses], head, _PERIOD_SECONDS, float(jam.rotor_speed) / omega
