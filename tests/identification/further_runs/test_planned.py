@@ -52,7 +52,7 @@ def test_planned_run_has_the_numbers_and_the_noise_of_the_fit():
     np.testing.assert_allclose(found.fitted.linear[:2], 0.05 * np.array([np.cos(0.4), np.sin(0.4)]))
     assert not np.any(found.fitted.linear[2:]) and not np.any(found.fitted.x)
     # Numbers, gain and unbalance; the runs have no common zero of the angle.
-    assert found.own.tolist() == [0, 1, 3, 2] and found.place.tolist() == [0, 2, 1, 4]
+    assert found.places_in_run.tolist() == [0, 1, 3, 2] and found.places_in_fit.tolist() == [0, 2, 1, 4]
     np.testing.assert_allclose(problem.precisions, 0.0)  # the gain is known by the fit
     assert problem.unbalances == (None,)
 
@@ -63,7 +63,12 @@ def test_noise_of_another_rate_and_of_new_channels(noise, deviation):
     deck, tacho = jv.Channel("deck", "velocity", at=1), jv.Channel("tacho", "pulses")
     found = expected_run(fit(), ramp(channels=(deck, tacho), noise=noise))
     np.testing.assert_allclose(found.fitted.problem.runs[0].weights[0, :, 0], 1.0 / deviation)
-    assert found.own.tolist() == [0, 1, 2, 3] and found.place.tolist() == [0, 2, 1, 5]  # no gain, but the mark of the angle
+    assert found.places_in_run.tolist() == [0, 1, 2, 3] and found.places_in_fit.tolist() == [
+        0,
+        2,
+        1,
+        5,
+    ]  # no gain, but the mark of the angle
     with pytest.raises(jv.InputError, match="candidates: ramp: channel 'new' is new; give its noise, noise="):
         expected_run(fit(), ramp(channels=(jv.Channel("new", "velocity", at=1),)))
 
