@@ -302,6 +302,10 @@ def app() -> None:
     """
 
 
+_SOURCES = ("scene", "design", "study", "store", "record", "recording", "identification")
+"""Names of the argument that is the main file of a command."""
+
+
 def shared(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options --json, --out, --report, --title, --author and --unit to a command, which receives them as an
     `Output`."""
@@ -313,7 +317,7 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
         type=click.Path(path_type=Path, dir_okay=False),
         help="Write a report with inputs, results and figures to this file (.html).",
     )
-    @click.option("--title", help="Title of the report [name of the command and of the scene file].")
+    @click.option("--title", help="Title of the report [name of the command and of its file].")
     @click.option("--author", help="Author of the report.")
     @click.option(
         "--unit",
@@ -329,7 +333,9 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
         from jaxvib.display import display_units  # slow import, which --help does not need
 
         display_units(speed="rad/s" if unit == "SI" else unit, si=unit == "SI")  # pyright: ignore[reportArgumentType]
-        output = Output(as_json, out, report, rest.get("scene"), title=title, author=author)
+        source = next((rest[name] for name in _SOURCES if rest.get(name) is not None), None)
+        heading = title if title or source is None else f"{command.__name__.replace('_', '-')}: {source.stem}"
+        output = Output(as_json, out, report, rest.get("scene"), title=heading, author=author)
         with output.waiting():
             command(output=output, **rest)
 

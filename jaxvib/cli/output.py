@@ -215,7 +215,7 @@ class Output:
         draw_sketch = getattr(jv, "sketch", None)
         arguments = click.get_current_context().find_root().obj or [name]
         page = Report(
-            title=self.title or (name if self.scene is None else f"{name}: {self.scene.stem}"),
+            title=self.title or name,
             author=self.author or "",
             command=" ".join(["jaxvib", *arguments]),
             document=document,
