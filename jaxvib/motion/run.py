@@ -15,14 +15,14 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import Axes, Drawn, Onto, SpeedUnit, quantity_text, speed_text
+from jaxvib.display import Axes, Drawn, Onto, SpeedUnit, quantity_text
 from jaxvib.equations.forces import normal_force
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import on_body, read_place
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import start_notes
-from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory
+from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory, turning_masses
 from jaxvib.motion.analysis.points import (
     PointMotion,
     absent_vibration,
@@ -172,7 +172,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         rotors = [w[-1] for w in self.window.rotor_speeds]
         stuck = [] if np.max(np.abs(rotors)) > 1.0 else start_notes(self.scene)
         if not stuck and float(jnp.abs(self.omega)) < STILL_SHARE * float(self.scene.top_speed):
-            stuck = [f"the {self._turning} are almost at rest"]
+            stuck = [f"the {turning_masses(self.scene)} are almost at rest"]
         state = "settled" if bool(self.settled) else f"not settled: {stuck[0] if stuck else 'run longer'}"
         state = "steady in the mean" if bool(self.status == RunStatus.beating) else state
         state = "balanced" if bool(self.status == RunStatus.creeping) else state
@@ -192,8 +192,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  {error}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
                 *([] if self.window.time.dtype.itemsize >= 8 else [_SINGLE_PRECISION]),
-                f"  {self._turning} turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)})"
-                + self._rotors_of_loads(),
+                f"  {self.speeds_text(self.scene, self.window.rotor_speeds)}",
                 f"  {self.amplitude_text(self.scene)}",
                 *(f"  {line}" for line in measures_text(self.scene, self.no_vibration, self.vibration, measures)),
                 *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
@@ -214,18 +213,6 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         largest = zip(structure.coordinates, np.asarray(self.largest_displacement), structure.units, strict=True)
         named = ", ".join(f"{name} {quantity_text(x, unit, 4)}" for name, x, unit in largest)
         return f"largest on the way: {named}; foundation force {quantity_text(self.largest_force, 'N', 4)}"
-
-    def _rotors_of_loads(self) -> str:
-        """Return the final speeds of the rotors of loads as text; the speed of another rotor is that of its exciter."""
-        exciters = zip(self.scene.exciters, self.window.rotor_speeds, strict=True)
-        ends = [speeds[-1] for exciter, speeds in exciters if exciter.loads is not None]
-        return f", {'rotor' if len(ends) == 1 else 'rotors'} at {speed_text(ends, 6)}" if ends else ""
-
-    @property
-    def _turning(self) -> str:
-        """Name of the masses to which `load_speed` belongs: loads, exciters, or both."""
-        has_loads = [exciter.loads is not None for exciter in self.scene.exciters]
-        return "loads" if all(has_loads) else "loads and exciters" if any(has_loads) else "exciters"
 
     def _detachment(self) -> list[str]:
         times = np.asarray(self.detached)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.display import quantity_text
+from jaxvib.display import quantity_text, speed_text
 from jaxvib.equations.dynamics import Dynamics
 from jaxvib.equations.model import Model
 from jaxvib.equations.state import State
@@ -106,6 +106,23 @@ class AbstractMeasured(Readable):
         named = zip(structure.coordinates, self.amplitude, structure.units, strict=True)
         amplitude = ", ".join(f"{name} {quantity_text(a, unit, 4)}" for name, a, unit in named)
         return f"amplitude, zero to peak: {amplitude}; foundation force {quantity_text(self.foundation_force, 'N', 4)}"
+
+    def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array]) -> str:
+        """Return the speeds of the turning masses, and the last `rotor_speeds` of loads, as a line of text.
+
+        The speed of a rotor without loads is that of its exciter.
+        """
+        exciters = zip(scene.exciters, rotor_speeds, strict=True)
+        rotors = [speeds[-1] for exciter, speeds in exciters if exciter.loads is not None]
+        rotor = f", {'rotor' if len(rotors) == 1 else 'rotors'} at {speed_text(rotors, 6)}" if rotors else ""
+        each = speed_text(self.load_speed, 6)
+        return f"{turning_masses(scene)} turn at {speed_text(self.omega, 6)} (each: {each}){rotor}"
+
+
+def turning_masses(scene: Scene) -> str:
+    """Return the name of the masses to which `load_speed` belongs: "loads", "exciters", or both."""
+    has_loads = [exciter.loads is not None for exciter in scene.exciters]
+    return "loads" if all(has_loads) else "loads and exciters" if any(has_loads) else "exciters"
 
 
 class Measured(AbstractMeasured):

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import Drawn, Onto, SpeedUnit, speed_text
+from jaxvib.display import Drawn, Onto, SpeedUnit
 from jaxvib.equations.linear import linear_model, peak_force
 from jaxvib.equations.torque_balance import resultant_of
 from jaxvib.machine.drives.drive import Motor
@@ -167,14 +167,12 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         if named in ("would_separate", "unstable"):
             first, end = [f"not settled: {self.message}"], EnvelopeStatus[EnvelopeStatus.done]
             state = f"periodic only {'while the loads are at one angle' if named == 'would_separate' else 'until disturbed'}"
-        rotors = speed_text([speed[-1] for speed in self.window.rotor_speeds], 6)
-        rotor = "rotor" if len(self.window.rotor_speeds) == 1 else "rotors"
         return "\n".join(
             [
                 *first,
                 f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
-                f"  loads turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), {rotor} at {rotors}",
+                f"  {self.speeds_text(self.scene, self.window.rotor_speeds)}",
                 f"  {self.amplitude_text(self.scene)}",
                 *(f"  {line}" for line in measured),
                 f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
