@@ -1,9 +1,10 @@
-"""The command lines of README and documentation are ones that the command line takes, and run."""
+"""The command lines of README, documentation, templates and help texts are ones that the command line takes, and run."""
 
 import pathlib
 import re
 import shlex
 import shutil
+import tomllib
 
 import click
 import numpy as np
@@ -16,8 +17,12 @@ ROOT = pathlib.Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
+TEMPLATES = sorted(file for folder in ("jaxvib", "optimize", "examples") for file in (ROOT / folder).rglob("*.toml"))
+SOURCES = sorted((ROOT / "jaxvib").rglob("*.py"))
+
+
 def printed():
-    """{command line: the page it is on first}, of blocks, and of code within sentences that has arguments."""
+    """{command line: the file it is in first}, of blocks, and of code within sentences that has arguments."""
     found = {}
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
@@ -27,6 +32,13 @@ def printed():
         for line in (*lines, *spans):
             command = re.sub(r"\s+#.*", "", line).strip()
             found.setdefault(command, page.stem)
+    for file, pattern in (
+        *((file, r"#.*?(jaxvib [a-z-]+ [^\n,;()]+)$") for file in TEMPLATES),
+        *((file, r"`(jaxvib [a-z-]+ [^-`{][^`{]*)`") for file in SOURCES),
+    ):
+        for command in re.findall(pattern, file.read_text(encoding="utf-8"), flags=re.M):
+            if " ... " not in command:
+                found.setdefault(command.strip(), file.stem)
     return found
 
 
@@ -43,6 +55,8 @@ def words_of(line):
 
 def test_the_documentation_has_command_lines():
     assert len(COMMANDS) > 35 and {words_of(line)[0][0] for line in COMMANDS} == set(app.list_commands(None))
+    in_files = {"jaxvib describe name_plate_motor", "jaxvib sweep study.toml", "jaxvib new identification > fit.toml"}
+    assert in_files <= set(COMMANDS)
 
 
 @pytest.mark.parametrize("line", COMMANDS)
@@ -120,3 +134,28 @@ def record_run_up(path):
     angle = 20.0 * t + 2.0 * t**2
     columns = np.stack([t, np.sin(angle), np.clip(50.0 * np.sin(angle), 0.0, 5.0)], axis=1)
     np.savetxt(path, columns, delimiter=",", header="time (s),frame (g),tacho (V)", comments="", fmt="%.9g")
+
+
+def test_readme_activates_the_environment_before_jaxvib():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    lines = [line.strip() for line in re.findall(r"^    (.+)$", text, flags=re.M)]
+    first = next(k for k, line in enumerate(lines) if line.startswith("jaxvib "))
+    assert lines[:first] == ["make demo", ". .venv/bin/activate"]
+
+
+def test_the_demo_installs_no_packages_of_the_tests():
+    text = (ROOT / "Makefile").read_text(encoding="utf-8")
+    needed = re.search(r"^demo: \$\(VENV\)/(.+)$", text, flags=re.M)[1]
+    recipe = re.search(rf"^\$\(VENV\)/{needed}: pyproject.toml\n((?:\t.*\n)+)", text, flags=re.M)[1]
+    assert "--editable .\n" in recipe and "[" not in recipe
+
+
+def test_printed_installations_name_extras_of_this_project():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    found = set()
+    for file in (*PAGES, *SOURCES):
+        for requirement in re.findall(r"pip install ['\"]?([^\s'\"`]*\[[^\]]*\])", file.read_text(encoding="utf-8")):
+            name, names = requirement[:-1].split("[")
+            assert name == ".", f"{file.name}: {requirement}; jaxvib is installed from its sources"
+            found |= set(names.split(",")) - {"{extra}"}
+    assert {"explore", "sweep"} <= found <= set(extras)
