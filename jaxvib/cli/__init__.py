@@ -14,11 +14,11 @@ from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 
 _LATER = 0.05
-"""Time after which an interrupt is repeated, s, if its moment was not suitable."""
+"""Time, s, after which an interrupt is repeated if it could not be handled."""
 
 
 _USING_INTERRUPTS = ("optimize", "sweep", "explore")
-"""Commands for which an interrupt is an exception: they print their result so far or end a server."""
+"""Commands that handle an interrupt as an exception: they print the result found so far, or end a server."""
 
 
 def main() -> None:
@@ -73,9 +73,9 @@ def _is_loading_extension(frame: FrameType | None) -> bool:
 
 
 def _repeat_lost_interrupt(lost: sys.UnraisableHookArgs) -> None:
-    """Interrupt again if Python discarded an interrupt, which it does in a callback of a weak reference or of C.
+    """Interrupt again if Python discarded an interrupt. Python discards exceptions in callbacks of weak references and of C.
 
-    The default hook would print the interrupt, and the command would go on.
+    The default hook would only print the interrupt, and the command would continue.
     """
     if issubclass(lost.exc_type, KeyboardInterrupt):
         _interrupt_later()

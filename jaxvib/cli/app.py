@@ -130,8 +130,8 @@ TOLERANCE = click.option(
     "tolerances",
     multiple=True,
     metavar="NAME=SHARE",
-    help="Ranges over machines with deviations, repeatable: stiffness=5%, damping=30%, load=0..20kg (material on platform or "
-    "body 1).",
+    help="Show the ranges of the results for machines within tolerances, repeatable: stiffness=5%, damping=30%, load=0..20kg "
+    "(material on platform or body 1).",
 )
 """Option of commands that show ranges over machines within tolerances."""
 

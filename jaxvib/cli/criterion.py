@@ -50,11 +50,11 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
         from jaxvib.draw.style import panels
         from jaxvib.steady.balance.criterion import criterion_functional
 
-        crowd = np.concatenate([w + np.geomspace(1e-4, 0.2, 60) * w * s for w in document["resonances"] for s in (-1, 1)])
-        speeds = np.unique(np.clip(np.concatenate([np.linspace(1e-3, 1.0, 1200) * top, crowd]), 1e-3 * top, top))
-        pull = jax.vmap(lambda w: criterion_functional(loaded, w))(jnp.asarray(speeds))
+        near = np.concatenate([w + np.geomspace(1e-4, 0.2, 60) * w * s for w in document["resonances"] for s in (-1, 1)])
+        speeds = np.unique(np.clip(np.concatenate([np.linspace(1e-3, 1.0, 1200) * top, near]), 1e-3 * top, top))
+        functional = jax.vmap(lambda w: criterion_functional(loaded, w))(jnp.asarray(speeds))
         figure, (axis,) = panels(1)
-        criterion_chart(axis, speeds, np.asarray(pull), document["balancing"], exact, float(loaded.drive.speed))
+        criterion_chart(axis, speeds, np.asarray(functional), document["balancing"], exact, float(loaded.drive.speed))
         return figure
 
     output.picture("criterion.png", figure)

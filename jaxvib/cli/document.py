@@ -21,7 +21,7 @@ _DECK_KEY = "jaxvib.deck_point"
 """Key of the values of --deck and --slope in the context of click."""
 
 _NOTED_KEY = "jaxvib.noted_measures"
-"""Key of True in the context of click if a note about implausible measures was printed."""
+"""Key in the context of click. Its value is True if a note about implausible measures was printed."""
 
 
 def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:

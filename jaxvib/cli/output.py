@@ -53,7 +53,7 @@ def note(text: str) -> None:
 
 
 def _wrapped(text: str) -> str:
-    """Return a text whose sentences do not break within a word on a terminal; continued lines are indented. Tables fit."""
+    """Return a text whose lines fit on the terminal and break between words. Continued lines are indented; tables are kept."""
     columns = shutil.get_terminal_size().columns
     folded = []
     for line in text.splitlines():

@@ -67,7 +67,7 @@ class EnsembleStatus(eqx.Enumeration):
 
 
 class Ensemble(Result):
-    """Ends of many runs.
+    """Final states of many runs, and quantities measured at their ends.
 
     Returned by `ensemble`.
 

@@ -225,7 +225,7 @@ class Response(AbstractResponse, Result):
 def response(
     scene: Scene, speeds: Numbers | None = None, *, phases: Numbers | None = None, points: int = 500, most: Number | None = None
 ) -> Response:
-    """Return the response of a machine to the unbalances of its exciters over their speed, and the torque that it needs.
+    """Return the vibration of a machine under the unbalances of its exciters over their speed, and the torque that it needs.
 
         Y = w^2 D(w)^-1 f,    f = sum_k S_k exp(i alpha_k) B_k^T e_k,    D = K - w^2 M + i w (C + sigma w G)
         torque of exciter k = -(S_k/2) Im(exp(-i alpha_k) e_k^H B_k w^2 Y)

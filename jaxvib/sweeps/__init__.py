@@ -1,1 +1,2 @@
-"""Studies of many cases of a scene, with labelled results on disk; they can be continued, and use one machine or several."""
+"""Studies of many cases of a scene, with labelled results on disk. A study can be interrupted and continued, and can use
+several machines."""

@@ -88,7 +88,7 @@ def on_a_cluster(
 def _compute_remotely(study: Study, chunk: int, key: str, expected_versions: dict[str, str], is_double: bool) -> Chunk | str:
     """Compute the cases of a chunk on a worker.
 
-    **Returns** a text about the difference if versions differ from those in the store.
+    **Returns** the results; if versions differ from those in the store, a text about the difference.
     """
     for name, version in versions().items():
         if expected_versions[name] != version:

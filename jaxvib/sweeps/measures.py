@@ -146,15 +146,18 @@ RUN_MEASURES = {
         _vibration_measure("run.conveying_speed", "m/s", "conveying_speed"),
     )
 }
-"""Measures of a run by name: regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor, amplitudes and
-foundation force (zero to peak), ripple, drift (see `AbstractMeasured`), and settling time. The settling time is the time after
-which each load speed differs from its final value by less than 1 % of the rotor speed, with a resolution of 1/64 of the time
-before the measuring window; it is the end of the run if the loads do not settle. The relative rotation is the largest
-difference between the angles through which two loads, or rotors without loads, turn in the measuring window. Regime, jam mode,
-ripple and rotor speed need a scene with one exciter and loads. The measures from stroke to conveying speed are those of
-`VibrationMeasures`, for the centre of mass as the point; all but torque and power are NaN for a run that does not end in a
-vibration at the speed of its exciters (see `Run.no_vibration`). The support load is the sum of the static and the vertical
-dynamic load."""
+"""Measures of a run by name.
+
+- regime (see `regime`), jam mode (0: not jammed), ripple and rotor speed. They need a scene with one exciter and loads
+- load speeds, amplitudes and foundation force (zero to peak), drift (see `AbstractMeasured`)
+- relative rotation: the largest difference between the angles through which two loads, or rotors without loads, turn in the
+  measuring window
+- settling time: the time after which each load speed differs from its final value by less than 1 % of the rotor speed, with a
+  resolution of 1/64 of the time before the measuring window. It is the end of the run if the loads do not settle
+- stroke to conveying speed: the measures of `VibrationMeasures` with the centre of mass as the point. All of them except torque
+  and power are NaN for a run that does not end in a vibration at the speed of its exciters (see `Run.no_vibration`)
+- support load: the sum of the static and the vertical dynamic load
+"""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:

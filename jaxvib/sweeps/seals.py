@@ -67,7 +67,7 @@ def seal(store: Path, chunk: int, files: Mapping[str, Path]) -> None:
 
 
 def is_sealed(store: Path, chunk: int, files: Mapping[str, Path]) -> bool | None:
-    """Return True if the seal of a chunk agrees with its files, None if the chunk has no seal."""
+    """Return True if the seal of a chunk agrees with its files, False if it does not, and None if the chunk has no seal."""
     path = seal_of(store, chunk)
     stamps = _stamps({**files, "": path})
     if _intact.get(str(path)) == stamps:

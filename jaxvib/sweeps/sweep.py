@@ -60,7 +60,7 @@ Report = Callable[[Progress], None]
 
 
 class CaseCount(NamedTuple):
-    """Number of `cases` that ended with a `status`, a name of `CaseStatus`, or in a regime or jam mode."""
+    """Number of `cases` with the same `status`: a name of `CaseStatus`, or the name of a regime with its jam mode."""
 
     status: str
     cases: int
@@ -182,8 +182,8 @@ def sweep(
     - `samples`: number of samples; typical: 1000 to 100,000; `sampling`: "low_discrepancy" or "random"; `seed` of the samples
     - `chunk`: number of cases that are computed and written together; a store is continued only with the same number.
       Typical: the default, about a second of computation. With smaller chunks an interruption loses fewer cases, but there are
-      more file operations. An accelerator computes a whole chunk at once, up to 262,144 cases; use chunks there that
-      fill its memory
+      more file operations. An accelerator computes a whole chunk at once, up to 262,144 cases; give a chunk that fills
+      its memory
     - `workers`: number of processes on this machine; or `scheduler`: address of a Dask scheduler ("tcp://10.0.0.1:8786"),
       which must answer within `timeout`, s. Both need the extra `cluster`
     - `report`: a function that is called with a `Progress` after each chunk
@@ -252,8 +252,8 @@ def run_study(
     path = Path(store)
     if workers is not None:
         count(workers, "workers")
-        if workers > (most := max(_MAX_WORKERS, 4 * (os.cpu_count() or 1))):
-            raise InputError("workers", f"is {workers}, too many processes for this machine; give at most {most}")
+        if workers > (limit := max(_MAX_WORKERS, 4 * (os.cpu_count() or 1))):
+            raise InputError("workers", f"is {workers}, too many processes for this machine; give at most {limit}")
     if not path.exists():
         Store.create(path, new_study)
     opened = Store(path, writable=True)

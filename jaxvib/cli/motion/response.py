@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 def response(
     scene: Path, most: str | None, phases: str | None, points: int, without: tuple[str, ...], csv: Path | None, output: Output
 ) -> None:
-    """Compute the vibration of SCENE under the unbalances of its exciters over their speed, and the torque that it needs; --out
-    adds a figure.
+    """Compute the vibration of SCENE under the unbalances of its exciters over their speed, and the torque that the vibration
+    needs; --out adds a figure.
 
     The operating points are the speeds at which the torque of the motor is equal to the torque that the vibration needs.
     Several exciters turn as if gears connected them: with fixed phases, and the sum of their torques. Motors without gears
@@ -63,8 +63,8 @@ def response(
         "phases": angles,
         "phases_from": origin,
         "operating_points": [
-            row | ({} if own is None else {"measures": own.document()})
-            for row, own in zip(
+            row | ({} if measured is None else {"measures": measured.document()})
+            for row, measured in zip(
                 rows_of(result.operating, operating, *measures, *rest, "growth", "stable"), vibration_measures, strict=True
             )
         ],
@@ -125,16 +125,22 @@ def _text(
         lines.append(table("operating points (zero to peak)", [unit, "stays", *moves, *end], rows))
         if several:
             rows = [
-                [f"{scale * points.speed[k]:.5g}", str(number), f"{needed:.4g}", f"{own:.4g}", f"{points.speed[k] * own:.4g}"]
+                [
+                    f"{scale * points.speed[k]:.5g}",
+                    str(number),
+                    f"{needed:.4g}",
+                    f"{motor:.4g}",
+                    f"{points.speed[k] * motor:.4g}",
+                ]
                 for k in operating
-                for number, (needed, own) in enumerate(zip(points.torque[k], points.motor_torque[k], strict=True))
+                for number, (needed, motor) in enumerate(zip(points.torque[k], points.motor_torque[k], strict=True))
             ]
             head = [unit, "exciter", "torque of its vibration, N m", "of its motor, N m", "power of its motor, W"]
             lines.append(table("torques at the operating points", head, rows))
-        stable = [(k, own) for k, own in zip(operating, vibration_measures, strict=True) if own is not None]
-        lines += [indented(f"at {speed_text(points.speed[k])}:", own) for k, own in stable]
+        stable = [(k, each) for k, each in zip(operating, vibration_measures, strict=True) if each is not None]
+        lines += [indented(f"at {speed_text(points.speed[k])}:", each) for k, each in stable]
     else:
-        lines.append("the motor supplies the torque that the vibration needs at no speed")
+        lines.append("no operating point: at no speed is the torque of the motor equal to the torque that the vibration needs")
     if peaks := result.peaks():
         lines.append(table("peaks of the foundation force", [unit, *moves, *end], [motion(result, k) for k in peaks]))
     if folds:

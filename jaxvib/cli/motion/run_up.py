@@ -17,12 +17,14 @@ from jaxvib.errors import InputError
 @app.command("run-up")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--until", required=True, help="End time, such as 20s.")
-@click.option("--least", is_flag=True, help="Also find the smallest factor of all torques with which all exciters pass.")
+@click.option(
+    "--least", is_flag=True, help="Also find the smallest factor of all torques with which all exciters pass the resonances."
+)
 @WITHOUT
 @csv_options
 @shared
 def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
-    """Run the motors of SCENE up from rest by averaged equations: resonances that catch exciters, and peaks on the way.
+    """Compute the run-up of the motors of SCENE from rest by averaged equations, and list the resonances that catch exciters.
 
     --out adds the figure. For loads (balls, pendulums) and several drags use `run-up-map`."""
     found = jv.run_up(loaded_scene(scene, without), until, least=least)

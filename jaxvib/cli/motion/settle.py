@@ -49,9 +49,7 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode near which
     "--drift", type=float, help="Largest drift (relative change) of a settled motion [1e-6, or a change without a trend]."
 )
 @click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-9].")
-@click.option(
-    "--stretches", type=int, default=200, show_default=True, help="Largest number of parts of the run (100 slow periods)."
-)
+@click.option("--stretches", type=int, default=200, show_default=True, help="Largest number of stretches of the run.")
 @SPEED
 @TOLERANCE
 @deck_options
@@ -132,8 +130,10 @@ def envelope(
 @click.option("--stretches", type=int, default=40, show_default=True, help="Number of equal parts of the run, at least 8.")
 @shared
 def growth(scene: Path, speed: str | None, output: Output, **options: Any) -> None:
-    """Measure the growth of small disturbances of a motion of SCENE: regular, unstable, chaotic or undecided, and the time
-    after which derivatives are meaningless."""
+    """Measure the growth of small disturbances of a motion of SCENE.
+
+    The growth shows if the motion is regular, unstable, chaotic or undecided. It also determines the time after which
+    derivatives are meaningless."""
     if options["start"] == "spin_up":
         raise InputError("--start", "is 'spin_up'; the growth of disturbances needs a constant speed, use 'rest' or 'jam'")
     result = jv.growth(loaded_scene(scene, speed=speed, constant=True), **_with_start(options))

@@ -30,7 +30,9 @@ _OMEGA = click.option(
     metavar="FROM TO",
     help="Range of load speeds, such as '20 rad/s' '60 rad/s'.",
 )
-_POINTS_OPTION = click.option("--points", type=int, default=300, show_default=True, help="Load speeds of each diagram.")
+_POINTS_OPTION = click.option(
+    "--points", type=int, default=300, show_default=True, help="Number of load speeds of each diagram."
+)
 
 
 @app.command("stability-map")
@@ -74,7 +76,7 @@ def stability_map(
             [f"{row['value']:.6g}", f"{100.0 * row['stable_share']:.3g} %", _special_text(row["special"], scale)]
             for row in rows
         ]
-        return table(f"exact jams over {vary}", [words, "of load speeds stable", f"where stability changes, {unit}"], cells)
+        return table(f"exact jams over {vary}", [words, "stable load speeds", f"where stability changes, {unit}"], cells)
 
     output.done({"vary": vary, "map": rows}, text, "stability_map", result)
 

@@ -51,11 +51,10 @@ def audit(
     output: Output,
     **options: Any,
 ) -> None:
-    """Report by how much each effect and each tier changes the results of SCENE, and its cost: negligible and missing
-    effects.
+    """List the changes of the results of SCENE by each effect and each tier, and the cost of each.
 
-    The effects of the scene are removed one at a time, and effects that the scene lacks are added one at a time, with typical
-    values. --out adds the figure."""
+    The list shows negligible and missing effects. The effects of the scene are removed one at a time, and effects that the
+    scene lacks are added one at a time, with typical values. --out adds the figure."""
     if count_operations:
         from jaxvib.study.audit.operation_counts import operation_counts  # slow import, which --help does not need
 

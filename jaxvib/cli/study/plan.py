@@ -17,7 +17,7 @@ from jaxvib.errors import InputError
 @click.option("--fit", type=click.Path(path_type=Path), help="A fit.npz of `jaxvib identify`, in place of a new fit.")
 @shared
 def plan(identification: Path, fit: Path | None, output: Output) -> None:
-    """Rank the candidate runs of an IDENTIFICATION file by how much they reduce the expected errors of its unknown numbers, per
+    """Rank the candidate runs of an IDENTIFICATION file by the reduction of the expected errors of its unknown numbers per
     minute of test.
 
     The file names the runs so far, as for `identify`, and each [[candidate]]: a ramp, a dwell or a coast-down, other places of

@@ -136,7 +136,7 @@ class _Scaled(MotorWrapper):
 
 @validated
 def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
-    """Run the motors of a scene up from rest by the averaged equations, and name the resonances that catch exciters.
+    """Compute the run-up of the motors of a scene from rest by averaged equations, and the resonances that catch exciters.
 
     An exciter has passed a natural frequency if its speed at the end is at least 5 % higher. An exciter is caught by the lowest
     natural frequency that it has not passed, if this frequency is below 0.95 of the no-load speed of its motor.

@@ -117,10 +117,9 @@ def stability_onset(
     points: int = 300,
     accuracy: float = 1e-3,
 ) -> float:
-    """Return the x from which the exact diagram of `make(x)` has a special point of a kind, by bisection in log x.
+    """Return the x at which a special point of a kind appears in the exact diagram of `make(x)`, by bisection in log x.
 
-    The bisection finds one x at which such a point appears. This x is the smallest one only if the point exists for all larger
-    x.
+    If such a point appears at several x in the range, the bisection finds one of these x.
 
     Odd jam modes of light loads are stable on their whole range. This function finds, for example, the load mass above which a
     torus bifurcation ends the stable range before the fold, or above which the half-turn symmetry breaks.
