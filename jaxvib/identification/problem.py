@@ -51,8 +51,8 @@ _FREQUENCY_MARGIN, _SPEED_TIMES = 1.5, 64
 sampling rate."""
 
 _STRETCH_ANGLE, _MAX_STRETCHES = 25.0, 64
-"""Length of a stretch of a motion with loads, rad of the slowest vibration, and largest number of stretches: the first values
-of the numbers must describe a stretch to less than a radian."""
+"""Length of a stretch of a motion with loads, rad of the slowest vibration, and largest number of stretches. With the first
+values of the unknowns, the phase error within a stretch must be less than a radian."""
 
 _STEPS_PER_RADIAN = 1.0
 """Number of steps of order 8 per radian of the fastest motion, with errors of about 3e-9 in a turn."""
@@ -69,7 +69,7 @@ class Known(NamedTuple):
 
     @property
     def is_exact(self) -> bool:
-        """True for a number without an error; for an unbalance the error `EXACT` stands for 0."""
+        """True for a number without an error. The error of an unbalance that is known exactly is `EXACT` instead of 0."""
         return self.error <= 1.001 * EXACT * abs(self.value)
 
 
@@ -175,7 +175,7 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     scale = np.where(values != 0.0, np.abs(values), [number.spec.typical or 1.0 for number in nonlinear])
     means, errors = _known_means(nonlinear, known_numbers, values, positive, scale)
 
-    runs = [_with_own_rate(scene, run) for run in runs]
+    runs = [_with_reduced_rate(scene, run) for run in runs]
     notes = [note for run in runs for note in run.notes]
     notes += [f"{run.source}: channel {c.name!r} of kind {c.kind} is not used" for run in runs for c in run.of_kind(*UNUSED)]
     angles = [rotor_angles(_changed(scene, run), run) for run in runs]
@@ -247,10 +247,10 @@ def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs:
             )
 
 
-def _with_own_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
-    """Return the run; the sampling rate of a long run is reduced to the rate that its highest frequency needs.
+def _with_reduced_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
+    """Return the run. The sampling rate of a long run is reduced to the rate that its highest frequency needs.
 
-    The natural frequencies have a margin, because they are those of the first values.
+    The natural frequencies are increased by a margin, because they are computed from the first values of the unknowns.
     """
     if max(time.size for time in run.times.values()) < MIN_SAMPLES:
         return run
@@ -310,7 +310,7 @@ def _known_unbalance(
     scene: Scene, k: int, free: Mapping[str, NamedNumber], known_numbers: Mapping[str, tuple[NamedNumber, Known]]
 ) -> Known | None:
     if scene.exciters[k].unbalance is None:
-        return Known(1.0, EXACT)  # the components of an unbalance that acts on nothing
+        return Known(1.0, EXACT)  # any unbalance, because it has no effect
     number = find_number(scene, f"exciters[{k}].unbalance", "unknown")
     if number.name in known_numbers and known_numbers[number.name][1].error > 0.0:
         return known_numbers[number.name][1]
@@ -437,16 +437,16 @@ def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: 
     values, from which the influence of outliers and of clipped readings follows; None in the first passes.
     """
     runs = []
-    for r, (samples, mask, raw, own) in enumerate(zip(problem.runs, problem.masks, problem.raw, noise, strict=True)):
+    for r, (samples, mask, raw, of_channels) in enumerate(zip(problem.runs, problem.masks, problem.raw, noise, strict=True)):
         delayed = any(channel.delay != 0.0 for channel in samples.channels)
         filters = []
-        for channel, each in zip(samples.channels, own, strict=True):
+        for channel, each in zip(samples.channels, of_channels, strict=True):
             shift, lag = (np.ones(1), np.ones(1)) if not delayed else _delay_taps(channel.delay / float(samples.step))
             filters.append((np.convolve(each.taps, shift), np.convolve(each.taps, lag)))
         longest = next(n for n in _FILTER_LENGTHS if n >= max(len(taps) for pair in filters for taps in pair))
         shape, n = samples.readings.shape, raw.shape[0]
         readings, weights = np.zeros((shape[0] * shape[1], raw.shape[1])), np.zeros((shape[0] * shape[1], raw.shape[1]))
-        for k, ((data, model), each) in enumerate(zip(filters, own, strict=True)):
+        for k, ((data, model), each) in enumerate(zip(filters, of_channels, strict=True)):
             readings[:n, k] = np.convolve(raw[:, k], data)[:n]
             valid = mask[:, k].copy()
             for j in np.flatnonzero(data):

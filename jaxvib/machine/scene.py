@@ -115,8 +115,8 @@ class Exciter(Part):
 
         **Arguments**: `loads`, `drive` and `effects` of the new exciter.
         """
-        own = {name: getattr(self, name) for name in ("unbalance", "unbalance_mass", "at", "body", "direction")}
-        return Exciter(loads, drive, effects=effects, **own)
+        kept = {name: getattr(self, name) for name in ("unbalance", "unbalance_mass", "at", "body", "direction")}
+        return Exciter(loads, drive, effects=effects, **kept)
 
     @property
     def turning_drive(self) -> Drive:
@@ -161,9 +161,9 @@ def read_unbalance(drive: Drive, unbalance: Number | None, unbalance_mass: Numbe
 
 
 def _require_inertia(unbalance: float, mass: float, inertia: float) -> None:
-    own = unbalance**2 / mass
-    if inertia < own * (1.0 - 1e-12):
-        problem = f"is {inertia:g} kg m^2, less than that of the unbalance alone, S^2/m = {own:g} kg m^2"
+    smallest = unbalance**2 / mass
+    if inertia < smallest * (1.0 - 1e-12):
+        problem = f"is {inertia:g} kg m^2, less than that of the unbalance alone, S^2/m = {smallest:g} kg m^2"
         raise InputError("drive.inertia", f"{problem}; it must include the unbalance")
 
 
@@ -299,9 +299,9 @@ class Scene(Part):
         >>> scene.replace(effects=(jv.Gravity(),)).all_effects[0].kind
         'gravity'
         """
-        own = self.exciter
-        all_parts = {"machine": self.machine, "loads": own.loads, "drive": own.drive, "effects": self.all_effects} | parts
-        exciter = own.with_parts(all_parts.pop("loads"), all_parts.pop("drive"))
+        old = self.exciter
+        all_parts = {"machine": self.machine, "loads": old.loads, "drive": old.drive, "effects": self.all_effects} | parts
+        exciter = old.with_parts(all_parts.pop("loads"), all_parts.pop("drive"))
         return Scene(**all_parts, exciters=[exciter])
 
     def prefix_of(self, k: int) -> str:
@@ -345,7 +345,7 @@ def _require_fit(machine: Machine, exciter: Exciter) -> None:
 
 
 def _acts_on_machine(effect: Effect) -> bool:
-    """True if an effect acts on the whole machine, False if it acts on one rotor and its loads."""
+    """Return True if an effect acts on the whole machine, False if it acts on one rotor and its loads."""
     return has_term([effect], GravityField, SupportForce)
 
 

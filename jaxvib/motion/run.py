@@ -105,8 +105,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
     - `steps`: number of accepted and rejected steps; `rejected`: number of rejected steps
     - `error`: estimated error; NaN if no estimate was requested, infinite if it cannot be estimated; typical: 1e-8 to 1e-5
     - `scene` of the run
-    - `coincident`: True if several loads started at one angle and stayed at one angle. Loads with the same parameters do so
-      even if this motion is unstable. If such a motion settles, its stability is tested by the linearized equations; if
+    - `coincident`: True if several loads started at one angle and stayed at one angle. Loads with the same parameters stay at
+      one angle even if this motion is unstable. If this motion settles, its stability is tested by the linearized equations. If
       slightly separated loads would leave it, the status is `would_separate`, and the run is not `settled`. Loads with a
       `ball_radius` that end inside each other have the status `overlapping`, which the effect `LoadContact` prevents
     - `engine` of the integration: "scalar" if the equations are computed on scalars, which is faster for small states, or
@@ -362,8 +362,10 @@ def _histories(trajectory: Trajectory) -> list[np.ndarray]:
 
 
 def with_separation_status(run: Run, *, is_settled: bool = True) -> Run:
-    """Return the run with the status `overlapping` if loads with a size are inside each other at its end, with the status
-    `would_separate` if loads stay at nearly one angle although this motion is unstable, otherwise unchanged.
+    """Return the run with the status `overlapping` or `would_separate` if it applies, otherwise unchanged.
+
+    - `overlapping`: loads with a size are inside each other at the end of the run
+    - `would_separate`: loads stay at nearly one angle although this motion is unstable
 
     The end of a settled run is its measuring window. The end of another run is its last state, which only `overlapping` tests.
     """

@@ -125,13 +125,7 @@ def _text(
         lines.append(table("operating points (zero to peak)", [unit, "stays", *moves, *end], rows))
         if several:
             rows = [
-                [
-                    f"{scale * points.speed[k]:.5g}",
-                    str(number),
-                    f"{needed:.4g}",
-                    f"{motor:.4g}",
-                    f"{points.speed[k] * motor:.4g}",
-                ]
+                [f"{scale * points.speed[k]:.5g}", str(number), *(f"{x:.4g}" for x in (needed, motor, points.speed[k] * motor))]
                 for k in operating
                 for number, (needed, motor) in enumerate(zip(points.torque[k], points.motor_torque[k], strict=True))
             ]

@@ -163,14 +163,13 @@ class Converter(MotorWrapper):
 
         T(t, theta') = T_motor(theta' + n_motor - n(t))
 
-    n_motor is the motor's own no-load speed (`motor.speed`). The converter shifts the torque curve of the motor along the speed
-    axis, so that the torque is 0 at the speed n(t). This is exact for a `DCMotor` whose voltage is changed, and for
-    Kloss's formula at constant flux (voltage in proportion to the frequency).
+    n_motor is the no-load speed of the motor without the converter (`motor.speed`). The converter shifts the torque curve of
+    the motor along the speed axis, so that the torque is 0 at the speed n(t). This is exact for a `DCMotor` whose voltage is
+    changed, and for Kloss's formula at constant flux (voltage in proportion to the frequency).
 
     **Arguments**
 
-    - `motor` without states of its own (such as currents) and without switching times, such as an `InductionMotor`; not another
-      converter
+    - `motor` without states (such as currents) and without switching times, such as an `InductionMotor`; not another converter
     - `reference` n(t): an ideal drive, such as a `RunUp`, a `SpinUp` or a `SpeedProfile`
 
     **Raises** `InputError` for a motor or a reference of the wrong type.

@@ -61,9 +61,9 @@ def support(
     - `at` (2,): the point of the body, (x, y) m from the centre of mass of all parts that the body's `mass` includes
       (unbalances count as masses on the axes of their exciters); typical: 0.2 to 3 m
     - `stiffness` (k1, k2), N/m; typical: 1e4 to 1e6
-    - `damping` (c1, c2), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(k m). Also a percentage of it, with the
-      mass m that this support carries, "5 % of 250 kg", or a loss factor of rubber at a frequency of vibration, "loss factor
-      0.1 at 16 Hz"
+    - `damping` (c1, c2), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(k m). It can also be a percentage of the
+      critical damping, with the mass m that this support carries ("5 % of 250 kg"), or a loss factor of rubber at a frequency
+      of vibration ("loss factor 0.1 at 16 Hz")
     - `angle` of the first spring, rad, anticlockwise from x; typical: 0 (the default)
     - `body`: number of the body in a `plane_network`, from 0; typical: 0 (the default)
     - `to`: number of the body at the other end; default: the foundation
@@ -218,9 +218,9 @@ class _Bodies(Machine):
     def _point_rows(self, at: Array, body: int) -> Array:
         """Return the rows (2, nd) of the point `at` of a body."""
         lever = jnp.stack([-at[1], at[0]])
-        own = jnp.concatenate([jnp.eye(2, dtype=at.dtype), lever[:, None]], axis=1)
+        of_body = jnp.concatenate([jnp.eye(2, dtype=at.dtype), lever[:, None]], axis=1)
         before, after = 3 * body, 3 * (self.body_count - body - 1)
-        return own if before + after == 0 else jnp.pad(own, ((0, 0), (before, after)))
+        return of_body if before + after == 0 else jnp.pad(of_body, ((0, 0), (before, after)))
 
 
 def _force_rows(each: PlaneSupport, rows: Array, along: Array, name: str) -> Array:

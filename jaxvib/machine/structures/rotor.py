@@ -97,8 +97,11 @@ class Rotor(Machine):
         return dataclasses.replace(carrier, **changed) if changed else carrier
 
     def mount(self, at: Place = None) -> Mount:
-        """Return the motion of the exciter's station; if the loads have stations of their own, the motion of the centre of mass
-        and the tilt of the axis, with the station of each load as its lever."""
+        """Return the motion of the exciter's station.
+
+        If each load has a separate station, return the motion of the centre of mass and the tilt of the axis, with the station
+        of each load as its lever.
+        """
         skew = np.zeros((4, 4))
         skew[2, 3], skew[3, 2] = 1.0, -1.0
         station = self.stations if at is None else jnp.asarray(at)
@@ -114,7 +117,7 @@ class Rotor(Machine):
     def rows_at(self, place: Place, name: str = "place") -> Array:
         """Return the matrix that gives the displacement of the point of the axis at a distance from the centre of mass, m.
 
-        None is the common station of the loads, or the centre of mass if each load has its own.
+        None is the common station of the loads, or the centre of mass if each load has a separate station.
         """
         if isinstance(place, int):
             raise InputError(
@@ -199,7 +202,7 @@ def rotor(
     - `damping_terms` (b1, b2, b3) in N s/m, N s, N m s: a list of three in place of the terms that follow from the supports;
       typical: 800, up to 10, 20
     - `stiffness_up` (2,), N/m, and `damping_up` (2,), N s/m: vertical values of the supports; `stiffness` and `damping` are
-      then the horizontal ones; typical: 0.5 to 2 times those; default: equal to them
+      then the horizontal values; typical: 0.5 to 2 times the horizontal values; default: the horizontal values
 
     **Returns** `Rotor`.
 
@@ -347,7 +350,7 @@ def planar_rotor(
     - `damping` b, N s/m; typical: 50 to 1000; also a ratio of the critical damping 2 sqrt(k M), "5 %", or a loss factor, see
       `one_mass`
     - `stiffness_up` k_up, N/m, and `damping_up` b_up, N s/m: vertical values, if `stiffness` and `damping` are the horizontal
-      ones; typical: 0.5 to 2 times those; default: equal to them
+      values; typical: 0.5 to 2 times the horizontal values; default: the horizontal values
 
     **Returns** `PlanarRotor`. **Raises** `InputError` for wrong units and values that are not allowed.
 

@@ -171,9 +171,9 @@ class JamModes(AbstractJam):
 
         **Raises** `InputError` for a number outside 1 .. 2 nd + 1; with `throw` also the errors of `select`.
         """
-        most = self.mode.shape[0]
-        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
-            raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {most}")
+        count = self.mode.shape[0]
+        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= count:
+            raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {count}")
         if throw:
             when_known(lambda *_: self._require_mode(int(mode)), self.omega, self.status)
         return int(mode) - 1
@@ -383,7 +383,7 @@ def jam_at(
     """Return the jam of mode `number` with load speed `omega` rad/s at a rotor speed (rad/s) at which it exists, all scalars.
 
     **Arguments**: `rotor_speed` (default: that of the branch); `at_fold`: True if the jam is at a fold (default: if the slope
-    of the branch is almost zero). Never returns `absent`; the caller has established that the mode exists.
+    of the branch is almost zero). The status is never `absent`, because the caller has checked that the mode exists.
     """
     speed, slope, displacement = branch_tangent(model, omega)
     rotor_speed = speed if rotor_speed is None else rotor_speed
@@ -420,9 +420,9 @@ def _can_stay_together(model: JammedModel, omega: Array, rotor_speed: Array, dis
     loads = model.loads
     if loads.alike:
         return True
-    most = loads.mass * loads.radius * omega**2 * magnitude(jnp.sum(model.force_direction.conj() * displacement)) / 2.0
-    need = loads.drag * loads.radius**2 * (rotor_speed - omega)
-    return jnp.all(~(most < (1.0 - 1e-6) * need))
+    available = loads.mass * loads.radius * omega**2 * magnitude(jnp.sum(model.force_direction.conj() * displacement)) / 2.0
+    needed = loads.drag * loads.radius**2 * (rotor_speed - omega)
+    return jnp.all(~(available < (1.0 - 1e-6) * needed))
 
 
 def branch_points(model: JammedModel, omega: Array) -> tuple[Jam, Folds]:

@@ -40,7 +40,7 @@ _SHOWN_DRAG_FACTOR = 30.0
 """Drag range of a figure of all jams: from the scene's drag divided by this factor to the drag times it."""
 
 _SAME_LINE_DIFFERENCE = 5e-3
-"""Unstable patterns whose drags differ by less, relative, are drawn once."""
+"""Relative difference of drags below which the lines of two unstable patterns are drawn as one line."""
 
 _JAMS_PER_PROGRAM = 64
 """Number of jams in one program; typical scenes have some tens."""
@@ -147,8 +147,9 @@ def phase_jams(
     **Arguments**
 
     - `scene` with a drive of prescribed speed and loads with drag; typical: 2 to 4 loads
-    - `starts`: random sets of phases at each load speed; typical: 16 to 1024 (default 128). Stable jams are found with a few;
-      unstable ones close to the separation of two patterns need many. The time is proportional to this number
+    - `starts`: number of random sets of phases at each load speed; typical: 16 to 1024 (default 128). A few are enough for
+      stable jams. Many are necessary for unstable jams near a load speed at which two patterns separate. The time is
+      proportional to this number
     - `seed` of these random phases
     - `near`: (omega, phase), a speed rad/s and the phases (count,) rad of the loads, from which Newton's method finds one jam,
       see `phase_jam`; the function can then be used under `jit`, `vmap` and `grad`
@@ -181,7 +182,7 @@ def _jams_from_starts(scene: Scene, balance: TorqueBalance, omega: np.ndarray, p
     groups = equal_loads(balance)
     starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(balance.speed)))
     places, reached = _distinct(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
-    # Starts that were solved to a low accuracy can lead to the same jam, which shows only after convergence.
+    # Several starts can lead to the same jam. At the low accuracy of the search this is not visible.
     first = starts_at[np.asarray(places, dtype=int)]
     jams = in_chunks(_JAMS_PER_PROGRAM, lambda w, a: _jams_from(scene, w, a), omega[first], phase[first])
     found = np.flatnonzero(status_names(jams.status) == "found")

@@ -53,7 +53,7 @@ def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
 
     If none of them is stable, slower regimes follow in the order of their speeds. The search takes a hundredth of the time of
     `synchronous_regimes`, and works under `jit`, `vmap` and `grad`. Derivatives are those of the implicit function theorem.
-    With more than 6 exciters the starts first approach stable regimes, as those of `synchronous_regimes`.
+    With more than 6 exciters, each start is first moved toward a stable regime, as in `synchronous_regimes`.
 
     **Arguments**
 
