@@ -96,7 +96,7 @@ def _row(regime: jv.SynchronousRegime, scale: float) -> list[str]:
     return [
         f"{scale * float(regime.speed):.6g}",
         "stable" if regime.stable else "unstable",
-        "family" if status_name(regime.status) == "degenerate" else "",
+        {"degenerate": "family", "no_vibration": "no vibration"}.get(status_name(regime.status), ""),
         " ".join(f"{degrees(float(a)):.4g}" for a in regime.phases),
         f"{float(regime.margin):.4g}",
         " ".join(f"{float(p):.4g}" for p in regime.power),

@@ -70,6 +70,10 @@ class RegimeStatus(eqx.Enumeration):
     degenerate = (
         "one of a family: phases can change without a change of torques, so that even the smallest disturbance changes them"
     )
+    no_vibration = (
+        "the forces of the rotating masses cancel: the machine does not vibrate; equal masses that turn in one direction about "
+        "one axis do so in antiphase"
+    )
     not_converged = "no regime was found from this start"
     none_stable = (
         "no stable synchronous regime was found: the exciters turn at different speeds, or a resonance catches them; "
@@ -160,8 +164,8 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
             return self.message
         phases = ", ".join(f"{degrees(float(a)):.4g}" for a in self.phases)
         stable = f"{'stable' if bool(self.stable) else 'unstable'} ({float(self.growth):.3g} 1/s)"
-        family = ", one of a family" if status_name(self.status) == "degenerate" else ""
-        return f"Omega {speed_text(self.speed, 6)}, {stable}, margin {float(self.margin):.3g}{family}: {phases} deg"
+        special = {"degenerate": ", one of a family", "no_vibration": ", no vibration"}.get(status_name(self.status), "")
+        return f"Omega {speed_text(self.speed, 6)}, {stable}, margin {float(self.margin):.3g}{special}: {phases} deg"
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
@@ -274,6 +278,8 @@ def synchronous_regimes(
     - n is the mean of the rotors' speeds, anticlockwise positive; the gyroscopic matrix G is 0 for most machines
     - Regimes that differ by the same shift of all phases or by an exchange of equal exciters, such as mirror images, are listed
       once; of a family of regimes one member is listed, with the status `degenerate`
+    - If the forces of the masses cancel, for example those of two equal unbalances of one direction and one axis in antiphase,
+      the status is `no_vibration`
     - Stability is the growth of small disturbances of amplitudes, speeds and phases together, see `averaged_field`
     - The relative error of the torques is of the order S^2/(2 M I) with the inertia I of a rotor; close to the parameters at
       which two regimes exchange their stability, the error of the phases is some tenths of a radian
@@ -396,11 +402,13 @@ def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: A
     residual = jnp.max(jnp.abs(driving + vibration) / jnp.where(scale > 0.0, scale, 1.0))
 
     eps = jnp.finfo(w.dtype).eps
+    is_still = jnp.all(magnitude(z) <= eps**0.5 * w**2 * (magnitude(response) @ balance.unbalance))
     size = jnp.max(balance.unbalance) / jnp.min(jnp.diagonal(balance.model.mass))
     bounded = jnp.all(magnitude(z) * 100.0 * eps < size)
     good = is_balanced(frozen, x) & _has_one_speed(balance)
     there = good & bounded
-    status = RegimeStatus.where(neutral > 0, RegimeStatus.degenerate, RegimeStatus.found)
+    status = RegimeStatus.where(is_still, RegimeStatus.no_vibration, RegimeStatus.found)
+    status = RegimeStatus.where(neutral > 0, RegimeStatus.degenerate, status)
     status = RegimeStatus.where(good, status, RegimeStatus.not_converged)
     status = RegimeStatus.where(bounded | ~jnp.isfinite(w), status, RegimeStatus.unbounded)
 

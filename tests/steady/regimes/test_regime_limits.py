@@ -32,6 +32,28 @@ def test_opposite_exciters_at_the_centre_are_one_family():
     assert "family" in found.summary()
 
 
+@pytest.mark.parametrize("second", [0.4, 0.3])
+def test_exciters_on_one_axis_have_two_isolated_regimes(second):
+    """The torques of two equal motors are equal if (S_1^2 - S_2^2) Im H + 2 S_1 S_2 Re H sin(alpha_2 - alpha_1) = 0."""
+    at, motor = (0.1, 0.2), jv.DCMotor(100.0, stall_torque=60.0, inertia=0.05)
+    exciters = [jv.Exciter(drive=motor, unbalance=S, at=at) for S in (0.4, second)]
+    found = jv.synchronous_regimes(jv.Scene(body(), exciters=exciters))
+    names = [found.select(k).status_name for k in range(found.speed.size)]
+    assert names == ["no_vibration" if second == 0.4 else "found", "found"] and found.stable.tolist() == [True, False]
+    carrier, push = body().carrier(), np.array([[1, 0, -at[1]], [0, 1, at[0]]]).T @ np.array([1, -1j])
+    for w, phase, sign in zip(found.speed, found.phases[:, 1], (-1.0, 1.0), strict=True):
+        h = push.conj() @ np.linalg.solve(carrier.stiffness - w**2 * carrier.mass + 1j * w * carrier.damping, push)
+        sine = -(0.4**2 - second**2) / (0.8 * second) * h.imag / h.real
+        np.testing.assert_allclose(np.exp(1j * phase), sign * np.sqrt(1.0 - sine**2) + 1j * sine, atol=1e-9)
+
+
+def test_cancelling_forces_leave_the_machine_at_rest():
+    regime = jv.working_regime(scene_of([(0.1, 0.2)] * 3, (1, 1, 1)))
+    assert regime.status_name == "no_vibration" and "no vibration" in regime.summary()
+    np.testing.assert_allclose(regime.speed, 100.0, rtol=1e-12)
+    np.testing.assert_allclose(regime.amplitude, 0.0, atol=1e-12)
+
+
 def test_no_damping_is_not_called_stable():
     found = jv.synchronous_regimes(scene_of(PAIR, (1, -1), machine=body(damping=0.0)))
     assert found.speed.size == 2 and np.all(np.isfinite(found.growth)) and not np.any(found.stable)
