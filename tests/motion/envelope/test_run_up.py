@@ -22,8 +22,8 @@ def motor(torque):
     return jv.DCMotor(WORKING, stall_torque=torque, inertia=0.5)
 
 
-def central(torque):
-    return jv.Scene(body(), exciters=[jv.Exciter(drive=motor(torque), unbalance=S)])
+def central(torque, make=motor):
+    return jv.Scene(body(), exciters=[jv.Exciter(drive=make(torque), unbalance=S)])
 
 
 def test_weak_motor_is_caught_below_the_resonance():
@@ -86,6 +86,32 @@ def test_peaks_include_runs_from_hanging_unbalances():
     single = jv.envelope(scene, 2.5, start=level, samples=4096)
     assert float(jnp.max(single.trajectory.amplitude[:, 1])) < 0.5 * float(found.peak_amplitude[1])
     assert "largest over the initial angles" in found.summary()
+
+
+def constant_torque(torque):
+    return jv.TorqueTable([0.0, 90.0, 100.0], [torque, torque, 0.0], 0.5)
+
+
+def kloss(torque):
+    return jv.InductionMotor(WORKING, breakdown_torque=torque, breakdown_slip=0.2, inertia=0.5)
+
+
+@pytest.mark.parametrize("make", [constant_torque, motor, kloss])
+def test_least_motor_is_that_at_the_fold_of_its_torque(make):
+    """The fold: the braking torque below the resonance, divided by the torque of a motor of 1 N m, is largest.
+
+    A motor that runs up from rest already passes a little below its fold, because the vibration needs time to build up.
+    """
+    speeds = np.linspace(10.0, 15.5, 5501)
+    braking = 600.0 * S**2 * speeds**5 / ((6e4 - MASS * speeds**2) ** 2 + (600.0 * speeds) ** 2)
+    factor = braking / np.asarray(make(1.0).torque(jnp.asarray(speeds)))
+    fold, caught = np.max(factor), 0.97 * np.max(factor)
+    passed = jv.run_up(central(1.03 * fold, make), 200.0, least=True)
+    assert passed.status_name == "passed" and 0.97 < 1.03 * float(passed.least_torque) < 1.0
+    found = jv.run_up(central(caught, make), 200.0)
+    assert found.status_name == "caught" and found.caught_at.tolist() == [1]
+    below = np.flatnonzero(factor > caught)[0]
+    np.testing.assert_allclose(found.speed, np.interp(caught, factor[: below + 1], speeds[: below + 1]), rtol=1e-4)
 
 
 def induction_motor(voltage):
