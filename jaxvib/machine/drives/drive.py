@@ -349,7 +349,7 @@ class RunUp(IdealDrive):
     **Arguments** (SI, or strings with a unit)
 
     - `speed` n, rad/s, greater than 0; typical: 60 to 500 (600 to 4800 rpm)
-    - `acceleration`, rad/s^2, greater than 0; typical: 10 to 300
+    - `acceleration`, rad/s^2, greater than 0; typical: 10 to 300. For braking use `SpeedProfile`
 
     **Raises** `InputError` for a wrong unit or a value that is not positive.
 
