@@ -344,10 +344,10 @@ def shapes_of(machine: Machine, at: Place = None) -> tuple[Carrier, Mount]:
     """Return the names, directions and shapes of the carrier, and of the mount of an exciter at `at`, without values."""
     platform, position = (at, None) if isinstance(at, int) else (None, at)
     leaves, rest = jax.tree.flatten((machine, position))
-    return _structure(rest, tuple(map(_shape_and_dtype, leaves)), jnp.result_type(float), platform)
+    return _structure(rest, tuple(map(shape_and_dtype, leaves)), jnp.result_type(float), platform)
 
 
-def _shape_and_dtype(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
+def shape_and_dtype(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
     """Return the shape and the dtype of an array, or those of the array that JAX makes of a Python number."""
     array = leaf if isinstance(leaf, (jax.Array, np.ndarray)) else jnp.asarray(leaf)
     return array.shape, array.dtype

@@ -18,6 +18,7 @@ from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, GravityField, RotorImbalance, SlipRelease, SupportForce
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import Part, read_numbers, unit
+from jaxvib.machine.shapes import require_drive, require_forces, require_loads, require_machine, require_terms
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import when_known
 
@@ -85,6 +86,9 @@ class Exciter(Part):
             _require_part("loads", loads, Loads, "balls(...)" if unbalance is not None else "balls(...), or give an unbalance")
         if not isinstance(drive, Drive):
             raise InputError("drive", f'is {quoted(drive)}; it must be a Drive, for example ConstantSpeed("1500 rpm")')
+        require_drive(drive)
+        if loads is not None:
+            require_loads(loads)
         if isinstance(direction, bool) or not isinstance(direction, (int, float, np.number)) or direction not in (1, -1):
             raise InputError("direction", f"is {quoted(direction)}; it must be 1 (anticlockwise) or -1 (clockwise)")
         effects = read_effects(effects)
@@ -222,13 +226,15 @@ class Scene(Part):
             exciters = (Exciter(loads, drive, effects=rotating),)
         else:
             exciters = _read_exciters(exciters, loads, drive, rotating)
+        for exciter in exciters:
+            require_machine(machine, exciter.place)
         self.machine, self.exciters, self.effects = machine, exciters, shared
         for term in terms_of(self.all_effects, SupportForce):
             term.rows(machine)  # raises for a place that the machine does not have
         for k, exciter in enumerate(exciters):
             if exciter.loads is not None:
                 for effect in shared:
-                    effect.validate(machine, exciter.loads)
+                    _require_effect(effect, machine, exciter.loads)
             with within(self.prefix_of(k)):
                 machine.require_body(exciter.body)
             _require_stations(machine, exciter)
@@ -334,7 +340,7 @@ def _require_fit(machine: Machine, exciter: Exciter) -> None:
     loads = exciter.loads
     for effect in exciter.effects:
         if loads is not None:
-            effect.validate(machine, loads)
+            _require_effect(effect, machine, loads)
         elif not all(isinstance(term, RotorImbalance) for term in effect.terms()):
             raise InputError(f"effects.{effect.kind}", "acts on loads, but this exciter has none; remove it")
         if not exciter.drive.ideal and has_term([effect], DrillingSpinRelease, SlipRelease):
@@ -342,6 +348,12 @@ def _require_fit(machine: Machine, exciter: Exciter) -> None:
             raise InputError(f"effects.{effect.kind}", problem)
     if loads is not None:
         require_comparable(machine, loads, exciter.drive)
+
+
+def _require_effect(effect: Effect, machine: Machine, loads: Loads) -> None:
+    """**Raises** `InputError` for an effect that cannot act on this machine or these loads."""
+    require_forces(effect, loads)
+    effect.validate(machine, loads)
 
 
 def _acts_on_machine(effect: Effect) -> bool:
@@ -384,6 +396,7 @@ def read_effects(effects: object) -> tuple[Effect, ...]:
     for index, effect in enumerate(effects):
         if not isinstance(effect, Effect):
             raise InputError(f"effects[{index}]", f"is {quoted(effect)}; it must be an Effect, for example Gravity()")
+        require_terms(effect)
     kinds = [effect.kind for effect in effects if not effect.repeatable]
     for kind in kinds:
         if kinds.count(kind) > 1:
