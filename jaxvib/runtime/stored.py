@@ -73,12 +73,13 @@ class StoredFunction(Generic[T]):
     exceed `MAX_PROGRAMS_IN_MEMORY` or `MAX_PROGRAM_MEMORY`, the least recently used ones are freed and later read or traced
     again.
 
-    A program is not stored, but traced in each process, if it has
+    A program is not stored, but traced in each process, and again after it was freed, if it has
 
-    - arguments of classes of other packages, whose sources are not part of the key
+    - arguments or results of classes of other packages, whose sources are not part of the key
     - functions without a name
     - host callbacks
-    - arrays on several devices
+
+    Programs of arrays on several devices belong to `jitted`; their memory is not limited.
 
     In a process whose code differs from the source files (see `jaxvib.code_changes`), no program is stored or read, and
     programs that were traced from the former code are not used again.
@@ -101,7 +102,7 @@ class StoredFunction(Generic[T]):
             return program(x for x in leaves if isinstance(x, _ARRAYS))
 
     def compiled(self, leaves: Sequence[Any], treedef: Any) -> _Program | None:
-        """Return the compiled program for these arguments, or None if it cannot be stored."""
+        """Return the compiled program for these arguments, or None if `jitted` has to compile it."""
         call, program = self._look_up(leaves, treedef)
         if program is _UNKNOWN:
             folder, *_, sharding, _ = call
@@ -119,18 +120,17 @@ class StoredFunction(Generic[T]):
         return program
 
     def is_ready(self, leaves: Sequence[Any], treedef: Any) -> bool:
-        """Return True if the program for these arguments is in memory or cannot be stored."""
+        """Return True if the program for these arguments is in memory, or if `jitted` has to compile it."""
         return self._look_up(leaves, treedef)[1] is not _UNKNOWN
 
     def _look_up(self, leaves: Sequence[Any], treedef: Any) -> tuple[Any, _Program | None]:
         """Return the key of a call and its program in memory.
 
-        The program is `_UNKNOWN` if it is not in memory, and None if it cannot be stored.
+        The program is `_UNKNOWN` if it is not in memory, and None if `jitted` has to compile it.
         """
-        folder = program_folder()
-        if folder is None or is_debugging():
+        if is_debugging():
             return (), None
-        call = (folder, treedef, tuple(map(leaf_key, leaves)), _sharding_of(leaves), _options())
+        call = (program_folder(), treedef, tuple(map(leaf_key, leaves)), _sharding_of(leaves), _options())
         try:
             return call, self.ready.get((_current_code(), call), _UNKNOWN)
         except TypeError:  # an argument is not hashable
@@ -140,36 +140,46 @@ class StoredFunction(Generic[T]):
         args, kwargs = jax.tree.unflatten(treedef, arrays_on_device(leaves))
         return self.jitted(*args, **kwargs)
 
-    def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable, sharding: Sharding) -> _Program | None:
-        """Read the program from disk, or trace it and write it to disk; return None if it cannot be stored."""
-        if not code_state().is_on_disk:
+    def _program(self, folder: Path | None, leaves: Sequence[object], treedef: Hashable, sharding: Sharding) -> _Program | None:
+        """Read the program from disk, or else trace it, and write it to disk if possible; return None for several devices."""
+        if not all(_is_on_one_device(leaf) for leaf in leaves):
+            return None
+        path = self._path(folder, leaves, treedef)
+        return (path and _read(path, sharding)) or self._trace(path, leaves, treedef, sharding)
+
+    def _path(self, folder: Path | None, leaves: Sequence[object], treedef: Hashable) -> Path | None:
+        """Return the path of the stored program, or None if it cannot be stored."""
+        if folder is None or not code_state().is_on_disk:
             return None
         try:
-            path = folder / f"{self.function.__name__}-{self._key(leaves, treedef)}.program"
-            return _read(path, sharding) or self._write(path, leaves, treedef, sharding)
+            return folder / f"{self.function.__name__}-{self._key(leaves, treedef)}.program"
         except Undescribable:
             return None
 
     def _key(self, leaves: Sequence[object], treedef: Hashable) -> str:
         def abstract(leaf: Array) -> str:
-            device, *others = leaf.sharding.device_set
-            if others or device.platform != jax.devices()[0].platform:
-                raise Undescribable("an array is not on one device of the default kind")
             return f"{leaf.dtype}{leaf.shape}{jax.typeof(leaf).weak_type}"
 
         arguments = describe(jax.tree.unflatten(treedef, leaves), abstract)
         name = f"{self.function.__module__}:{self.function.__qualname__}"
         return _digest(json.dumps([name, _sources(), _machine(), str(_options()), arguments]).encode())[:32]
 
-    def _write(self, path: Path, leaves: Sequence[object], treedef: Hashable, sharding: Sharding) -> _Program:
-        structure: list[Description] = []
+    def _trace(self, path: Path | None, leaves: Sequence[object], treedef: Hashable, sharding: Sharding) -> _Program:
+        """Trace the program, and write it to `path` unless this is None or its result has no description."""
+        results: list[tuple[Description, Skeleton]] = []
         # `flat` refers to a skeleton, because the arrays of this call would otherwise stay in memory with the program.
         arguments, state = Skeleton.of(leaves, treedef), code_state()
 
         def flat(*arrays: Array) -> list[Array]:
             args, kwargs = arguments.filled(arrays)
             result, outputs = self.function(*args, **kwargs), []
-            structure[:] = [describe(result, outputs.append)]
+            try:
+                structure = describe(result, outputs.append)
+                results[:] = [(structure, _skeleton(structure))]
+            except Undescribable:
+                parts, tree = jax.tree.flatten(result)
+                outputs = [part for part in parts if eqx.is_array(part)]
+                results[:] = [(None, Skeleton.of(parts, tree))]
             return [jnp.asarray(x, x.dtype) for x in outputs]  # not weakly typed, as the outputs of a stored program
 
         jitted = jax.jit(flat)
@@ -178,39 +188,54 @@ class StoredFunction(Generic[T]):
                 exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
                 stored = bytes(exported.serialize())
         except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers
-            if not structure:  # the function itself raised the error
+            if not results:  # the function itself raised the error
                 raise
-            return _Program.of(jitted, structure[0])
+            return _Program(jitted, results[0][1], UNKNOWN_STORED_SIZE)
         exported = export.deserialize(bytearray(stored))  # frees the trace, 1 to 3 MB, to which the first one refers
-        program = _Program.of(_compiled(path, exported, sharding), structure[0], size=len(stored))
-        if code_state(look=True) != state:  # the code changed during the trace
+        (structure, result), name = results[0], self.function.__name__
+        program = _Program(_compiled(name, exported, sharding), result, len(stored))
+        if path is None or structure is None or code_state(look=True) != state:  # the code changed during the trace
             return program
-        head = json.dumps({"structure": structure[0]}).encode() + b"\n"
+        head = json.dumps({"structure": structure}).encode() + b"\n"
         with contextlib.suppress(OSError):  # a full disk or a read-only folder: the program still works in this process
             _replace(path, _digest(head + stored).encode() + b"\n" + head + stored)
         return program
+
+
+def _is_on_one_device(leaf: object) -> bool:
+    """Return True except for an array on several devices, or on another kind of device than the default one."""
+    if not isinstance(leaf, jax.Array):
+        return True
+    device, *others = leaf.sharding.device_set
+    return not others and device.platform == jax.devices()[0].platform
+
+
+def _skeleton(structure: Description) -> Skeleton:
+    """Return the skeleton of a result. **Raises** `Undescribable` if an array is in a static field."""
+    indices = itertools.count()
+    result = Skeleton(rebuild(structure, map(Slot, indices)))
+    if result.size != next(indices):
+        raise Undescribable("an array of the result is in a static field")
+    return result
 
 
 @dataclasses.dataclass
 class _Program:
     """Function of all arrays of the arguments, compiled by `jax.jit`.
 
-    `result` is the structure of its result and `memory` its estimated memory in bytes. `used` is a counter that orders programs
-    by their last use.
+    `result` is the structure of its result, and `size` that of its stored form in bytes. `used` is a counter that orders
+    programs by their last use.
     """
 
     run: Callable[..., list[Array]]
     result: Skeleton
-    memory: int = 0
+    size: int = 0
     used: int = dataclasses.field(default_factory=lambda: next(_clock))
 
-    @classmethod
-    def of(cls, run: Callable[..., list[Array]], structure: Description, size: int = UNKNOWN_STORED_SIZE) -> _Program:
-        indices = itertools.count()
-        result = Skeleton(rebuild(structure, map(Slot, indices)))
-        if result.size != next(indices):
-            raise Undescribable("an array of the result is in a static field")
-        return cls(run, result, MEMORY_PER_PROGRAM + MEMORY_PER_STORED_BYTE * size)
+    @property
+    def memory(self) -> int:
+        """Estimated memory, bytes."""
+        return MEMORY_PER_PROGRAM + MEMORY_PER_STORED_BYTE * self.size
 
     def __call__(self, arrays: Iterable[Array | np.ndarray]) -> Any:
         return self.result.filled(self.run(*arrays))
@@ -287,18 +312,19 @@ def _read(path: Path, sharding: Sharding) -> _Program | None:
             return None
         head, _, stored = content.partition(b"\n")
         exported = export.deserialize(bytearray(stored))
-    except (OSError, ImportError):
+        result = _skeleton(json.loads(head)["structure"])
+    except (OSError, ImportError, Undescribable):
         return None
-    return _Program.of(_compiled(path, exported, sharding), json.loads(head)["structure"], size=len(stored))
+    return _Program(_compiled(path.stem.rpartition("-")[0], exported, sharding), result, len(stored))
 
 
-def _compiled(path: Path, exported: export.Exported, sharding: Sharding) -> Callable[..., list[Array]]:
+def _compiled(name: str, exported: export.Exported, sharding: Sharding) -> Callable[..., list[Array]]:
     def run(*arrays: Array) -> list[Array]:
         return exported.call(*arrays)  # pyright: ignore[reportReturnType]
 
     # The name is part of the key in JAX's compilation cache. The name includes the processor, which JAX's key lacks. It
     # includes no digest of the sources, because a program that is the same after an edit need not be compiled again.
-    run.__name__ = f"{path.stem.rpartition('-')[0]}-{_digest(processor().encode())[:16]}"
+    run.__name__ = f"{name}-{_digest(processor().encode())[:16]}"
     # Without `in_shardings` JAX compiles twice: for uncommitted arrays, which it may move, and for outputs of other programs.
     return jax.jit(run, in_shardings=sharding)
 

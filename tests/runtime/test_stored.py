@@ -159,6 +159,32 @@ def test_programs_beyond_the_memory_are_freed_and_read_again(folder, monkeypatch
     assert traces == ["a", "b", "c", "d"]
 
 
+@pytest.mark.parametrize("reason", ["edited source", "class of another package", "no folder"])
+def test_programs_that_cannot_be_stored_are_freed_too(folder, monkeypatch, reason):
+    if reason == "edited source":
+        monkeypatch.setattr(code_changes._code, "state", code_changes.CodeState(-1, False))
+        monkeypatch.setattr(code_changes._code, "update", lambda: None)
+    elif reason == "class of another package":
+        structure.KNOWN_PACKAGES.discard(__name__)
+    else:
+        cache.set_program_folder(None)
+    monkeypatch.setattr(stored, "_functions", weakref.WeakSet())
+    function = programs.cached(doubled)
+
+    def ask(name):
+        found, sums = function(Pair(jnp.arange(3.0), name), 2.0)
+        assert found.name == name + "!" and found.first.tolist() == [0.0, 2.0, 4.0] and float(sums["sum"]) == 3.0
+        return [program.result.tree[0].name.removesuffix("!") for program in function.stored.ready.values()]
+
+    ask("a")
+    (program,) = function.stored.ready.values()
+    assert stored.MEMORY_PER_PROGRAM < program.memory < stored.MEMORY_PER_PROGRAM + 5000 * stored.MEMORY_PER_STORED_BYTE
+    monkeypatch.setattr(stored, "MAX_PROGRAM_MEMORY", 2.5 * program.memory)
+    assert ask("b") == ["a", "b"] and ask("c") == ["b", "c"] and program.run._cache_size() == 0
+    assert ask("b") == ["b", "c"] and ask("a") == ["b", "a"]
+    assert traces == ["a", "b", "c", "a"] and not list(folder.iterdir())
+
+
 def test_a_stored_program_holds_no_trace(folder):
     """An exported program holds the function to differentiate it, and with it the trace; a deserialized one does not."""
     function = programs.cached(doubled)
