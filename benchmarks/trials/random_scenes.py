@@ -34,6 +34,7 @@ import equinox as eqx
 import jax
 import numba
 import numpy as np
+from scipy.linalg import eigh
 
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
@@ -141,6 +142,8 @@ def drawn(rng: np.random.Generator) -> jv.Scene:
     """A random machine of one or two platforms with one to three equal loads.
 
     A fifth each have no damping, drag up to a billion times the usual one, and rotors down to a hundredth of the frequencies.
+    In half of the scenes the drag is replaced by that of a jam up to a tenth below a resonance, if the rotor is fast enough:
+    most drags of the first kind let the loads turn with the rotor.
     """
 
     def number(low: float, high: float) -> float:
@@ -167,8 +170,15 @@ def drawn(rng: np.random.Generator) -> jv.Scene:
             lambda m: (m.damping, m.link_damping), machine, (0.0 * machine.damping, 0.0 * machine.link_damping)
         )
     drag, speed = drag * (number(1.0, 1e9) if dragged else 1.0), speed * (number(0.01, 1.0) if slow else 1.0)
-    loads = jv.balls(count=count, mass=mass, radius=radius, drag=drag)
-    return jv.Scene(machine, loads, jv.ConstantSpeed(speed))
+    scene = jv.Scene(machine, jv.balls(count=count, mass=mass, radius=radius, drag=drag), jv.ConstantSpeed(speed))
+    if rng.uniform() < 0.5:
+        p = reference_model(scene)
+        natural = np.sqrt(eigh(p.stiffness, p.whole_mass, eigvals_only=True))
+        omega = (1.0 - number(1e-4, 0.1)) * natural[int(rng.integers(natural.size))]
+        lag = light_speed(p, omega)[0] - omega
+        if lag > 0.0 and speed > omega:
+            drag *= lag / (speed - omega)
+    return jv.Scene(machine, jv.balls(count=count, mass=mass, radius=radius, drag=drag), jv.ConstantSpeed(speed))
 
 
 @numba.njit(cache=True)

@@ -147,11 +147,11 @@ def child(store: pathlib.Path) -> subprocess.Popen:
 def killed(folder: pathlib.Path, out: pathlib.Path) -> None:
     whole, broken = folder / "whole.zarr", folder / "broken.zarr"
     many_chunks(whole)
-    generator, kills = random.Random(0), 0
-    while kills < 10:
+    generator, kills = random.Random(1), 0
+    while kills < 20:
         run = child(broken)
         # at a random moment: of a chunk that is computed, or of one that is being written
-        for _ in range(generator.randint(1, 70)):
+        for _ in range(generator.randint(1, 35)):
             run.stdout.readline()
         time.sleep(generator.random() * 0.05)
         run.send_signal(signal.SIGKILL)
@@ -161,7 +161,7 @@ def killed(folder: pathlib.Path, out: pathlib.Path) -> None:
         print(f"kill {kills}: {dict(kept.counts).get('done', 0)} of {kept.cases} cases kept", flush=True)
     last = child(broken)
     last.communicate()
-    print("killed ten times and resumed, bit for bit as undisturbed:", same(whole, broken))
+    print(f"killed {kills} times and resumed, bit for bit as undisturbed:", same(whole, broken))
     print("files left of writing that was cut off:", len(list(broken.rglob("*.partial"))))
 
 

@@ -1,6 +1,6 @@
-"""Fifty cases in the style of textbooks, catalogues and papers, each beside a computation that shares no code with jaxvib.
+"""Eighty cases in the style of textbooks, catalogues and papers, each beside a computation that shares no code with jaxvib.
 
-    python benchmarks/trials/public/compare.py [frequencies] [jams] [motion] [--only WORD]
+    python benchmarks/trials/public/compare.py [frequencies] [jams] [motion] [exciters] [--only WORD]
 
 The reference of a case is a closed form, or NumPy and SciPy on equations written out here. The script prints one line per case,
 the largest relative difference and its bound, and exits with 1 if any bound is exceeded.
@@ -49,10 +49,10 @@ def judged(only: str) -> Iterator[bool]:
 
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("kinds", nargs="*", help="frequencies, jams, motion (default: all)")
+    options.add_argument("kinds", nargs="*", help="frequencies, jams, motion, exciters (default: all)")
     options.add_argument("--only", default="", help="cases whose name has this word")
     given = options.parse_args()
-    for kind in given.kinds or ("frequencies", "jams", "motion"):
+    for kind in given.kinds or ("frequencies", "jams", "motion", "exciters"):
         importlib.import_module(kind)  # adds its cases
     outcomes = list(judged(given.only))
     print(f"{sum(outcomes)} of {len(outcomes)} cases agree with their reference")
