@@ -9,7 +9,7 @@ import pytest
 SCRIPT = pathlib.Path(__file__).parents[1] / "benchmarks" / "trials" / "public" / "compare.py"
 
 
-SLOW = {"jams": 15, "motion": 23, "exciters": 25}
+SLOW = {"jams": 15, "motion": 23, "exciters": 24}
 
 
 @pytest.mark.parametrize(
