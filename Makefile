@@ -38,8 +38,8 @@ VERSION_TESTS = tests/runtime tests/numerics tests/machine tests/equations tests
 test-versions:
 	$(MAKE) .venv-lowest/installed VENV=.venv-lowest PYTHON=$(LOWEST_PYTHON) PIP_CONSTRAINT=.ci/lowest.txt
 	$(MAKE) .venv-highest/installed VENV=.venv-highest PYTHON=$(HIGHEST_PYTHON)
-	.venv-lowest/bin/python -m pytest $(VERSION_TESTS)
-	.venv-highest/bin/python -m pytest $(VERSION_TESTS)
+	.venv-lowest/bin/python -m pytest -n 2 --dist loadfile $(VERSION_TESTS)
+	.venv-highest/bin/python -m pytest -n 2 --dist loadfile $(VERSION_TESTS)
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff check .
