@@ -35,7 +35,7 @@ _STARTS = 32
 """Number of starts of designs of screens and feeders, which have few minima."""
 
 _LEAST_ROUNDNESS = 0.9
-"""Least roundness of the middle of the deck of a circular screen."""
+"""Smallest allowed roundness of the motion of the middle of the deck of a circular screen."""
 
 
 def _platforms(scene: Scene, least: int) -> Platforms:

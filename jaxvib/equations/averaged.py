@@ -202,8 +202,8 @@ class Averaged(eqx.Module):
     def shifted_inverse(self, t: Array, state: Amplitudes, shift: Array) -> Callable[[Amplitudes], Amplitudes]:
         """Return the function that maps r to the solution x of (shift - J) x = r, with the Jacobian J of this field at `state`.
 
-        A mass depends on the other masses only through the changes z of V and of Omega. For given z its own two unknowns follow
-        from one division. The remaining equations for z are few, and the cost is linear in the number of masses:
+        A mass depends on the other masses only through the changes z of V and of Omega. For given z the two unknowns of a mass
+        follow from one division. The remaining equations for z are few, and the cost is linear in the number of masses:
 
             (shift - a - b/shift) dw = Re(c^H dA) + r_w + (b/shift) (r_psi - dOmega),   shift dpsi = dw - dOmega + r_psi
             (shift + i Omega) (dY, dV) = (dV - i Y dOmega + r_Y, dA - i V dOmega + r_V),   dOmega = mean of dw
@@ -226,7 +226,7 @@ class Averaged(eqx.Module):
 
         by_rate = jax.jvp(free, (state.rate,), (jnp.ones_like(state.rate),))[1]
         by_phase = self.unbalance * (jnp.conj(turn) * forward).real / (2.0 * self.inertia) / shift
-        own = 1.0 / (shift - by_rate - by_phase)
+        rate_response = 1.0 / (shift - by_rate - by_phase)
         force = self.unbalance * turn * (state.rate**2 - 1j * rate)
         spin = shift + 1j * omega
 
@@ -236,7 +236,7 @@ class Averaged(eqx.Module):
             da = spin * dv + 1j * state.velocity * domega - r.velocity
             dy = (dv - 1j * state.displacement * domega + r.displacement) / spin
             along = mean_torque(self.unbalance, jnp.conj(turn) * jnp.sum(v * da[None, :], axis=-1)) / self.inertia
-            dw = own * (along + r.rate + by_phase * (r.phase - domega))
+            dw = rate_response * (along + r.rate + by_phase * (r.phase - domega))
             dpsi = (dw - domega + r.phase) / shift
             dforce = self.unbalance * turn * (2.0 * state.rate * dw - 1j * (shift * dw - r.rate)) + 1j * force * dpsi
             carrier = jnp.sum(u * dforce[:, None], axis=0) - times(self.stiffness, dy) - times(self.damping, dv)
@@ -459,7 +459,7 @@ def _rotating_masses(exciter: Exciter, dtype: jnp.dtype) -> tuple[Array, Array, 
 
 def _rows_of_masses(levers: Sequence[Array], rows: Array) -> Array:
     """Return the rows (count, p, nd) of all masses from those of the exciters' levers (levers, p, nd)."""
-    each = jnp.split(rows, np.cumsum([len(own) for own in levers])[:-1])
+    each = jnp.split(rows, np.cumsum([len(of_exciter) for of_exciter in levers])[:-1])
     return jnp.concatenate([jnp.einsum("lj,lpa->jpa", *pair, precision="highest") for pair in zip(levers, each, strict=True)])
 
 
@@ -514,12 +514,12 @@ def largest_growth(matrix: Array, neutral: Array | int) -> Array:
 def rotating_angles(scene: Scene, state: State) -> tuple[Array, Array]:
     """Return the angles (count,) rad and rates, rad/s, of all rotating masses at t = 0, in their directions of rotation."""
     each = []
-    for exciter, own in zip(scene.exciters, state.exciters, strict=True):
-        if own.angle:
-            angle, rate = own.angle[0], own.rate[0]
+    for exciter, part in zip(scene.exciters, state.exciters, strict=True):
+        if part.angle:
+            angle, rate = part.angle[0], part.rate[0]
         else:
             drive, start = exciter.turning_drive, jnp.zeros_like(exciter.drive.speed)
-            angle, rate = drive.rotor_angle(start, own.rotor)[None], drive.rotor_speed(start, own.rotor)[None]
+            angle, rate = drive.rotor_angle(start, part.rotor)[None], drive.rotor_speed(start, part.rotor)[None]
         each.append((angle, rate) if exciter.direction == 1 else (-angle, -rate))
     if len(each) == 1:
         return each[0]

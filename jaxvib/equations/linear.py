@@ -40,8 +40,8 @@ from jaxvib.units.known import when_known
 TURNING_TERMS = (GravityField, LoadPotential, LoadInteraction, RotorImbalance)
 """Terms that analyses of turning loads include.
 
-With them the carrier stays linear, and their mean torque over a turn on loads that turn together is 0 to leading order of the
-loads' mass.
+These terms keep the carrier linear. Their mean torque over a turn on loads that turn together is 0 to leading order of the mass
+of the loads.
 """
 
 JAM_TERMS = (*TURNING_TERMS, ContactFriction)
@@ -122,8 +122,8 @@ class LinearModel(Model):
     def decomposed(self, direction: Array | None = None) -> Self:
         """Return this model with its modal form, which is faster for many load speeds.
 
-        Models of up to 3 coordinates are returned without it, because a direct solution takes no longer, and so are models with
-        gyroscopic coupling, which the modal form does not include.
+        Models of up to 3 coordinates are returned without a modal form, because a direct solution takes no longer. Models with
+        gyroscopic coupling are also returned without it, because the modal form does not include this coupling.
 
         **Arguments**: `direction` (count, nd) of the forces of several masses, default: `direction` of the model.
         """
@@ -326,9 +326,9 @@ def circular_loads(scene: Scene) -> CircularLoads:
 
 
 def jammed_loads(scene: Scene) -> CircularLoads:
-    """Return the loads of a scene, for an analysis of jams, which may include dry friction of the loads.
+    """Return the loads of a scene, for an analysis of jams.
 
-    Otherwise the requirements are those of `circular_loads`.
+    The loads may have dry friction. All other requirements are those of `circular_loads`.
     """
     return turning_loads(scene, JAM_TERMS, at_one_point=True)
 

@@ -201,7 +201,7 @@ class UnbalancedModel(ExcitedModel):
     def drive_torque(self, omega: Array, required: Array) -> Array:
         """Return the torque of each drive, (count,) N m, from the torques that the rotors need, `required_torque`.
 
-        An ideal drive supplies the torque that its own rotor needs, and an equal share of the torque that the motors lack.
+        An ideal drive supplies the torque that its rotor needs, and an equal share of the torque that the motors lack.
         """
         prescribed, driving = self.balance.is_prescribed, self.balance.driving_torque(omega)
         if prescribed.all() or not prescribed.any():
@@ -332,8 +332,8 @@ def resultant_of(model: LinearModel, turn: Array) -> Array:
     for exciter, mount in zip(model.scene.exciters, model.mounts, strict=True):
         loads = exciter.loads
         if loads is None:
-            own = 0.0 if exciter.unbalance is None else exciter.unbalance
-            each = turn[first] * sum((amount for amount in _imbalances(exciter, about_tilts=False)), own)
+            unbalance = 0.0 if exciter.unbalance is None else exciter.unbalance
+            each = turn[first] * sum((amount for amount in _imbalances(exciter, about_tilts=False)), unbalance)
         else:
             size = loads.mass * loads.radius if isinstance(loads, CircularLoads) else jnp.nan
             each = jnp.sum(size * turn[first : first + loads.count])
@@ -390,8 +390,8 @@ def _motor_torque(averaged: Averaged) -> Array:
             motor = drive.torque_and_inertia(jnp.full_like(share, LATE), share * drive.speed)
             return jnp.ones_like(share) if motor is None else jnp.abs(motor[0])
 
-        most = jnp.max(jax.vmap(torque)(shares))[None]
-        each.append(jnp.zeros(count, shares.dtype) if count else jnp.where(most > 0.0, most, 1.0))
+        largest = jnp.max(jax.vmap(torque)(shares))[None]
+        each.append(jnp.zeros(count, shares.dtype) if count else jnp.where(largest > 0.0, largest, 1.0))
     return jax.lax.stop_gradient(each[0] if len(each) == 1 else jnp.concatenate(each))
 
 

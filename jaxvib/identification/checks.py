@@ -311,7 +311,7 @@ def _disagreements(fitted: Fitted) -> Iterator[str]:
     if len(problem.runs) < 2:
         return
     exciters = range(len(problem.unbalances))
-    own = np.array([*range(p - unknowns.turns - unknowns.errors), *range(p, p + 2 * len(exciters))])
+    kept = np.array([*range(p - unknowns.turns - unknowns.errors), *range(p, p + 2 * len(exciters))])
     names = [*(number.name for number in unknowns.numbers), *(f"the gain of channel {name!r}" for name in unknowns.gains)]
     names += [f"{what} exciters[{k}].unbalance" for k in exciters for what in ("the size of", "the angle (rad) of")]
     turn, _ = polar_unbalances(problem, fitted.linear)
@@ -319,7 +319,7 @@ def _disagreements(fitted: Fitted) -> Iterator[str]:
     equations = [(each[:-1, :-1], each[:-1, -1]) for each in run_equations(problem, fitted.x, fitted.linear)]
     for matrix, gradient in (*equations, prior_equations(problem, fitted.x, fitted.linear)):
         polar = turn.T @ matrix @ turn
-        parts.append((eliminate(polar, own), elimination(polar, own).T @ (turn.T @ gradient)))
+        parts.append((eliminate(polar, kept), elimination(polar, kept).T @ (turn.T @ gradient)))
     total, gradient_sum = (np.sum(each, axis=0) for each in zip(*parts, strict=True))
     step = pseudoinverse(total)[0] @ gradient_sum  # to the exact minimum, which matters for a run with much less information
     for k, (part, gradient) in enumerate(parts[:-1]):

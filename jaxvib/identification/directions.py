@@ -83,7 +83,7 @@ def information_of(fitted: Fitted) -> Information:
     number_count = len(unknowns.numbers)
     data, prior, sizes = in_polar_unbalances(fitted)
     free_exciters = free_unbalances(problem)
-    own = np.array([*range(number_count), *(p + 2 * k for k in free_exciters)], int)
+    kept = np.array([*range(number_count), *(p + 2 * k for k in free_exciters)], int)
     names = (*(number.name for number in unknowns.numbers), *(f"exciters[{k}].unbalance" for k in free_exciters))
     values = np.concatenate([np.asarray(unknowns.values(fitted.x)), sizes[free_exciters]])
     logarithmic = np.concatenate([np.asarray(unknowns.positive), np.ones(len(free_exciters), bool)])
@@ -92,12 +92,12 @@ def information_of(fitted: Fitted) -> Information:
     gains = np.arange(number_count, number_count + len(unknowns.gains))
     without_gains[gains, gains] = 0.0
 
-    with_gains, without_gain_errors = (eliminate(data + known, own) for known in (prior, without_gains))
+    with_gains, without_gain_errors = (eliminate(data + known, kept) for known in (prior, without_gains))
     errors, axes = _errors(with_gains)
     single = np.abs(axes) > _SINGLE
     error = np.sum(single * errors, axis=1)
     # Unbalances are left out: if the size of an unbalance tends to 0, its angle is unknown, too.
-    vanished = logarithmic & (error > UNDETERMINED) & (error < _UNSEEN) & (np.arange(own.size) < number_count)
+    vanished = logarithmic & (error > UNDETERMINED) & (error < _UNSEEN) & (np.arange(kept.size) < number_count)
     factors = np.where(vanished, 10.0 * error, 1.0)  # of a vanished number: ten times its standard error in place of its value
     determined_part = covariance_of(with_gains * np.outer(factors, factors))
     covariance, undetermined = determined_part.covariance, determined_part.undetermined
@@ -146,10 +146,10 @@ def combined_information(fitted: Fitted) -> np.ndarray:
     problem, p = fitted.problem, fitted.x.size
     data, prior, _ = in_polar_unbalances(fitted)
     number_count, gains = len(problem.unknowns.numbers), len(problem.unknowns.gains)
-    own = [*range(number_count), *(p + 2 * k for k in free_unbalances(problem)), *range(number_count, number_count + gains)]
+    kept = [*range(number_count), *(p + 2 * k for k in free_unbalances(problem)), *range(number_count, number_count + gains)]
     if problem.marked:
-        return eliminate(data + prior, np.array([*own, p + 1], int))
-    return np.pad(eliminate(data + prior, np.array(own, int)), (0, 1))
+        return eliminate(data + prior, np.array([*kept, p + 1], int))
+    return np.pad(eliminate(data + prior, np.array(kept, int)), (0, 1))
 
 
 def free_unbalances(problem: Problem) -> list[int]:
@@ -178,29 +178,29 @@ def polar_unbalances(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, 
     return turn, sizes
 
 
-def eliminate(matrix: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return the information about the unknowns at the places `own` if all other unknowns are free."""
-    free, size, vectors, values = _free(matrix, own)
-    coupling = (matrix[np.ix_(own, free)] / size) @ vectors / np.sqrt(values)
-    return matrix[np.ix_(own, own)] - coupling @ coupling.T
+def eliminate(matrix: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Return the information about the unknowns at the places `kept` if all other unknowns are free."""
+    free, size, vectors, values = _free(matrix, kept)
+    coupling = (matrix[np.ix_(kept, free)] / size) @ vectors / np.sqrt(values)
+    return matrix[np.ix_(kept, kept)] - coupling @ coupling.T
 
 
-def elimination(matrix: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return L: the changes of all unknowns per change of the unknowns at the places `own`, if all other unknowns are free.
+def elimination(matrix: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Return L: the changes of all unknowns per change of the unknowns at the places `kept`, if all other unknowns are free.
 
     `eliminate` returns L^T F L of the matrix F; to first order its change by dF is L^T dF L.
     """
-    free, size, vectors, values = _free(matrix, own)
-    changes = np.zeros((len(matrix), own.size))
-    changes[own, np.arange(own.size)] = 1.0
-    changes[free] = -((vectors / values) @ vectors.T @ (matrix[np.ix_(free, own)] / size[:, None])) / size[:, None]
+    free, size, vectors, values = _free(matrix, kept)
+    changes = np.zeros((len(matrix), kept.size))
+    changes[kept, np.arange(kept.size)] = 1.0
+    changes[free] = -((vectors / values) @ vectors.T @ (matrix[np.ix_(free, kept)] / size[:, None])) / size[:, None]
     return changes
 
 
-def _free(matrix: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the unknowns other than `own` (r,), their scales (r,), and the eigenvectors (r, s) and eigenvalues (s,) > 0 of
+def _free(matrix: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the unknowns other than `kept` (r,), their scales (r,), and the eigenvectors (r, s) and eigenvalues (s,) > 0 of
     their scaled information."""
-    free = np.setdiff1d(np.arange(len(matrix)), own)
+    free = np.setdiff1d(np.arange(len(matrix)), kept)
     free = free[np.diagonal(matrix)[free] > 0.0]
     size = np.sqrt(np.diagonal(matrix)[free])
     values, vectors = np.linalg.eigh(matrix[np.ix_(free, free)] / np.outer(size, size))

@@ -48,8 +48,8 @@ _STEADY_VALUES = 0.05
 """Change of the unknowns in a pass, in standard errors, below which the influence of outliers and bounds is final."""
 
 _MAX_GROWTH = 1.2
-"""Standard deviation of residuals relative to that of a fit with white noise above which coloured noise takes up a part of the
-motion. It then has the frequencies of the machine, and a free decay is such noise as well as a motion."""
+"""Standard deviation of residuals, relative to that of a fit with white noise, above which the coloured noise contains a part
+of the motion. The noise then has the frequencies of the machine: a free decay can be noise or motion."""
 
 _ANGLE_MATTERS = 0.03
 """Share of the noise due to the error of the rotor's angle above which the angle is fitted with the machine."""
@@ -112,8 +112,8 @@ def linear_places(problem: Problem) -> list[np.ndarray]:
     for samples in problem.runs:
         offsets = len(samples.channels)
         states = state_count(problem.scene, samples.channels)
-        own = np.arange(after, after + states + offsets)
-        places.append(np.concatenate([own[:states], np.arange(2 * exciters), own[states:]]))
+        of_run = np.arange(after, after + states + offsets)
+        places.append(np.concatenate([of_run[:states], np.arange(2 * exciters), of_run[states:]]))
         after += states + offsets
     return places
 

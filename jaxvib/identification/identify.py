@@ -284,7 +284,8 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
     logarithmic = known.logarithmic & ~known.vanished
     estimates = list(map(_estimate, known.values, known.scale, logarithmic, _spreads(known), known.determined))
     estimates = [
-        each._replace(low=max(each.low, 0.0)) if own else each for each, own in zip(estimates, known.vanished, strict=True)
+        each._replace(low=max(each.low, 0.0)) if is_zero else each
+        for each, is_zero in zip(estimates, known.vanished, strict=True)
     ]
     has_profiles = resembles(fitted) and not fitted.misfits
     ends = profile_intervals(fitted, known) if has_profiles else {}
@@ -359,10 +360,10 @@ def _with_ends(estimate: Estimate, scale: float, logarithmic: bool, low: float, 
 def _gains(fitted: Fitted) -> tuple[Estimate, ...]:
     unknowns = fitted.problem.unknowns
     number_count = len(unknowns.numbers)
-    own = np.arange(number_count, number_count + len(unknowns.gains))
+    places = np.arange(number_count, number_count + len(unknowns.gains))
     data, prior, _ = in_polar_unbalances(fitted)
-    covariance = np.linalg.inv(eliminate(data + prior, own))
-    pairs = zip(fitted.x[own], np.sqrt(np.diagonal(covariance)), strict=True)
+    covariance = np.linalg.inv(eliminate(data + prior, places))
+    pairs = zip(fitted.x[places], np.sqrt(np.diagonal(covariance)), strict=True)
     return tuple(_estimate(math.exp(x), math.exp(x), True, float(spread), True) for x, spread in pairs)
 
 

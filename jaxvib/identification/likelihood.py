@@ -157,8 +157,8 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
     problem, p, number_count = fitted.problem, fitted.x.size, len(fitted.problem.unknowns.numbers)
     data, prior, sizes = in_polar_unbalances(fitted)
     free_exciters = free_unbalances(problem)
-    own = np.array([*range(p), *(p + 2 * k for k in free_exciters)], int)
-    covariance = np.linalg.pinv(eliminate(data + prior, own), rcond=1e-13, hermitian=True)
+    places = np.array([*range(p), *(p + 2 * k for k in free_exciters)], int)
+    covariance = np.linalg.pinv(eliminate(data + prior, places), rcond=1e-13, hermitian=True)
     floor, intervals, columns = project(problem, fitted.x).cost, {}, None
     if problem.linear is not None:
         columns = np.concatenate(columns_with_loads(problem, fitted.x, problem.linear))
@@ -169,7 +169,7 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
         place = p + i - number_count if is_unbalance else i
         index = free_exciters[i - number_count] if is_unbalance else i
         center = math.log(sizes[index]) if is_unbalance else float(fitted.x[i])
-        slopes, variance = elimination(data + prior, own[[place]])[:, 0], covariance[place, place]
+        slopes, variance = elimination(data + prior, places[[place]])[:, 0], covariance[place, place]
         if is_vanished:  # its information may be below the accuracy of the pseudoinverse
             slopes, variance = np.zeros(len(data)), known.covariance[i, i]
         spread = math.sqrt(variance)

@@ -84,9 +84,9 @@ def vibration_zone(
 ) -> str:
     """Return the zone A, B, C or D of ISO 20816-3 of a vibration.
 
-    A: new machines; B: allowed for long operation; C: allowed for a limited time; D: can cause damage. The standard is about
-    parts that shall not vibrate, such as motors, frames and foundations. It does not apply to decks, which shall vibrate; their
-    velocities are usually those of zone D.
+    A: new machines; B: allowed for long operation; C: allowed for a limited time; D: can cause damage. The standard applies to
+    parts that must not vibrate, such as motors, frames and foundations. It does not apply to decks, which must vibrate; their
+    velocities are usually in zone D.
 
     **Arguments**
 

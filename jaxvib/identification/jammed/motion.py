@@ -71,8 +71,8 @@ class _Equations(NamedTuple):
 
 
 def _equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pair: Array) -> _Equations:
-    own = samples.scene(unknowns.scene(scene, x))
-    exciter, drive = own.exciters[0], samples.drives[0]
+    scene_of_run = samples.scene(unknowns.scene(scene, x))
+    exciter, drive = scene_of_run.exciters[0], samples.drives[0]
     first, count = samples.errors
     if count and isinstance(drive, RecordedDrive):
         drive = drive.with_errors(x[first : first + count])
@@ -80,13 +80,13 @@ def _equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pai
     if exciter.unbalance is not None:
         turn = 0.0 if samples.turn is None else x[unknowns.first.shape[0] + len(unknowns.gains) + samples.turn]
         phase = exciter.direction * (jnp.arctan2(pair[1], pair[0]) + turn)
-        own = eqx.tree_at(lambda scene: scene.exciters[0].unbalance, own, jnp.hypot(pair[0], pair[1]))
+        scene_of_run = eqx.tree_at(lambda scene: scene.exciters[0].unbalance, scene_of_run, jnp.hypot(pair[0], pair[1]))
     shifted = ShiftedDrive(drive=drive, phase=phase, end=samples.end, speed=drive.speed)
-    own: Any = eqx.tree_at(lambda scene: scene.exciters[0].drive, own, shifted)
-    model = assemble(own)
+    scene_of_run: Any = eqx.tree_at(lambda scene: scene.exciters[0].drive, scene_of_run, shifted)
+    model = assemble(scene_of_run)
     gains = jnp.stack([jnp.asarray(unknowns.gain(x, channel.name)) for channel in samples.channels])
     corners = jnp.asarray([2.0 * np.pi * channel.high_pass for channel in samples.channels if channel.high_pass > 0.0])
-    return _Equations(dynamics_of(model), sensor_rows(own, model.carrier, samples.channels), gains, corners)
+    return _Equations(dynamics_of(model), sensor_rows(scene_of_run, model.carrier, samples.channels), gains, corners)
 
 
 def _rates(samples: Samples, t: Array, y: Array, equations: _Equations) -> tuple[Array, Array]:

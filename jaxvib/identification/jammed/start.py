@@ -195,8 +195,8 @@ def load_spread_of(problem: Problem, linear: np.ndarray) -> np.ndarray:
     spread = _COINCIDENT_SPREAD if loads.alike and mount.at_one_point else _FREE_SPREAD
     for place in linear_places(problem):
         angles, rates = np.split(place[2 * nd : 2 * (nd + loads.count)], 2)
-        for own, size in ((angles, 1.0), (rates, abs(float(linear[rates[0]])))):
-            information[np.ix_(own, own)] = (np.eye(loads.count) - 1.0 / loads.count) / (spread * size) ** 2
+        for group, size in ((angles, 1.0), (rates, abs(float(linear[rates[0]])))):
+            information[np.ix_(group, group)] = (np.eye(loads.count) - 1.0 / loads.count) / (spread * size) ** 2
     return information
 
 
@@ -239,14 +239,14 @@ def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[
     """Return the states (J, ns) at the starts of the stretches of a run, the pair of its unbalance, and its offsets, at the
     values `x`."""
     samples = problem.runs[r]
-    own = samples.scene(problem.unknowns.scene(problem.scene, x))
-    exciter, loads = own.exciters[0], _loads_of(own)
+    scene_of_run = samples.scene(problem.unknowns.scene(problem.scene, x))
+    exciter, loads = scene_of_run.exciters[0], _loads_of(scene_of_run)
     place: dict[str, Any] = {"at": exciter.at, "body": exciter.body, "direction": exciter.direction}
     mass = np.sum(np.broadcast_to(loads.mass, loads.count))
     jammed = Exciter(drive=jam.drive, unbalance=float(mass * np.mean(loads.arm())), unbalance_mass=float(mass), **place)
     rotors = [] if exciter.unbalance is None else [exciter.with_parts(None, samples.drives[0])]
     exciters, drives = [*rotors, jammed], (*samples.drives[: len(rotors)], jam.drive)
-    own = Scene(own.machine, exciters=exciters, effects=own.effects)
+    jammed_scene = Scene(scene_of_run.machine, exciters=exciters, effects=scene_of_run.effects)
     empty, no = jnp.zeros(0), ()
     samples = dataclasses.replace(
         samples, drives=drives, amounts=empty, changed=no, actions=no, turn=None, errors=(0, 0), stretches=(0, 0, 0)
@@ -254,7 +254,7 @@ def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[
     unknowns = Unknowns((), empty, empty, empty, no, 0)
     linear = project(
         problem._replace(
-            scene=own, unknowns=unknowns, runs=(samples,), unbalances=(None,) * len(exciters), linear=None,
+            scene=jammed_scene, unknowns=unknowns, runs=(samples,), unbalances=(None,) * len(exciters), linear=None,
             means=np.zeros(0), precisions=np.zeros(0),
         ),
         np.zeros(0),
@@ -263,7 +263,7 @@ def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[
     at = length * np.arange(number)
     pairs, channels = linear[: 2 * len(exciters)], len(samples.channels)
     ordered = np.concatenate([linear[2 * len(exciters) : -channels], pairs, linear[-channels:]])
-    motion = np.asarray(model_states(unknowns, samples, own, empty, jnp.asarray(ordered)))[at]
+    motion = np.asarray(model_states(unknowns, samples, jammed_scene, empty, jnp.asarray(ordered)))[at]
     angle = np.repeat(exciter.direction * jam.angle[at][:, None] + math.atan2(pairs[-1], pairs[-2]), loads.count, axis=1)
     rate = np.repeat(exciter.direction * jam.speed[at][:, None], loads.count, axis=1)
     filters = np.zeros((number, sum(channel.high_pass > 0.0 for channel in samples.channels)))
@@ -282,8 +282,8 @@ def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.
     def trial(x: np.ndarray, linear: np.ndarray, starts: tuple[np.ndarray, ...]) -> _Trial:
         total, prior, gradient = np.zeros((size + 2, size + 2)), np.zeros((size + 1, size + 1)), np.zeros(size + 1)
         start_changes = []
-        for samples, place, own in zip(problem.runs, places, starts, strict=True):
-            at = linearized(problem.unknowns, samples, problem.scene, x, linear[place], own)
+        for samples, place, starts_of_run in zip(problem.runs, places, starts, strict=True):
+            at = linearized(problem.unknowns, samples, problem.scene, x, linear[place], starts_of_run)
             where = np.concatenate([np.arange(p), p + place, [size, size + 1]])
             columns = weighted_columns(samples, at, at.columns)
             total[np.ix_(where, where)] += columns.T @ columns
@@ -296,8 +296,8 @@ def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.
 
     def stepped(at: _Trial, step: np.ndarray) -> _Trial:
         step = limited_step(problem, step)
-        own = (np.concatenate([step[:p], step[p + place], step[size:]]) for place in places)
-        changes = [change @ each for change, each in zip(at.start_changes, own, strict=True)]
+        steps = (np.concatenate([step[:p], step[p + place], step[size:]]) for place in places)
+        changes = [change @ each for change, each in zip(at.start_changes, steps, strict=True)]
         factor = min(1.0, _MAX_TURN / max(float(np.max(np.abs(each[:, turns]))) for each in changes))
         new = tuple(each + factor * change for each, change in zip(at.starts, changes, strict=True))
         return trial(at.x + factor * step[:p], at.linear + factor * step[p:size], new)

@@ -68,7 +68,7 @@ class BalancedStates(Result):
       loads in two planes "turn in plane 1", "shape 1 in plane 1", ...
     - `scene`
 
-    Loads in one line have one neutral direction more than the family has dimensions.
+    If all loads are on one line, there is one more neutral direction than `dimension`.
     """
 
     status: BalanceStatus
@@ -535,7 +535,7 @@ def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:
 
 @cached
 def _disturbance(scene: Scene, angles: Any) -> Array:
-    """Return the largest acceleration of a load, rad/s^2, in the balanced motion, at some angles of the rotor."""
+    """Return the largest acceleration of a load, rad/s^2, in the balanced motion, at three angles of the rotor."""
     field, speed = vector_field(at_constant_speed(scene)), scene.drive.speed
 
     def acceleration(turn: Array) -> Array:

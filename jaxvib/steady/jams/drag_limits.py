@@ -43,7 +43,7 @@ class DragStatus(eqx.Enumeration):
 class DragLimits(Result):
     """Greatest drag at which the loads can jam at each resonance. Returned by `drag_limits`.
 
-    **Attributes** (nd,), in the order of the resonances; NaN for a resonance above the rotor speed or without a jam of its own
+    **Attributes** (nd,), in the order of the resonances; NaN for a resonance above the rotor speed or without a separate jam
 
     - `status`: a `DragStatus`
     - `factor`: greatest factor by which the drag of the scene can be multiplied; with a larger one this resonance has no jam

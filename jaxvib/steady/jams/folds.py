@@ -333,13 +333,16 @@ def _first_places(there: Array, size: int, otherwise: int) -> Array:
     return jnp.sort(jnp.where(there, jnp.arange(there.shape[0]), otherwise))[:size]
 
 
-def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, most: int) -> tuple[Array, Array]:
-    """Return a grid, and `slopes` on it; points are added at minima of |slope|, because one interval can contain two folds."""
+def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, added_count: int) -> tuple[Array, Array]:
+    """Return a grid with `added_count` additional points at minima of |slope|, and `slopes` on this grid.
+
+    The points are added because one interval of the grid can contain two folds.
+    """
     value = slopes(grid)
     sign, size = jnp.sign(value), jnp.abs(value)
     same = (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:])
     dips = same & (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:])
-    at = _first_places(dips, most, dips.shape[0] - 1)
+    at = _first_places(dips, added_count, dips.shape[0] - 1)
     step = (jnp.sqrt(jnp.asarray(5.0, grid.dtype)) - 1.0) / 2.0
 
     side, lowest = jnp.sign(value[at + 1]), jnp.abs(value[at + 1])
@@ -355,8 +358,8 @@ def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, most: int) 
 
     added, least = jax.lax.fori_loop(0, 16, narrow, (grid[at], grid[at + 2], grid[at + 1], lowest))[2:]
     # Both lists of points are ascending. Merging them takes a tenth of the time of sorting all points.
-    places = at + 1 + (added > grid[at + 1]) + np.arange(most)
-    is_added = jnp.zeros(grid.shape[0] + most, bool).at[places].set(True)
+    places = at + 1 + (added > grid[at + 1]) + np.arange(added_count)
+    is_added = jnp.zeros(grid.shape[0] + added_count, bool).at[places].set(True)
     before = jnp.cumsum(is_added)
     order = jnp.where(is_added, grid.shape[0] + before - 1, np.arange(is_added.shape[0]) - before)
     return jnp.concatenate([grid, added])[order], jnp.concatenate([value, side * least])[order]

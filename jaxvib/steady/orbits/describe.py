@@ -116,10 +116,10 @@ class Orbit(Result):
 
         **Raises** `InputError` for a coordinate that the machine does not have.
         """
-        most = self.displacement_harmonics.shape[-2]
+        nd = self.displacement_harmonics.shape[-2]
         for name, coordinate in (("i", i), ("j", j)):
-            if count(coordinate, name) > most:
-                raise InputError(name, f"is {coordinate}; the coordinates are numbered 1 to {most}")
+            if count(coordinate, name) > nd:
+                raise InputError(name, f"is {coordinate}; the coordinates are numbered 1 to {nd}")
         return _relative_amplitude(self.orders, self.displacement_harmonics, i, j)
 
     @property

@@ -107,7 +107,7 @@ def _jacobian(
     unit = (model.drag * omega)[:, None]
     phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
     by_angle, by_rate, by_acceleration = model.torque_slopes(phi, rate, speed, balance.acceleration)
-    own = (
+    of_one_body = (
         (model.inertia * omega**2 / unit[:, 0])[:, None, None] * grid.second[None]
         + (balance.vibration_stiffness - by_angle / unit)[:, :, None] * np.eye(m)[None]
         - (omega * by_rate / unit)[:, :, None] * grid.first[None]
@@ -116,7 +116,7 @@ def _jacobian(
     # Dry friction also depends on the acceleration that the other bodies cause.
     torque_response = (force_change if by_acceleration is None else force_change - by_acceleration) / unit[None]
     coupling = jnp.einsum("agi,abij,bhj->gihj", torque_response, _feedback(grid, port_response), force_change)
-    return (own[:, :, None, :] * np.eye(g)[:, None, :, None] + coupling).reshape(g * m, g * m)
+    return (of_one_body[:, :, None, :] * np.eye(g)[:, None, :, None] + coupling).reshape(g * m, g * m)
 
 
 class PeriodicSolution(NamedTuple):
