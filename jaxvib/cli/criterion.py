@@ -132,7 +132,7 @@ def balance(
     output.done(document, lambda: _balance_text(states, stabilities, stable), "balance", states)
 
 
-def _balance_text(states: jv.BalancedStates, stabilities: list[BalancedStability], stable: list[list[list[float]]]) -> str:
+def _balance_text(states: jv.BalancedStates, stabilities: list[BalancedStability], stable: Sequence[list[list[float]]]) -> str:
     """Return the arrangements as a table, below lines with the answer."""
     from jaxvib.display import speed_text, speed_unit  # slow imports, which --help does not need
     from jaxvib.results.status import status_name
