@@ -127,9 +127,11 @@ def away_from(fit):
     return np.array([(each.value - TRUTH[name]) / each.error for name, each in zip(fit.names, fit.estimates, strict=True)])
 
 
-def first_scene():
+FACTORS = {"stiffness": 1.05, "damping": 1.0 / 1.3, "loads.mass": 1.1, "drag": 1.0 / 1.2}
+
+
+def first_scene(factors):
     """Return the scene with first values away from the truth."""
-    factors = {"stiffness": 1.05, "damping": 1.0 / 1.3, "loads.mass": 1.1, "drag": 1.0 / 1.2}
     factor = {name: next((f for word, f in factors.items() if word in name), 1.0) for name in TRUTH}
     return scene_of({name: value * factor[name] for name, value in TRUTH.items()})
 
@@ -137,7 +139,7 @@ def first_scene():
 @functools.cache
 def fitted():
     run = jammed_record(JAMMED_NOISE, np.random.default_rng(0))
-    return jv.identify(first_scene(), run, unknown=[*NAMES, "loads.mass", "loads.drag"])
+    return jv.identify(first_scene(FACTORS), run, unknown=[*NAMES, "loads.mass", "loads.drag"])
 
 
 def test_jammed_balls_and_unbalance_are_found():
@@ -181,15 +183,19 @@ def test_jammed_balls_are_found_with_other_noise(name):
     found = repeated(2, **JAMMED_CASES[name])
     assert found.statuses.tolist() == ["found"] * 2
     assert np.max(np.abs(found.away)) < 3.5
-    np.testing.assert_allclose(np.abs(found.relative / found.away / found.bound), 1.0, atol=0.25)
+    ratio = np.abs(found.relative / found.away / found.bound)  # the bound does not know of clipped readings, 24 % of all
+    assert np.min(ratio) > 0.9 and np.max(ratio) < (1.35 if "clipped" in name else 1.1)
 
 
 @pytest.mark.slow
 def test_two_runs_with_an_added_mass_give_all_masses():
-    rng = np.random.default_rng(1)
+    """The first values of the natural frequencies are 5 % too low, and the stiffnesses follow from the jam at first."""
+    rng = np.random.default_rng([0, 0])
     first = jammed_record(JAMMED_NOISE, rng)
     heavier = jammed_record(JAMMED_NOISE, rng, impact=-0.15, added=5.0, change={"machine.mass[0]": "+5 kg"})
-    fit = jv.identify(first_scene(), [first, heavier], unknown=["machine.mass", *NAMES, "loads.mass", "loads.drag"])
+    factors = {"stiffness": 1.0 / 1.05, "link_damping": 1.0 / 1.3, "damping": 1.3, "machine.mass": 1.05}
+    scene = first_scene(factors | {"loads.mass": 1.1, "drag": 1.0 / 1.2})
+    fit = jv.identify(scene, [first, heavier], unknown=["machine.mass", *NAMES, "loads.mass", "loads.drag"])
     assert fit.status_name == "found" and fit.undetermined == ()
     assert np.max(np.abs(away_from(fit))) < 3.5
     assert fit.estimate("machine.mass[0]").error < 5.0

@@ -234,6 +234,44 @@ def test_filters_are_computed_until_the_noise_is_steady(monkeypatch):
     assert passes == [False, False, True, True]
 
 
+@pytest.mark.parametrize(("taps", "growth", "is_absorbed"), [(2, 1.25, True), (2, 1.15, False), (1, 1.25, False)])
+def test_coloured_noise_does_not_take_up_the_motion(monkeypatch, taps, growth, is_absorbed):
+    """The residuals of a channel grow with its coloured noise, and the fit with white noise is returned."""
+    passes, original = [], fit._pass
+
+    def run(*arguments):
+        found = original(*arguments)
+        passes.append(found)
+        if len(passes) > 2:
+            found = found._replace(noise=(found.noise[0], passes[1].noise[1] * np.array([1.0, growth])))
+        return found
+
+    monkeypatch.setattr(fit, "noise_of", lambda residual: Noise(np.eye(taps)[0], np.std(residual)))
+    monkeypatch.setattr(fit, "_pass", run)
+    found = fit.fit_from(problem_with(), [TRUTH])
+    assert found.is_absorbed is is_absorbed and len(passes) >= 3
+    if is_absorbed:
+        np.testing.assert_array_equal(found.noise, passes[1].noise)
+        np.testing.assert_array_equal(found.information, passes[1].information)
+
+
+def test_known_unbalance_without_influence_stays_small(monkeypatch):
+    """The readings hardly depend on the unbalance; least squares alone would give it an arbitrary size."""
+    original = fit.linear_equations
+
+    def equations(*arguments):
+        total = np.array(original(*arguments))
+        factors = np.ones(len(total))
+        factors[first : first + 2] = 1e-9
+        return total * np.outer(factors, factors)
+
+    problem = problem_with(unbalance=Known(1.0, 1e-4))
+    first = int(np.flatnonzero(fit.linear_places(problem)[0] == 0)[0])
+    monkeypatch.setattr(fit, "linear_equations", equations)
+    found = fit.project(problem, TRUTH)
+    assert np.hypot(*found.linear[:2]) == pytest.approx(1.0, abs=1e-3)
+
+
 def test_best_of_several_minima_is_returned(monkeypatch):
     costs = {0.0: 3.0, 1.0: 1.0, 2.0: 2.0}
 
