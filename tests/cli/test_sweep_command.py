@@ -69,7 +69,7 @@ def test_a_commented_study_file_is_one(typed, tmp_path):
     assert (tmp_path / "fresh" / "study.toml").read_text() == out.rstrip() + "\n"
 
 
-def test_an_interrupt_names_the_saved_chunks(typed, monkeypatch):
+def test_an_interrupt_names_the_saved_chunks(typed, monkeypatch, tmp_path):
     reports = []
 
     def stop_once(self, now):
@@ -80,7 +80,8 @@ def test_an_interrupt_names_the_saved_chunks(typed, monkeypatch):
     monkeypatch.setattr(command._ProgressLines, "__call__", stop_once)
     code, _, err = typed("sweep", "study.toml")
     assert code == 1 and "finished cases are saved in study.zarr; run the same command again to continue" in err
-    code, out, _ = typed("show", "study.zarr")
+    code, out, _ = typed("show", "study.zarr", "--report", "report.html")
+    assert "<title>show: study</title>" in (tmp_path / "report.html").read_text()
     left = 10 - reports[0].done  # 6 or 8: threads end their chunks of 4, 4 and 2 cases in any order
     assert (
         left in (6, 8)
