@@ -103,7 +103,7 @@ def require_terms(effect: Effect) -> None:
     if _is_of_package(effect):
         return
     field = f"effects.{effect.kind}.terms"
-    for term in _require_tuple(field, "", effect.terms(), "terms"):
+    for term in _require_tuple(field, "", effect.terms(), "terms", least=0):
         if not isinstance(term, get_args(Term)):
             kinds = ", ".join(kind.__name__ for kind in get_args(Term))
             raise InputError(field, f"returns {quoted(term)}; terms are needed: {kinds}")
@@ -128,10 +128,10 @@ def _shapes(function: Callable[[T], Any], part: T) -> Any:
     return eqx.filter_eval_shape(function, part)
 
 
-def _require_tuple(field: str, name: str, value: Any, needed: str, *lengths: int) -> Sequence[Any]:
-    """Return the value. **Raises** `InputError` if it is not a tuple with one of the `lengths`; default: any but 0."""
+def _require_tuple(field: str, name: str, value: Any, needed: str, *lengths: int, least: int = 1) -> Sequence[Any]:
+    """Return the value. **Raises** `InputError` if it is not a tuple with one of the `lengths`; default: at least `least`."""
     is_tuple = isinstance(value, (tuple, list))
-    if not is_tuple or not value or len(value) not in (lengths or (len(value),)):
+    if not is_tuple or len(value) < least or (lengths and len(value) not in lengths):
         shown = f"a tuple of {len(value)}" if is_tuple else _described(value)
         raise InputError(field, f"returns {name}{shown}; a tuple of {needed} is needed")
     return value

@@ -127,4 +127,5 @@ def test_wrong_shape_of_a_part_is_named(name):
 def test_plain_numbers_and_lists_of_terms_are_allowed():
     effects = with_method(BRAKE, "terms", lambda self: [LoadResistance(self.force)])
     own = scene(loads=with_method(LOADS, "inertia_factor", lambda self: 1.0), drive=STEADY, effects=effects)
+    assert scene(effects=with_method(BRAKE, "terms", lambda self: ())).exciters[0].effects[0].terms() == ()
     assert own.drive.acceleration_at(0.0) == 0.0 and own.loads.inertia_factor() == 1.0
