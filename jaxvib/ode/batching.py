@@ -1,4 +1,7 @@
-"""Batches of tangents or of runs along a last axis, which is the best layout for vector instructions."""
+"""Batches of tangents (derivatives in several directions) or of runs.
+
+The batch is the last axis of each array; vector instructions compute this layout fastest.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +23,18 @@ VECTOR = 8
 X = TypeVar("X")
 Out = TypeVar("Out")
 _WithTangents: TypeAlias = Callable[[PyTree, Tangents], tuple[PyTree[Array], Tangents]]
+"""Function of values and tangents that returns results and their tangents."""
 
 
 def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents], tuple[Out, Tangents]]) -> Callable[[X], Out]:
     """Return `function` with forward derivatives by `jvp`, and without reverse derivatives.
 
-    Under `jacfwd` JAX maps the derivative along one tangent over all tangents, and their axis is the first one. Here `jvp` is
-    called once for all tangents, and their axis is the last one. Every number of the program is then a vector over the
-    tangents, contiguous in memory.
+    `jacfwd` of JAX applies the derivative along one tangent to all tangents by `vmap`; the axis of the tangents is then the
+    first one. Here `jvp` is called once for all tangents (unless x is batched too), and their axis is the last one. Every
+    number of the program is then a vector over the tangents, contiguous in memory.
 
-    **Arguments**: `jvp(x, tangents)`: `function(x)` and its tangents; both tangents are `Tangents`.
+    **Arguments**: `jvp(x, tangents)` returns `function(x)` and its tangents. The tangents of x and of the result are
+    `Tangents`, with the axis of the tangents last.
 
     >>> import jax, jax.numpy as jnp
     >>> square = multi_tangent_jvp(lambda x: x**2, lambda x, slope: (x**2, 2.0 * x[:, None] * slope))
@@ -43,17 +48,19 @@ def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents],
 
     @call.def_jvp
     def _(primals: tuple[X], tangents: tuple[Tangents]) -> tuple[Out, Tangents]:
-        leaves, rest = jax.tree.flatten(primals[0])
-        moves = flat_tangents(tangents[0], primals[0])
+        leaves, structure = jax.tree.flatten(primals[0])
+        directions = flat_tangents(tangents[0], primals[0])
         arrays = [leaf if eqx.is_array(leaf) else None for leaf in leaves]
-        places = [k for k, move in enumerate(moves) if move is not None]
+        places = [k for k, direction in enumerate(directions) if direction is not None]
 
-        def on_arrays(arrays: list[Array | None], moves: list[Array]) -> tuple[Out, Tangents]:
+        def on_arrays(arrays: list[Array | None], directions: list[Array]) -> tuple[Out, Tangents]:
             inputs = [leaf if array is None else array for array, leaf in zip(arrays, leaves, strict=True)]
-            given = dict(zip(places, moves, strict=True))
-            return jvp(jax.tree.unflatten(rest, inputs), jax.tree.unflatten(rest, [given.get(k) for k in range(len(leaves))]))
+            given = dict(zip(places, directions, strict=True))
+            return jvp(
+                jax.tree.unflatten(structure, inputs), jax.tree.unflatten(structure, [given.get(k) for k in range(len(leaves))])
+            )
 
-        return _tangents_last(on_arrays)(arrays, [moves[k] for k in places])
+        return _tangents_last(on_arrays)(arrays, [directions[k] for k in places])
 
     return call
 
@@ -75,12 +82,12 @@ def batch_last(function: Callable[[X], Out], batched: Callable[[X, Batched], Out
 
     @eqx.filter_custom_jvp
     def call(x: X) -> Out:
-        leaves, rest = jax.tree.flatten(x)
+        leaves, structure = jax.tree.flatten(x)
         places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
 
         def unflatten(arrays: Sequence[Array]) -> X:
             given = dict(zip(places, arrays, strict=True))
-            return jax.tree.unflatten(rest, [given.get(k, leaf) for k, leaf in enumerate(leaves)])
+            return jax.tree.unflatten(structure, [given.get(k, leaf) for k, leaf in enumerate(leaves)])
 
         mapped = custom_vmap(lambda *arrays: function(unflatten(arrays)))
 
@@ -88,7 +95,7 @@ def batch_last(function: Callable[[X], Out], batched: Callable[[X, Batched], Out
         def _(size: int, is_batched: Sequence[bool], *arrays: Array) -> tuple[Out, Batched]:
             last = [jnp.moveaxis(a, 0, -1) if along else a for a, along in zip(arrays, is_batched, strict=True)]
             known = dict(zip(places, is_batched, strict=True))
-            out = batched(unflatten(last), jax.tree.unflatten(rest, [known.get(k, False) for k in range(len(leaves))]))
+            out = batched(unflatten(last), jax.tree.unflatten(structure, [known.get(k, False) for k in range(len(leaves))]))
             return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), out), jax.tree.map(lambda _: True, out)
 
         return mapped(*(leaves[k] for k in places))
@@ -106,8 +113,8 @@ def flat_tangents(tangents: Tangents, like: PyTree) -> list[Array | None]:
 
 
 def _tangents_last(function: _WithTangents) -> _WithTangents:
-    """Convert a function for directions along a last axis to f(x, tangents) for one direction. Under `vmap` the original
-    function is called once."""
+    """Convert a function of x and many tangents (last axis) to a function of x and one tangent. Under `vmap` over tangents
+    alone the original function is called once for all of them."""
 
     def single(x: PyTree, tangents: Tangents) -> tuple[PyTree[Array], Tangents]:
         y, out = function(x, jax.tree.map(lambda dx: dx[..., None], tangents))

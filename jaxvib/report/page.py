@@ -1,4 +1,4 @@
-"""Report of a result as one web page: command, accuracy, figures, numbers, machine, versions."""
+"""Report of a result as one web page: command, results, figures, machine, all numbers, versions."""
 
 from __future__ import annotations
 

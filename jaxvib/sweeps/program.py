@@ -33,7 +33,7 @@ _STATES_PER_TURN = 8
 """Smallest number of states per turn of the rotor. Jammed loads turn more slowly; there are more states per turn of a load."""
 
 _SLOW_PERIODS = 20
-"""Length of the window in periods of the lowest natural frequency, as in `simulate`."""
+"""Length of the window in periods of the lowest natural frequency, as in `simulate`, which allows twice as many turns."""
 
 _CASES_PER_BLOCK = 64
 """Number of cases whose rates are computed together in the search for the fastest and the slowest case."""
@@ -41,7 +41,7 @@ _CASES_PER_BLOCK = 64
 _MAX_STEPS = 1e9
 """Maximum number of steps of a run, about an hour of computation."""
 
-_CODE = {name: k for k, name in enumerate(CASE_STATUSES)}
+_STATUS_NUMBER = {name: k for k, name in enumerate(CASE_STATUSES)}
 
 
 class Chunk(NamedTuple):
@@ -107,7 +107,8 @@ def _rates(scene: Scene, values: Array, targets: tuple[Target, ...]) -> Array:
     """Return rates (cases, 5) of cases (cases, axes): fastest and -slowest rate, decay, rotor speed, and the sum of the squared
     natural frequencies.
 
-    If a motor is faster than all vibrations, no single axis changes the fastest rate; the sum changes with every stiffness.
+    The sum serves the search of `extreme_cases`, which changes one axis at a time: if the rotor is faster than all vibrations,
+    a stiffness does not change the fastest rate, but it changes the sum.
     """
 
     def rates_of_case(value: Array) -> Array:
@@ -175,8 +176,10 @@ def compute(study: Study, chunk: int) -> Chunk:
     parts = _compute_cases(study, values, np.arange(len(values)), errors)
     leaves, finite = parts
     is_complete = np.all([np.all(np.isfinite(leaf.reshape(len(values), -1)), axis=1) for leaf in leaves], axis=0)
-    status = np.where(finite, np.where(is_complete, _CODE["done"], _CODE["absent"]), _CODE["not_finite"]).astype(np.uint8)
-    status[list(errors)] = _CODE["failed"]
+    status = np.where(
+        finite, np.where(is_complete, _STATUS_NUMBER["done"], _STATUS_NUMBER["absent"]), _STATUS_NUMBER["not_finite"]
+    ).astype(np.uint8)
+    status[list(errors)] = _STATUS_NUMBER["failed"]
     return Chunk(dict(zip(study.names, leaves, strict=True)), status, errors)
 
 

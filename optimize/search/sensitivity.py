@@ -14,7 +14,7 @@ from optimize.search.polish import FEASIBILITY_TOLERANCE
 from optimize.search.problem import Problem
 
 _STEP = 0.01
-"""Relative change of a free parameter by which its influence is computed."""
+"""Relative change of a free parameter for its influence, and of a limit for the improvement of the objective."""
 
 
 def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult, sides: np.ndarray) -> tuple[Limit, ...]:
@@ -22,7 +22,7 @@ def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult,
 
     **Arguments**: `sides` (number of demands, 2): the value of each demanded quantity, and its limit.
     """
-    best, m = result.best, problem.equalities
+    best, held_count = result.best, problem.equalities
     values, duals = result.point.values[best], result.optimality
     objective = abs(values[0]) if np.isfinite(values[0]) else np.nan
     space = problem.space.within(*result.bounds)
@@ -31,22 +31,23 @@ def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult,
     def gain(multiplier: float) -> float:
         return float(100.0 * _STEP * multiplier / max(objective, 1e-300))
 
-    for held, off, dual in zip(space.held, values[1 : 1 + m], duals.held[best], strict=True):
+    for held, deviation, dual in zip(space.held, values[1 : 1 + held_count], duals.held[best], strict=True):
         assert held.value is not None
         at = float(held.value)
         unit, factor = shown_unit(held.quantity.unit, abs(at))
         what = f"{held.quantity.words} held at {at * factor:.5g} {unit}".rstrip()
-        violation = 0.0 if abs(off) <= 10.0 * FEASIBILITY_TOLERANCE else abs(off) if np.isfinite(off) else np.inf
-        value = float(at * (1.0 + off))
+        size = abs(deviation)
+        violation = 0.0 if size <= 10.0 * FEASIBILITY_TOLERANCE else size if np.isfinite(size) else np.inf
+        value = float(at * (1.0 + deviation))
         rows.append(Limit(what, held.quantity.unit, value, at, float(violation), True, float(-dual), gain(-dual)))
     for k, demand in enumerate(demands):
-        excess, dual, scale = values[1 + m + k], duals.demands[best, k], float(problem.scales[k])
+        excess, dual, scale = values[1 + held_count + k], duals.demands[best, k], float(problem.scales[k])
         violation = 0.0 if excess <= 10.0 * FEASIBILITY_TOLERANCE else excess if np.isfinite(excess) else np.inf
         active = bool(excess > -1e-6)
-        share = -dual * abs(sides[k, 1]) / scale if active else 0.0
+        multiplier = -dual * abs(sides[k, 1]) / scale if active else 0.0
         value, limit = float(sides[k, 0]), float(sides[k, 1])
-        change = (float(share), gain(share), demand.written_unit)
-        rows.append(Limit(demand.words, demand.quantity.unit, value, limit, float(violation), active, *change))
+        effect = (float(multiplier), gain(multiplier), demand.written_unit)
+        rows.append(Limit(demand.words, demand.quantity.unit, value, limit, float(violation), active, *effect))
     numbers = space.numbers(result.point.z[best])
     low, high = (np.asarray(b) for b in (problem.space.low, problem.space.high))
     sizes = np.abs([low, high])
@@ -60,8 +61,9 @@ def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult,
             continue
         shown, factor = shown_unit(unit, abs(numbers[k]))
         what = f"{word} {'at most' if upper else 'at least'} {numbers[k] * factor:.5g} {shown}"
-        share = -abs(dual * numbers[k]) / slopes[k]
-        rows.append(Limit(what, unit, float(numbers[k]), float(numbers[k]), 0.0, True, float(share), gain(share)))
+        multiplier = -abs(dual * numbers[k]) / slopes[k]
+        at = float(numbers[k])
+        rows.append(Limit(what, unit, at, at, 0.0, True, float(multiplier), gain(multiplier)))
     return tuple(rows)
 
 
@@ -71,8 +73,8 @@ def neighbours(problem: Problem, result: SearchResult) -> np.ndarray:
     In each neighbour one free parameter is 1 % smaller or larger.
     """
     numbers = problem.space.within(*result.bounds).numbers(result.point.z[result.best])
-    off = np.diag(_STEP * numbers)
-    return numbers + np.concatenate([np.zeros((1, len(numbers))), -off, off])
+    changes = np.diag(_STEP * numbers)
+    return numbers + np.concatenate([np.zeros((1, len(numbers))), -changes, changes])
 
 
 def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]:

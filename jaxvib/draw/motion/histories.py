@@ -16,9 +16,9 @@ _BINS = 300
 _MAX_PLAIN_PERIODS = 40
 """Maximum number of periods of a run that is drawn without bands."""
 
-_MAX_BEATS, _SAMPLES_PER_BAND, _MIN_SAMPLES = 20, 10, 1000
+_MAX_BEATS, _SAMPLES_PER_INTERVAL, _MIN_SAMPLES = 20, 10, 1000
 """Maximum number of beats of an averaged history that is drawn as a curve. A history with more beats is a band between the
-minimum and the maximum of `_SAMPLES_PER_BAND` samples, if it has at least `_MIN_SAMPLES`."""
+minimum and the maximum of `_SAMPLES_PER_INTERVAL` samples, if it has at least `_MIN_SAMPLES`."""
 
 _SHOWN_PERIODS = 3
 """Number of periods at the end that are drawn as curves."""
@@ -80,7 +80,7 @@ def time_histories(
     **Arguments** (nt times, nd coordinates, nb directions of the force)
 
     - `whole`, `end`: tuples of time (nt,), s; displacement (nt, nd), m or rad; load speeds (nt, count) and rotor speeds
-      (nt, exciters), rad/s; force (nt, nb), N. The last periods are those of `end`
+      (nt, exciters), rad/s; force (nt, nb), N. The right column shows the last periods of `end`
     - `names`, `units` (nd,): names of the coordinates and their units, "m" or "rad"; `units` None: all m
     - `directions` (nb,): names of the directions of the force
 
@@ -104,19 +104,19 @@ def time_histories(
         own = [k for k in range(len(names)) if units[k] == kind]
         left, right = axes[2 * row : 2 * row + 2]
         for k in own:
-            _band(left, whole[0], factor * whole[1][:, k], k, names[k], bins, depth[k])
+            _draw_band(left, whole[0], factor * whole[1][:, k], k, names[k], bins, depth[k])
         for k in own:
             right.plot(part[0], factor * part[1][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.3)
         left.set_ylabel(label)
         legend_above(left, 6)
     left, right = axes[-4:-2]
     for k, name in _equal_loads(whole[2], part[2]):
-        _band(left, whole[0], scale * whole[2][:, k], k, name, bins)
+        _draw_band(left, whole[0], scale * whole[2][:, k], k, name, bins)
         right.plot(part[0], scale * part[2][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.2)
     _draw_rotor_speeds(left, whole[0], scale * whole[3])
-    ends = [np.min(part[2], initial=np.inf), np.max(part[2], initial=-np.inf)]
+    slowest, fastest = np.min(part[2], initial=np.inf), np.max(part[2], initial=-np.inf)
     # The ripple of loads that are much slower than the rotor would be invisible on an axis that includes the rotor.
-    if whole[2].shape[1] == 0 or np.all(np.abs(part[3] - np.mean(ends)) < ends[1] - ends[0]):
+    if whole[2].shape[1] == 0 or np.all(np.abs(part[3] - 0.5 * (slowest + fastest)) < fastest - slowest):
         _draw_rotor_speeds(right, part[0], scale * part[3])
     low, high = right.get_ylim()
     if high - low < (least := _MIN_SPEED_RANGE * max(abs(low), abs(high))):  # rounding errors of a constant speed
@@ -125,7 +125,7 @@ def time_histories(
     legend_above(left, 6)
     left, right = axes[-2:]
     for k, name in enumerate(directions):
-        _band(left, whole[0], whole[4][:, k], k, name, bins)
+        _draw_band(left, whole[0], whole[4][:, k], k, name, bins)
         right.plot(part[0], part[4][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.2)
     left.set_ylabel("foundation force, N")
     if len(directions) > 1:
@@ -193,9 +193,10 @@ def _group_name(group: Sequence[int]) -> str:
     return f"loads {', '.join(str(k + 1) for k in group[:-1])} and {group[-1] + 1}"
 
 
-def _band(
+def _draw_band(
     axis: Axes, time: np.ndarray, values: np.ndarray, k: int, name: str | None, bins: int, depth: float | np.ndarray = 0.0
 ) -> None:
+    """Draw the signal number `k` as a curve, or as a band if it has more samples than `bins`."""
     middle, low, high = band(time, values, bins)
     if low is not high:
         low, high = -_smoothed_peaks(-low), _smoothed_peaks(high)
@@ -241,9 +242,12 @@ def amplitude_histories(
 ) -> Drawn:
     """Draw the histories of an averaged run, a panel for each quantity; amplitudes are zero to peak.
 
-    `time` (nt,) is in s, `amplitude` (nt, nd) in m, drawn in mm or µm, or rad, drawn in mrad, by `units` (nd,), `load_speed`
-    (nt, count) and `rotor_speed` (nt, exciters) are in rad/s, drawn in `unit`, and the foundation force `force` (nt,
-    directions) is in N. Natural frequencies `resonances`, rad/s, up to the largest speed are dotted lines beside the speeds.
+    **Arguments** (nt times, nd coordinates)
+
+    - `time` (nt,), s; `amplitude` (nt, nd), m or rad according to `units` (nd,), drawn in mm or µm, and in mrad
+    - `load_speed` (nt, count), `rotor_speed` (nt, exciters), rad/s, drawn in `unit`
+    - `force` (nt, directions): foundation force, N
+    - `resonances`: natural frequencies, rad/s; those below the largest rotor speed are dotted lines in the panel of the speeds
     """
     unit, scale = speed_unit(unit)
     kinds = _kinds(amplitude, units, "amplitude", "amplitude")
@@ -253,8 +257,8 @@ def amplitude_histories(
         depth = np.argsort(np.argsort(-np.ptp(values, axis=0)))  # as in `time_histories`
         for k, name in zip(places, labels, strict=True):
             beats = np.count_nonzero(np.diff(np.sign(np.diff(values[:, k])))) / 2.0
-            bins = time.size // _SAMPLES_PER_BAND if beats > _MAX_BEATS and time.size >= _MIN_SAMPLES else time.size
-            _band(axis, time, values[:, k], k, name, bins, depth[k])
+            bins = time.size // _SAMPLES_PER_INTERVAL if beats > _MAX_BEATS and time.size >= _MIN_SAMPLES else time.size
+            _draw_band(axis, time, values[:, k], k, name, bins, depth[k])
 
     for axis, (kind, label, factor) in zip(axes, kinds, strict=False):
         own = [k for k in range(len(names)) if units[k] == kind]

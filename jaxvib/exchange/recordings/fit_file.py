@@ -56,8 +56,10 @@ def fit_from_tables(tables: Tables, folder: Path) -> FitInput:
             raise InputError(name, f"is not part of an identification file; {suggest_name(name, FIT_TABLES)}")
     machine = tables.get("machine")
     if not isinstance(machine, Mapping) or set(machine) != {"file"} or not isinstance(machine["file"], str):
-        raise InputError("machine", 'is not the name of a scene file; write [machine] and below it file = "machine.toml"')
-    options = build_part(_options, _table(tables.get("identify", {}), "identify"), "identify")
+        raise InputError(
+            "machine", 'must be a table with the name of the scene file; write [machine] and below it file = "machine.toml"'
+        )
+    options = build_part(_unknown_and_known, _table(tables.get("identify", {}), "identify"), "identify")
     entries = _entries(tables, "channel")
     channels = [build_part(Channel, table, f"channel[{k}]") for k, table in enumerate(entries)]
     runs = [_run(table, k, channels, folder) for k, table in enumerate(_entries(tables, "run"))]
@@ -75,10 +77,10 @@ def _table(value: object, name: str) -> Mapping[str, object]:
     return value
 
 
-def _entries(tables: Mapping[str, object], name: str) -> list[Mapping[str, object]]:
-    entries = tables.get(name)
+def _entries(tables: Mapping[str, object], name: str, within_table: str | None = None) -> list[Mapping[str, object]]:
+    entries, path = tables.get(name), name if within_table is None else f"{within_table}.{name}"
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, Mapping) for entry in entries):
-        raise InputError(name, f"is {'missing' if entries is None else quoted(entries)}; write [[{name}]] for each {name}")
+        raise InputError(path, f"is {'missing' if entries is None else quoted(entries)}; write [[{path}]] for each {name}")
     return entries  # pyright: ignore[reportReturnType]
 
 
@@ -106,14 +108,16 @@ def _candidate(table: Mapping[str, object], k: int, channels: list[Mapping[str, 
     for name in ("name", "drive", "duration"):
         if name not in table:
             raise InputError(f"{field}.{name}", "is missing; a candidate needs a name, a drive and a duration")
-    places, names = _table(table.get("at", {}), f"{field}.at"), [str(each["name"]) for each in channels]
+    places, names = table.get("at", {}), [str(each["name"]) for each in channels]
+    if not isinstance(places, Mapping):
+        raise InputError(f"{field}.at", f"is {quoted(places)}; write the places of channels, such as at = {{ {names[0]} = 2 }}")
     for name in places:
         if name not in names:
             raise InputError(f"{field}.at.{name}", f"is not a channel; the channels are: {', '.join(names)}")
     moved_channels = [
         {**each, "at": places[name]} if name in places else each for name, each in zip(names, channels, strict=True)
     ]
-    new = _entries(table, "channel") if "channel" in table else []
+    new = _entries(table, "channel", within_table="candidate") if "channel" in table else []
     measured = [channel.name for channel in first.of_kind(*MOTIONS)]
     if "rate" not in table and not measured:
         raise InputError(f"{field}.rate", "is missing; write for example rate = '500 Hz'")
@@ -130,9 +134,12 @@ def _candidate(table: Mapping[str, object], k: int, channels: list[Mapping[str, 
         return build_part(PlannedRun, values, "")
 
 
-def _options(unknown: object = (), known: object = None) -> tuple[tuple[str, ...], dict[str, Number]]:
+def _unknown_and_known(unknown: object = (), known: object = None) -> tuple[tuple[str, ...], dict[str, Number]]:
     if not isinstance(unknown, (list, tuple)) or not unknown or not all(isinstance(each, str) for each in unknown):
-        raise InputError("identify.unknown", f'is {quoted(unknown)}; write a list of names, such as ["machine.stiffness"]')
+        raise InputError(
+            "identify.unknown",
+            f'is {quoted(unknown) if unknown else "missing or empty"}; write a list of names, such as ["machine.stiffness"]',
+        )
     if known is not None and not isinstance(known, Mapping):
         raise InputError("identify.known", f'is {quoted(known)}; write {{ "machine.mass[1]" = "95 kg +- 1 %" }}')
     return tuple(unknown), dict(known or {})

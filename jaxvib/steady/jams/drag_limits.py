@@ -30,7 +30,7 @@ _SETS_OF_PHASES = 64
 """Number of random sets of phases at each load speed."""
 
 _GOLDEN_STEPS = 60
-"""Number of golden-section steps; the speed of a maximum then has a relative error of 1e-8 and its value one of 1e-15."""
+"""Number of golden-section steps; the relative error is then 1e-8 for the speed of a maximum, and 1e-15 for its value."""
 
 
 class DragStatus(eqx.Enumeration):
@@ -87,11 +87,11 @@ def drag_limits(scene: Scene, *, phases: bool = False) -> DragLimits:
         factor(w) sum b_W R^2 (n - w) = braking torque of the vibration at w
 
     The greatest drag of a resonance is the maximum of `factor` over the load speeds w near it. At this maximum two jams merge
-    in a fold; with a larger drag the loads pass this resonance. An imbalance of the rotor does not change the limits at this
-    order, see `jam_modes`.
+    in a fold; with a larger drag the loads pass this resonance. In the limit of light loads an imbalance of the rotor does not
+    change the limits, see `jam_modes`.
 
-    - For equal loads at one point of the machine no other arrangement needs a larger drag: the torques of all loads have the
-      sum (w^4/2) |sum_j S_j exp(i a_j)|^2 Im h, which is largest for equal angles
+    - For equal loads at one point of the machine no other arrangement can jam at a larger drag: the torques of all loads have
+      the sum (w^4/2) |sum_j S_j exp(i a_j)|^2 Im h, which is largest for equal angles
     - Loads at several points of a rotor, or unequal loads, jam at unequal phases. With `phases`, `factor` is the largest one
       of all phases that a search finds
 
@@ -125,11 +125,11 @@ def _limits_of_coincident_loads(scene: Scene) -> DragLimits:
     model = jammed_model(scene)
     parts = {name: getattr(model, name) for name in DraggedModel.__dataclass_fields__}
     pieces = branch_pieces(DraggedModel(**parts).decomposed())
-    # Every second fold is a maximum, at the end of a piece that belongs to its resonance.
+    # The folds 0, 2, 4, ... are maxima. The piece before a maximum has the mode number 2 r - 1 of its resonance r = 1, 2, ...
     peaks, owner = pieces.folds.exists[0::2], (pieces.mode[0:-1:2] - 1) // 2
     is_own = peaks[None, :] & (owner[None, :] == np.arange(owner.size)[:, None])
-    there, which = jnp.any(is_own, axis=1), jnp.argmax(is_own, axis=1)
-    factor, omega = (jnp.where(there, each[0::2][which], jnp.nan) for each in (pieces.folds.rotor_speed, pieces.folds.omega))
+    exists, peak = jnp.any(is_own, axis=1), jnp.argmax(is_own, axis=1)
+    factor, omega = (jnp.where(exists, each[0::2][peak], jnp.nan) for each in (pieces.folds.rotor_speed, pieces.folds.omega))
     return _limits(scene, factor, omega, pieces.resonances)
 
 
@@ -146,11 +146,11 @@ def _limits_of_phases(scene: Scene) -> DragLimits:
     largest, best = np.zeros(speeds.size), np.full(speeds.size, -1)
     for k in np.argsort(factor):
         largest[row[k]], best[row[k]] = factor[k], k
-    inner = np.flatnonzero((largest[1:-1] > largest[:-2]) & (largest[1:-1] >= largest[2:])) + 1
-    owner = np.argmin(np.abs(resonances[None, :] - speeds[inner, None]), axis=1)
+    maxima = np.flatnonzero((largest[1:-1] > largest[:-2]) & (largest[1:-1] >= largest[2:])) + 1
+    owner = np.argmin(np.abs(resonances[None, :] - speeds[maxima, None]), axis=1)
     factors, omegas = np.full(resonances.size, np.nan), np.full(resonances.size, np.nan)
     for r in range(resonances.size):
-        if not (own := inner[owner == r]).size:
+        if not (own := maxima[owner == r]).size:
             continue
         k = own[np.argmax(largest[own])]
         around = on_device(speeds[k - 1 : k + 2])

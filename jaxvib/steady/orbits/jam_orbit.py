@@ -1,6 +1,6 @@
 """Exact jams of a mode, of a load speed, or near a load speed.
 
-Choices that depend on parameters of a scene are made on the host (`plan_orbit`), before a program is traced. Under a JAX
+Choices that depend on parameters of a scene are made in Python (`plan_orbit`), before a program is traced. Under a JAX
 transformation the number of collocation points is fixed.
 """
 
@@ -41,13 +41,14 @@ from jaxvib.units.known import is_known
 _MAX_SPEED_DIFFERENCE = 0.02
 """Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
 
-_MAX_UNKNOWN_STEPS = 128
+_MAX_TRACED_STEPS = 128
 """Limit of the integration steps for the multipliers under a JAX transformation; reverse derivatives need a static limit."""
 
 _COLLOCATION_POINTS = (16, 32, 64, 128)
 """Collocation points on half a period, tried one after the other until the accuracy is reached."""
 
-_BYTES_PER_POINT = 16.0
+_BYTES_PER_ENTRY = 16.0
+"""Memory per entry of the matrix of the collocation equations, (points * loads)^2 entries."""
 
 
 @validated
@@ -72,8 +73,8 @@ def jam_orbit(
 
     - Loads that have equal parameters are at one point, or side by side if they have a `ball_radius` (S is then m R sin(N
       arcsin(r/R)) / (r/R); if their mean contact force over a period would be tensile, the status is `would_separate`)
-    - Loads that differ have a deviation psi_j each. The differences of the means of psi_j are the angles between the loads,
-      which their torques require; the mean over all loads is 0
+    - Different loads have a deviation psi_j each. Its mean over a period is the phase of the load. The phases follow from the
+      torque balance of each load, and their sum is 0
     - The torque is that of drag, gravity and dry friction; the normal force of the friction depends on the acceleration a of
       the mount. If friction can hold the loads on the rotor, they stick and slip. No number of harmonics resolves this motion;
       its status is then `under_resolved` or `not_converged`
@@ -87,10 +88,10 @@ def jam_orbit(
     - `near`: load speed, rad/s or text, from which a motion at the scene's rotor speed is searched for
     - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-9 (the default; in
       single precision 1e-3). A smaller value costs little, because the error falls exponentially with the number of harmonics
-    - `points`: a fixed number of collocation points (on half a period if the scene has half-turn symmetry, which gravity
-      breaks, otherwise on a whole period) in place of an accuracy; typical: 12 to 32. The time grows at least with the square
-      of this number. Under `jit` and `vmap` the values that decide on this number are not known; the default is then 16 on half
-      a period and 33 on a whole period, and the status shows if it is too small
+    - `points`: a fixed number of collocation points in place of an accuracy; typical: 12 to 32. They are on half a period if
+      the scene has half-turn symmetry, which gravity and imbalances break, otherwise on a whole period. The time grows at least
+      with the square of this number. Under JAX transformations the values that decide on this number are not known; the default
+      is then 16 on half a period and 33 on a whole period, and the status shows if it is too small
     - `throw`: raise if there is no such motion; otherwise, and under a JAX transformation, the status shows it
 
     **Returns** `Orbit`; its fields have derivatives with respect to every parameter of the scene (implicit function theorem,
@@ -112,12 +113,14 @@ def jam_orbit(
     """
     scene = validate_scene(scene)
     if mode is not None and not jams_of.is_ready(scene):
+        # Compile the program of the orbit in the background while the jam modes are computed. Its arguments matter only by
+        # their shapes; therefore the start may be the rotor speed.
         rough = plan_orbit(scene, mode=None, omega=None, near=scene.drive.speed, accuracy=accuracy, points=points)
         problem = rough.problem._replace(direction=np.ones_like(rough.problem.value))
         in_background(partial(_solve_program.prepare, problem, rough.points[0], None))
     plan = plan_orbit(scene, mode=mode, omega=omega, near=near, accuracy=accuracy, points=points)
     if not plan.is_known:
-        return outcome(_solve_program(plan.problem, plan.points[0], _MAX_UNKNOWN_STEPS), scene)
+        return outcome(_solve_program(plan.problem, plan.points[0], _MAX_TRACED_STEPS), scene)
     orbit = _solve_accurately(plan)
     if plan.mode is not None and not abs(float(orbit.omega) / float(plan.problem.start) - 1.0) < _MAX_SPEED_DIFFERENCE:
         # The mode does not exist in leading order, or is far from it: search the whole exact branch.
@@ -167,7 +170,7 @@ def plan_orbit(
         given = " and ".join(named) if named else "none"
         raise InputError("jam_orbit", f"was called with {given}; give exactly one of mode, omega and near, for example mode=3")
     all_known = is_known(scene, omega, near)
-    # Starts have no derivatives. A known scene stays the same object, because it is validated already.
+    # Starts have no derivatives. A scene without traced values is not copied, because a copy would be validated again.
     frozen = scene if all_known else jax.tree.map(lambda x: x if is_known(x) else jax.lax.stop_gradient(x), scene)
     loads = jammed_loads(frozen)
     require_drag(loads)
@@ -181,7 +184,7 @@ def plan_orbit(
         tried = _COLLOCATION_POINTS if half else tuple(2 * p + 1 for p in _COLLOCATION_POINTS)
         tried = tried if all_known else tried[:1]
     else:
-        size = _BYTES_PER_POINT * (1 if loads.alike else loads.count) ** 2 * float(points if isinstance(points, int) else 1)
+        size = _BYTES_PER_ENTRY * (1 if loads.alike else loads.count) ** 2 * float(points if isinstance(points, int) else 1)
         tried = (count(points, "points", low=2, each=size),)
 
     exists, direction, start = on_device(np.asarray(True)), None, frozen.drive.speed

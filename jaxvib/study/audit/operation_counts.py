@@ -39,7 +39,8 @@ class OperationCount(NamedTuple):
 def operation_counts() -> list[OperationCount]:
     """Count the operations that each effect, drive, machine and kind of loads adds to the equations of motion.
 
-    The reference scene is a platform with one ball and a constant rotor speed, for kinds of loads a planar rotor with one ball.
+    The reference scene is a platform with one ball and a constant rotor speed. Kinds of loads are compared with a planar rotor
+    with one ball at a constant speed. A rotor with loads at stations has two balls, and its count includes the second ball.
     An effect that the platform with a ball cannot have is counted with other loads, or on a rotor with tilt, see `beside`. The
     counts do not depend on the values of the parameters.
 

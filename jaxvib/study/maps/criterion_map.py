@@ -52,7 +52,7 @@ class CriterionMap(Result):
         """Return a table as text: the share of rotor speeds at which criterion and exact stability agree, and the mean modulus
         of the shift of the boundaries."""
         lines = ["share of rotor speeds with the right prediction (mean shift of the boundaries)"]
-        lines.append("drag x \\ mass x " + "".join(f"{m:>16.3g}" for m in self.mass_factor))
+        lines.append("drag factor \\ mass factor " + "".join(f"{m:>16.3g}" for m in self.mass_factor))
         for d, factor in enumerate(self.drag_factor):
             cells = []
             for m in range(self.mass_factor.size):
@@ -107,7 +107,7 @@ def criterion_map(
     for name, value in values.items():
         bad = value.ndim != 1 or not value.size or not np.all(np.isfinite(value)) or np.any(value <= 0.0)
         if bad or np.any(np.diff(value) <= 0.0):
-            raise InputError(name, "must be a list of numbers greater than 0, one at least, ascending")
+            raise InputError(name, "must be an ascending list of at least one number; all numbers must be greater than 0")
     grid, mass_factor, drag_factor = values.values()
 
     scene_loads = circular_loads(scene)
