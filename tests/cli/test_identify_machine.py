@@ -88,7 +88,7 @@ def test_template_of_identification_is_complete(type_, tmp_path, monkeypatch):
         ('from = "0.5 s"', 'form = "0.5 s"', "run[0].form is not a field here; did you mean 'from'?"),
         ('file = "run_up.csv"', 'file = "none.csv"', "run[0]: none.csv cannot be read"),
         ('file = "run_up.csv"', "", "run[0].file is missing; write the path of a recording"),
-        ('file = "machine.toml"', "file = 3", "machine is not the name of a scene file; write [machine]"),
+        ('file = "machine.toml"', "file = 3", "machine must be a table with the name of the scene file; write [machine]"),
         ('from = "0.5 s"', "change = 3", "run[0].change is 3; write { "),
         ('kind = "pulses"', 'sort = "pulses"', "channel[2].sort is not a field here; allowed: name, kind"),
         ("at = 2", "at = 0", "channel 'deck': at is 0; it must be the number of a platform"),

@@ -59,7 +59,7 @@ def test_rate_of_a_candidate_and_files_without_one(tmp_path):
         ("speed", 3.0, r"candidate\[0\]\.speed is not a field here"),
         ("name", None, r"candidate\[0\]\.name is missing; a candidate needs a name, a drive and a duration"),
         ("at", {"desk": 1}, r"candidate\[0\]\.at\.desk is not a channel; the channels are: frame"),
-        ("at", 1, r"candidate\[0\]\.at is 1; it must be a table"),
+        ("at", 1, r"candidate\[0\]\.at is 1; write the places of channels"),
         ("duration", "-3 s", r"candidate\[0\]\.duration"),
     ],
 )

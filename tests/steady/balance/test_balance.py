@@ -291,7 +291,7 @@ def test_criterion_improves_for_lighter_loads_and_stronger_drag():
     assert np.all(np.diff(first, axis=1) > 0.0)
     assert np.all(np.diff(first[:, :2], axis=0) < 0.0) and first[2, 2] > first[1, 2]
     figure = found.plot()
-    assert len(figure.axes) == 3 and "drag x" in found.summary()
+    assert len(figure.axes) == 3 and "drag factor" in found.summary()
 
 
 def test_map_refuses_what_is_no_range():
