@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -32,6 +33,7 @@ from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import RotorImbalance, SupportForce
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
+from jaxvib.numerics.fence import fence, hidden_one
 from jaxvib.numerics.linalg import small_inverse, small_solve, solve_definite, times
 
 
@@ -57,6 +59,8 @@ class Dynamics(eqx.Module):
     - `accelerance` P M^-1 P^T (nP, nP), and `rows` P (nP, nd)
     - `mass` M (nd, nd) if P has more rows than there are coordinates, otherwise None
     - `groups` of the exciters, see `Group`; `supports`, a place for each `SupportForce`
+    - `has_fences`: True to compute the arrays of each group once, see `fence`. Without fences XLA repeats the sines of a group
+      for each use; time integration has fences of its own
     """
 
     stiffness: Array
@@ -68,6 +72,7 @@ class Dynamics(eqx.Module):
     mass: Array | None
     groups: tuple[Group[RotorDynamics], ...]
     supports: tuple[_Support, ...]
+    has_fences: bool = eqx.field(static=True, default=False)
 
     @property
     def exciters(self) -> list[RotorDynamics]:
@@ -90,6 +95,7 @@ class Dynamics(eqx.Module):
 
         def solve(contacts: Sequence[ContactSolution]) -> tuple[list[tuple[Eliminated, list[Array]]], Array]:
             parts = self._each(lambda exciter, *given: exciter.eliminate(*given), motions, contacts)
+            parts = self._fenced(parts, unforced)
             accelerations, carrier = self._solve_rows(parts, unforced)
             return list(zip(parts, accelerations, strict=True)), carrier
 
@@ -106,11 +112,23 @@ class Dynamics(eqx.Module):
             sliding = self._each(lambda exciter, *given: exciter.slide(*given[:2], *given[2]), motions, contacts, solved)
             solved, carrier = solve(sliding)
         rates = self._each(lambda exciter, *given: exciter.rates(*given[:2], *given[2]), motions, rolling, solved)
+        rates = self._fenced(rates, unforced)
         return State(state.velocity, carrier, exciters=ungroup(self.groups, rates))
 
     def _each(self, function: Callable[..., Any], *values: Sequence[Any]) -> list[Any]:
         """Return function(exciter, *values) of each exciter, by group."""
         return [group.each(function, *of_group) for group, *of_group in zip(self.groups, *values, strict=True)]
+
+    def _fenced(self, parts: list[Any], unforced: Array) -> list[Any]:
+        """Return parts of the groups with fences, if there are any."""
+        if not self.has_fences or all(len(group.members) == 1 for group in self.groups):
+            return parts
+        one = hidden_one(unforced[0])
+        arrays = [eqx.partition(part, eqx.is_inexact_array) for part in parts]
+        return [
+            part if len(group.members) == 1 else eqx.combine(jax.tree.map(lambda x: fence(x, one), own), rest)
+            for group, part, (own, rest) in zip(self.groups, parts, arrays, strict=True)
+        ]
 
     def at_rows(self, rows: Array) -> Dynamics:
         """Return the equations with the accelerations of P's rows and of further `rows` (k, nd) in place of the carrier's q''.
@@ -235,7 +253,7 @@ def vector_field(scene: Scene) -> Dynamics:
     equation (1). The gyroscopic force depends on the rotor speed only. The term of the rotor's acceleration, C theta'' psi / 2,
     is neglected as by Artyunin.
     """
-    return dynamics_of(assemble(validate_scene(scene)))
+    return dataclasses.replace(dynamics_of(assemble(validate_scene(scene))), has_fences=True)
 
 
 def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_solve) -> Dynamics:
