@@ -125,7 +125,7 @@ class Orbit(Result):
     @property
     def judgement(self) -> str:
         """Stability as text: "stable", "unstable", or that the stability is unknown."""
-        return judgement_of(self.multiplier, self.stable)
+        return judgement_of(self.multiplier, self.stable, self.trivial)
 
     def force_peaks(self) -> Array:
         """Return the greatest foundation force in each of 16 equal parts of the period, N, (16,); the largest is
@@ -161,9 +161,13 @@ class Orbit(Result):
         return plot_period(self.orders, self.displacement_harmonics, named, deviation, self.force_harmonics, ax)
 
 
-def judgement_of(multiplier: Array, stable: Array) -> str:
-    """Return "stable" or "unstable", or that the stability is unknown, for the largest `multiplier` of a motion."""
-    if np.isnan(multiplier):
+def judgement_of(multiplier: Array, stable: Array, trivial: Array) -> str:
+    """Return "stable" or "unstable", or that the stability is unknown, for the largest `multiplier` of a motion.
+
+    It is unknown without a multiplier, and if the multiplier differs from 1 by less than the `trivial` one, which is 1 except
+    for the error of the integration.
+    """
+    if np.isnan(multiplier) or abs(multiplier - 1.0) <= abs(trivial - 1.0):
         return "stability unknown"
     return "stable" if stable else "unstable"
 

@@ -137,7 +137,7 @@ class SynchronousOrbit(PathsOfPoints, Result):
     @property
     def judgement(self) -> str:
         """Stability as text: "stable", "unstable", or that the stability is unknown."""
-        return judgement_of(self.multiplier, self.stable)
+        return judgement_of(self.multiplier, self.stable, self.trivial)
 
     @validated
     def at(self, theta: Number) -> State:

@@ -261,3 +261,12 @@ def test_stability_beside_a_far_faster_carrier_is_not_computed(question):
     assert found.status_name == "unresolved" and found.judgement == "stability unknown"
     assert np.isnan(found.multiplier) and not found.stable and np.all(np.isnan(found.multipliers))
     np.testing.assert_allclose([found.omega, found.rotor_speed], 9.0, rtol=1e-9)
+
+
+def test_a_multiplier_within_its_error_of_one_gives_no_verdict():
+    """Two loads on a nearly rigid machine: they separate or gather within 1e16 turns."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e6, damping=100.0)
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.25, radius=0.1, drag=0.5), jv.ConstantSpeed(0.01))
+    found = jv.jam_orbit(scene, near=0.01)
+    assert abs(found.multiplier - 1.0) <= abs(found.trivial - 1.0) < 1e-9
+    assert found.judgement == "stability unknown" and "stability unknown" in found.summary()
