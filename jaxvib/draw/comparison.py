@@ -179,7 +179,7 @@ def audit_chart(
 ) -> Drawn:
     """Draw the relative changes (n,) that n effects with these `labels` cause, a marker for each quantity.
 
-    A line marks the requested `accuracy`; the range below the `uncertainty` (n,) is grey.
+    A line marks the requested `accuracy`; changes below their `uncertainty` (n,) lie in a grey range.
 
     >>> figure = audit_chart(["gravity"], {"amplitude": np.array([1e-4])}, np.array([1e-6]), 0.01)
     >>> figure.axes[0].get_xlabel()
@@ -221,8 +221,8 @@ def steps_chart(
 ) -> Drawn:
     """Draw the relative `difference` (n, k) between central differences and a derivative over the relative `steps` (k,).
 
-        Each of n `names` has a line. A ring marks its `best` step (n,) with the extrapolated difference `at_best` (n,), and a
-    dotted line marks the tolerance. `route`: mode of the derivative, "forward" or "reverse".
+    Each of n `names` has a line. On each line a ring marks the `best` step (n,) and the extrapolated difference `at_best` (n,).
+    A dotted line marks the tolerance. `route`: mode of the derivative, "forward" or "reverse".
     """
     figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)
     floor = np.finfo(float).eps

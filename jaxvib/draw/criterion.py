@@ -50,8 +50,8 @@ def agreement_maps(
     unit, scale = speed_unit(unit)
     figure, axes = panels(1, len(maps), size=(3.8, 3.6), ax=ax)
     for axis, (title, exact) in zip(axes, maps, strict=True):
-        both = np.where(predicted == exact, np.where(exact, 1, 0), np.where(predicted, 2, 3))
-        axis.pcolormesh(scale * speed, height, both, cmap=colours, norm=norm, shading="nearest", rasterized=True)
+        kind = np.where(predicted == exact, np.where(exact, 1, 0), np.where(predicted, 2, 3))
+        axis.pcolormesh(scale * speed, height, kind, cmap=colours, norm=norm, shading="nearest", rasterized=True)
         if np.size(height) > 1:
             axis.set_yscale("log")
             log_ticks(axis)
@@ -77,9 +77,9 @@ def criterion_chart(
 ) -> None:
     """Draw the `functional` of the criterion (S,), kg m^2, over the rotor `speed` (S,), rad/s, drawn in `unit`.
 
-    Balancing intervals are shaded, exact ones are bars at the bottom, and `at` is the operating speed, rad/s. The functional
-    spans many decades near resonances; therefore its scale is that of arsinh, which is logarithmic for large values of both
-    signs and smooth at 0.
+    The intervals `balancing` of the criterion (start, end), rad/s, are shaded; None is an open end. The intervals `exact` of
+    the exact stability, rad/s, are bars at the bottom. `at` is the operating speed, rad/s. The functional spans many decades
+    near resonances; therefore its scale is that of arsinh, which is logarithmic for large values of both signs and smooth at 0.
 
     >>> import matplotlib.pyplot as plt, numpy as np
     >>> ax = plt.figure().subplots()

@@ -185,7 +185,8 @@ def shares_chart(
 ) -> Drawn:
     """Draw fractions (n,) over x (n,) by name, each with its confidence interval as a bar or a band.
 
-    `shares` contains the fraction, the lower end and the upper end of its interval, of the confidence `level`.
+    `shares` contains for each name the fraction and the lower and the upper end of its confidence interval. `level` is the
+    confidence level as text.
 
     >>> import numpy as np
     >>> share = np.array([0.1, 0.5])

@@ -101,11 +101,11 @@ def time_histories(
     part = [values[last_periods(end[0], end[1])] for values in end]
     depth = np.argsort(np.argsort(-np.ptp(whole[1], axis=0)))  # signals of larger range are drawn first, below smaller ones
     for row, (kind, label, factor) in enumerate(kinds):
-        own = [k for k in range(len(names)) if units[k] == kind]
+        of_kind = [k for k in range(len(names)) if units[k] == kind]
         left, right = axes[2 * row : 2 * row + 2]
-        for k in own:
+        for k in of_kind:
             _draw_band(left, whole[0], factor * whole[1][:, k], k, names[k], bins, depth[k])
-        for k in own:
+        for k in of_kind:
             right.plot(part[0], factor * part[1][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.3)
         left.set_ylabel(label)
         legend_above(left, 6)
@@ -261,8 +261,8 @@ def amplitude_histories(
             _draw_band(axis, time, values[:, k], k, name, bins, depth[k])
 
     for axis, (kind, label, factor) in zip(axes, kinds, strict=False):
-        own = [k for k in range(len(names)) if units[k] == kind]
-        lines(axis, factor * amplitude, own, [names[k] for k in own])
+        of_kind = [k for k in range(len(names)) if units[k] == kind]
+        lines(axis, factor * amplitude, of_kind, [names[k] for k in of_kind])
         axis.set_ylabel(label)
         legend_above(axis, 6)
     for k, name in _equal_loads(load_speed, load_speed[-(load_speed.shape[0] // 4) :]):
