@@ -21,7 +21,10 @@ def ellipses(points: np.ndarray, amplitude: np.ndarray, magnify: float) -> list[
 
 
 def magnification(points: np.ndarray, amplitude: np.ndarray) -> float:
-    """Return the magnification at which neighbouring ellipses do not overlap, rounded to one digit."""
+    """Return the magnification at which the largest amplitude is 0.4 of the smallest distance of two points.
+
+    It is rounded to one digit. The distance is 1 m if there is only one point.
+    """
     size = max(float(np.max(np.abs(amplitude))), 1e-300)
     distance = np.linalg.norm(points[:, None] - points[None], axis=2)
     nearest = float(np.min(distance[distance > 0.0], initial=np.inf))
