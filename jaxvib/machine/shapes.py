@@ -1,4 +1,7 @@
-"""Types and shapes of the values that the parts of a user's file return. Parts of the package have tests of their own."""
+"""Checks of the types and shapes of the values that the parts of a user's file return.
+
+Parts of the package are not checked here, because the tests of the package check them.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,10 @@ def _is_of_package(part: Part) -> bool:
 
 
 def _once_for_each_structure(check: Callable[..., None]) -> Callable[..., None]:
-    """Return a check of a part, and of others with which it acts, that traces parts of one structure once."""
+    """Return a function that checks a part, with the other parts on which its result depends, by tracing.
+
+    Parts of the same structure, shapes and precision are traced once. Parts of the package are not checked.
+    """
 
     @functools.lru_cache(maxsize=256)
     def on_shapes(structure: Hashable, shapes: tuple[tuple[Shape, np.dtype], ...], precision: np.dtype) -> None:
@@ -76,14 +82,14 @@ def require_loads(loads: Loads) -> None:
     each, single = (loads.count,), ()
     if np.shape(loads.mass) not in (each, single):
         raise InputError("loads.mass", f"is {_described(loads.mass)}; the shape {each} or {single} is needed")
-    rest = _require_tuple("loads.rest", "", _shapes(lambda own: own.rest(), loads), "coordinates")
+    rest = _require_tuple("loads.rest", "", _shapes(lambda loads: loads.rest(), loads), "coordinates")
     for u in rest:
         _require_shape("loads.rest", "", u, each)
-    place = _shapes(lambda own: own.position(*own.rest()), loads)
+    place = _shapes(lambda loads: loads.position(*loads.rest()), loads)
     position = _require_tuple("loads.position", "", place, "2 or 3 coordinates", 2, 3)
-    force = _shapes(lambda own: own.resistance(own.rest(), own.rest(), jnp.ones(())), loads)
+    force = _shapes(lambda loads: loads.resistance(loads.rest(), loads.rest(), jnp.ones(())), loads)
     resistance = _require_tuple("loads.resistance", "", force, f"{len(rest)}, one force for each coordinate,", len(rest))
-    factor = _shapes(lambda own: own.inertia_factor(), loads)
+    factor = _shapes(lambda loads: loads.inertia_factor(), loads)
     for name, values in (("position", position), ("resistance", resistance), ("inertia_factor", (factor,))):
         for value in values:
             _require_shape(f"loads.{name}", "", value, each, single)
@@ -94,7 +100,7 @@ def require_drive(drive: Drive) -> None:
     """**Raises** `InputError` for a drive whose methods do not return single numbers."""
     names = ("speed_at", "angle_at", "acceleration_at") if isinstance(drive, IdealDrive) else ()
     for name in ("torque",) if isinstance(drive, Motor) else names:
-        value = _shapes(lambda own, name=name: getattr(own, name)(jnp.ones(())), drive)
+        value = _shapes(lambda drive, name=name: getattr(drive, name)(jnp.ones(())), drive)
         _require_shape(f"drive.{name}", "", value, ())
 
 

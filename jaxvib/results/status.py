@@ -67,7 +67,7 @@ def sentence(status: eqx.Enumeration) -> str:
     """
     names = status_names(status)
     enumeration = enumeration_of(status)
-    if names.ndim == 0:  # by its name, because a status converted to NumPy is not equal to a member
+    if names.ndim == 0:  # the member is found by its name, because a status converted to NumPy is not equal to a member
         return enumeration[getattr(enumeration, str(names))]
     counts = {name: int(np.sum(names == name)) for name in enumeration_names(enumeration)}
     parts = [f"{enumeration[getattr(enumeration, name)]} ({k} of {names.size})" for name, k in counts.items() if k]

@@ -225,8 +225,8 @@ def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
 
 
 def _exponents(units: Any) -> tuple[dict[str, float], float, float]:
-    """Return the exponents in a pint unit: those of the base units other than angles by name, that of the angle, and that of
-    hertz."""
+    """Return the exponents of a pint unit: a dictionary for the base units other than the radian, that of the radian, and that
+    of hertz."""
     import pint
 
     _, roots = pint.get_application_registry().get_root_units(units)

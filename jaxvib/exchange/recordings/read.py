@@ -55,12 +55,12 @@ def read_run(
     (101, 9.81)
     """
     path = Path(path)
-    speed = None if rate is None else float(number(rate, "Hz", "rate", low=0.0, open_low=True))
+    sampling_rate = None if rate is None else float(number(rate, "Hz", "rate", low=0.0, open_low=True))
     low = -math.inf if start is None else float(number(start, "s", "start"))
     high = math.inf if until is None else float(number(until, "s", "until"))
     if low >= high:
         raise InputError("until", f"is {high:g} s; it must be later than start, {low:g} s")
-    recorded = read_channels(path, speed)
+    recorded = read_channels(path, sampling_rate)
     times, values = described_channels(recorded, channels, str(path), low, high)
     return MeasuredRun.from_arrays(channels, times, values, change, str(path))
 
