@@ -50,7 +50,7 @@ def address(title):
 
 
 def on_config(config):
-    """The reference stands in the navigation."""
+    """Add the pages of the reference to the navigation."""
     for entry in config.nav:
         if isinstance(entry, dict) and "Reference" in entry:
             entry["Reference"] = [{title.replace("`", ""): address(title)} for title in public_groups()]
@@ -58,7 +58,7 @@ def on_config(config):
 
 
 def on_files(files, config):
-    """The pages of the reference, which are written nowhere else, and those that stand elsewhere."""
+    """Add the generated pages of the reference, the figures, and the pages of `INCLUDED`."""
     for page, source in INCLUDED.items():
         text = (ROOT / source).read_text(encoding="utf-8")
         text = text.replace("](jaxvib/ode/README.md)", "](engine.md)").replace("](jaxvib/runtime/README.md)", "](cache.md)")

@@ -27,7 +27,8 @@ Bounds = tuple[Number, Number] | tuple[Number, Number, str]
 """(low, high), or (low, high, "log" or "even")."""
 
 Source = str | tuple[str, float | Literal["keep"]]
-"""Source of a tied parameter: the name of another parameter, with a factor, or "keep" for their present ratio."""
+"""Source of a tied parameter: the name of another parameter (equal values), (name, factor), or (name, "keep") for their
+present ratio."""
 
 
 class HeldQuantity(Readable):
@@ -76,8 +77,11 @@ class Tie(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Further column of a catalogue of rows: the parameter `target` is interpolated linearly in the pairs (`at`, `values`), SI,
-    at the value of the parameter `source`, the first column."""
+    """Any column but the first of a catalogue of rows.
+
+    `source` is the parameter of the first column, with the values `at`; `target` is the parameter of this column, with `values`
+    (SI). Between rows, `target` is interpolated linearly.
+    """
 
     target: NamedNumber
     source: NamedNumber
@@ -99,8 +103,8 @@ class DesignSpace(Readable):
     **Arguments**
 
     - `scene`: the design from which the search begins
-    - `free`: a mapping from names to (low, high), SI or text with units; typical: 2 to 20 parameters, from a half or a tenth to
-      2 or 10 times their values. More free parameters need more starts
+    - `free`: a mapping from names to (low, high), SI or text with units; typical: 2 to 20 parameters, with
+      bounds of 1/2 and 2 times, or 1/10 and 10 times, the present values. More free parameters need more starts
     - `hold`: quantities that keep their value, each in `optimize.hold(...)`, for example a sum (`total`) or a product
       (`product`) of parameters
     - `ties`: a mapping from the name of a parameter to its source: the name of another parameter (equal values), (name,
@@ -125,7 +129,7 @@ class DesignSpace(Readable):
 
     **Raises** `InputError` for
 
-    - a name that the scene does not have, and a lower bound above the upper one
+    - a name that the scene does not have, and a lower bound that is not below the upper one
     - a parameter that is free twice, or free and tied
     - values of a catalogue that no scene can have
     - as many held quantities as free parameters, or more
@@ -177,7 +181,8 @@ class DesignSpace(Readable):
         numbers, lows, highs, logs, choices_ = [], [], [], [], []
         for name, array, low, high, log in ranges:
             if array.entries & used:
-                raise InputError(f"free.{name}", "frees a number that is free already; give each number once")
+                field = "choices" if name in chosen else "free"
+                raise InputError(f"{field}.{name}", "contains a number that is free already; give each number once")
             used |= array.entries
             for entry in present_numbers(scene, array, "choices" if name in chosen else "free"):
                 if name in chosen:
@@ -311,7 +316,7 @@ def _read_bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[NamedNumber, 
             raise InputError(f"free.{name}", f"has the scale {quoted(bounds[2])}; it must be 'log' or 'even'")
         log = bounds[2] == "log"
         if log and not low > 0.0:
-            raise InputError(f"free.{name}", "has the scale 'log' and a low bound of 0; give a low bound greater than 0")
+            raise InputError(f"free.{name}", f"has the scale 'log' and a low bound of {low:g}; give a low bound greater than 0")
     return found, low, high, log
 
 
@@ -371,7 +376,7 @@ def _read_ties(scene: Scene, ties: Mapping[str, Source], used: set) -> tuple[Tie
     for name, source_given in ties.items():
         target = find_number(scene, name, "ties")
         if target.entries & used:
-            raise InputError(f"ties.{name}", "is free as well; a tied number cannot be free")
+            raise InputError(f"ties.{name}", "is free, chosen or tied already; a number has one source")
         pair = isinstance(source_given, (list, tuple)) and len(source_given) == 2
         source_name, factor = source_given if pair else (source_given, 1.0)
         if not isinstance(source_name, str):
@@ -380,7 +385,10 @@ def _read_ties(scene: Scene, ties: Mapping[str, Source], used: set) -> tuple[Tie
         if source.entries & target.entries:
             raise InputError(f"ties.{name}", "is tied to itself; name another number")
         if source.size not in (1, target.size):
-            raise InputError(f"ties.{name}", f"has {target.size} entries and {source_name} {source.size}; name one of them")
+            raise InputError(
+                f"ties.{name}",
+                f"has {target.size} entries, but {source_name} has {source.size}; name a single entry, as in {source_name}[0]",
+            )
         if factor == "keep":
             with np.errstate(divide="ignore", invalid="ignore"):  # refused below
                 ratio = np.asarray(target.read(scene)) / np.asarray(source.read(scene))

@@ -83,7 +83,7 @@ _SINGLE_PRECISION = '  in single precision (about 6 digits); for double precisio
 """Line of the summary of a run in single precision."""
 
 ENDS = ("done", "beating", "creeping", "would_separate", "overlapping")
-"""Statuses of runs that reached their end."""
+"""Statuses of runs that reached their end, with the requested accuracy if there was one."""
 
 SETTLED_DRIFT = 1e-3
 """Drift below which a motion counts as settled."""
@@ -110,7 +110,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
       slightly separated loads would leave it, the status is `would_separate`, and the run is not `settled`. Loads with a
       `ball_radius` that end inside each other have the status `overlapping`, which the effect `LoadContact` prevents
     - `engine` of the integration: "scalar" if the equations are computed on scalars, which is faster for small states, or
-      "array", for states of more than 32 entries and for 4 loads or more
+      "array", for states of more than 32 entries, 4 or more coordinates or loads of one exciter, and very long equations
     - `evaluations` of the vector field (0 if the method does not count them), and `seconds` of the computation. Both include
       the run with larger steps for the error; `seconds` includes compilation if the program was new, and is NaN under a JAX
       transformation
@@ -143,23 +143,24 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def finished(self) -> Array:
-        """True if the run reached its end, settled or not."""
+        """True if the run reached its end, settled or not, with the requested accuracy."""
         return functools.reduce(operator.or_, (self.status == getattr(RunStatus, name) for name in ENDS))
 
     @property
     def largest_displacement(self) -> Array:
         """Largest displacement of each coordinate from rest during the run, (nd,), m (rad for tilts), among the stored
         states."""
-        return jnp.max(jnp.abs(self._whole.state.displacement), axis=0)
+        return jnp.max(jnp.abs(self._stored.state.displacement), axis=0)
 
     @property
     def largest_force(self) -> Array:
         """Largest force on the foundation during the run, N, among the stored states; for two directions the root of the sum of
         the squares of both peaks, as for `foundation_force`."""
-        return jnp.sqrt(jnp.sum(jnp.max(self._whole.foundation_force**2, axis=0)))
+        return jnp.sqrt(jnp.sum(jnp.max(self._stored.foundation_force**2, axis=0)))
 
     @property
-    def _whole(self) -> Trajectory:
+    def _stored(self) -> Trajectory:
+        """Stored states: the whole run, or the window if only the window was kept."""
         return self.window if self.trajectory is None else self.trajectory
 
     def summary(self, measures: VibrationMeasures | None = None) -> str:
@@ -167,7 +168,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
         **Arguments**: `measures` of the vibration that are shown; default: those of the centre of mass on a level deck.
         """
-        error = f"estimated error of the end state with its phase {float(self.error):.1e}"
+        error = f"estimated error of the states in the window, phase included, {float(self.error):.1e}"
         error = "error not estimated" if np.isnan(self.error) else error
         rotors = [w[-1] for w in self.window.rotor_speeds]
         stuck = [] if np.max(np.abs(rotors)) > 1.0 else start_notes(self.scene)
@@ -198,13 +199,13 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
                 *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
-                *([] if unstable else self._passages()),
+                *([] if unstable else self._pass_through_note()),
                 *self._detachment(),
             ]
         )
 
-    def _passages(self) -> list[str]:
-        if not overlap(self.scene, self._whole):
+    def _pass_through_note(self) -> list[str]:
+        if not overlap(self.scene, self._stored):
             return []
         return [f"  loads passed through each other on the way, which may change the result; {_CONTACT}"]
 
@@ -316,7 +317,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """Return the vibration over the window, for `vibration_measures`: the fitted harmonic, measured amplitudes and force,
         mean torques and powers of the drives.
 
-        **Raises** `InputError` if there is `no_vibration`.
+        **Raises** `InputError` with the text of `no_vibration`, unless this is empty.
         """
         when_known(lambda *_: require_vibration(self.no_vibration), self.window.time, self.omega, self.amplitude)
         measured = Measured(self.omega, self.load_speed, self.amplitude, self.foundation_force, self.drift)
@@ -367,7 +368,7 @@ def with_separation_status(run: Run, *, is_settled: bool = True) -> Run:
     - `overlapping`: loads with a size are inside each other at the end of the run
     - `would_separate`: loads stay at nearly one angle although this motion is unstable
 
-    The end of a settled run is its measuring window. The end of another run is its last state, which only `overlapping` tests.
+    For a settled run the measuring window is examined; for another run only its last state, and only for overlapping loads.
     """
     if status_name(run.status) not in ENDS:
         return run

@@ -17,7 +17,7 @@ from jaxvib.ode.types import VF, Args, BoolScalarLike, IntScalarLike, Norm, Real
 
 Decision: TypeAlias = tuple[BoolScalarLike, RealScalarLike, RealScalarLike, BoolScalarLike, PyTree[Array], diffrax.RESULTS]
 """Acceptance of a step, beginning and end of the next one, True if the field jumps at its beginning, new state of the
-controller, True if the run can continue."""
+controller, outcome of the step (`successful` if the run can continue)."""
 
 _State: TypeAlias = tuple[Array, Array | None]
 """State of `PIController`: the 32nd root of the last accepted step's error, and the remaining number of steps if it is
@@ -41,7 +41,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
     - A step whose error is NaN is rejected with e = infinity. If no shorter step advances the time in its dtype, the run ends
       with `diffrax.RESULTS.dt_min_reached`
     - A run with more than `max_steps` steps, rejected ones included, ends with `diffrax.RESULTS.max_steps_reached`. The limit
-      is an input of the compiled program, which serves all limits
+      is an input of the compiled program: another limit needs no compilation
 
     **Attributes**
 

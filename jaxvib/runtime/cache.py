@@ -14,7 +14,8 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError
 from jaxvib.runtime.compat import user_folder
 
-_folder: list[Path] = []
+_program_folder: list[Path] = []
+"""Folder of traced programs as a list of one entry; empty if programs are not stored."""
 
 
 @validated
@@ -45,8 +46,8 @@ def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bo
         ...
     jaxvib.errors.InputError: folder is '/dev/null'; it must be a folder that can be written to (Not a directory)
     """
-    if only_if_unset and _folder:
-        return _folder[0].parent
+    if only_if_unset and _program_folder:
+        return _program_folder[0].parent
     path = (default_folder() if folder is None else Path(folder)).expanduser().absolute()
     programs = path / "programs"
     try:
@@ -70,19 +71,19 @@ def default_folder() -> Path:
 
 def set_program_folder(folder: Path | None) -> None:
     """Set the folder of traced programs; None disables their storage."""
-    _folder[:] = [] if folder is None else [folder]
+    _program_folder[:] = [] if folder is None else [folder]
 
 
 def program_folder() -> Path | None:
     """Return the folder of traced programs, or None if programs are not stored."""
-    return _folder[0] if _folder else None
+    return _program_folder[0] if _program_folder else None
 
 
 @contextlib.contextmanager
 def compiled_anew() -> Iterator[None]:
     """Disable both caches within the context, in order to measure compile times.
 
-    A program that this process has already used is in memory and is not compiled again.
+    Only programs that this process has not used before are compiled; the others are still in memory.
     """
     folder, enabled = program_folder(), bool(jax.config.jax_enable_compilation_cache)  # pyright: ignore[reportAttributeAccessIssue]
     set_program_folder(None)
@@ -95,7 +96,7 @@ def compiled_anew() -> Iterator[None]:
 
 
 def require_own(folder: Path) -> None:
-    """Raise `InputError` if another user may write to a folder or replace it."""
+    """Raise `InputError` if another user may write to a folder, or if any user may replace it."""
     if not hasattr(os, "geteuid"):  # on Windows only the owner can write to a home folder
         return
     for place in (folder, *folder.resolve().parents):

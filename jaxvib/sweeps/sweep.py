@@ -78,7 +78,7 @@ class Sweep(Result):
     - `cases`: number of cases
     - `counts`: number of cases with each status
     - `regimes`: number of finished cases in each regime, with the jam mode, the most frequent first; empty if neither was
-      measured, or if files are damaged
+      measured, or if files were damaged when this call began
     - `computed`: number of cases computed in this call; `seconds`: their time, including compilation
     - `damaged`: number of cases whose files were damaged or incomplete; `sweep` has computed them again, `open_sweep` counts
       them as missing
@@ -176,7 +176,8 @@ def sweep(
     - `store`: a folder, usually with the ending ".zarr"
     - `tier` of quantities of a jam: "leading", "exact" or "time"; default: that of each quantity
     - `start`, `mode`: initial state of runs, "rest" (the default), "spin_up" (drives of constant speed are accelerated from
-      rest during half of the run), or "jam" for a start near the jam mode `mode`; axes may change its values
+      rest during half of the run), or "jam" for a start near the jam mode `mode`; axes whose names begin with
+      "start." change entries of this state
     - `until`: end of runs, s or text; typical: 5 to 60
     - `steps`: number of equal steps of a run, the same in all cases; default: one for each radian of the fastest motion
     - `samples`: number of samples; typical: 1000 to 100,000; `sampling`: "low_discrepancy" or "random"; `seed` of the samples
@@ -274,7 +275,7 @@ def _compute_missing(
     has_functions = any(measure not in RUN_MEASURES.values() for measure in new_study.measures)
     if has_functions and not new_study.program.startswith(PYTHON) and traced_program(new_study)[1] != new_study.program:
         problem = "have a function that has changed since the study was created, or that gives another program in each call"
-        raise InputError("measures", f"{problem} (a clock, random numbers, a file); pass such numbers as constants")
+        raise InputError("measure", f"{problem} (a clock, random numbers, a file); pass such numbers as constants")
     opened.require_same(new_study)
     states = opened.states(writing=True)
     damaged = np.flatnonzero(states == ChunkState.damaged)

@@ -32,8 +32,8 @@ Numbers: TypeAlias = Number | Sequence[Number]
 
 
 _TEXT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(\s*[^\W\d_]|\s+1\s*/|\s*[%°])((?:(?!\s\d)[^,;()])*)")
-"""Pattern of one number with a decimal point, then one unit, which may begin with "1/". Other texts are refused as mistakes,
-even if pint could evaluate them."""
+"""Pattern of one number (with a point, not a comma, before decimals), then one unit, which may begin with "1/". Other texts
+are refused as mistakes, even if pint could evaluate them."""
 
 _SEVERAL = re.compile(r"(\d{1,4})\s*[x×]\s*(\S.*)")
 """Pattern of several equal parts side by side, such as "4 x 50 N/mm"."""
@@ -136,7 +136,7 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         if factor is not None:
             return magnitude * factor
         return _magnitude(_quantity(magnitude, written, value, unit, field), unit, field, value)
-    # The test of the protocol takes longer than everything else here.
+    # `hasattr` is tested first, because `isinstance` with a protocol is slow.
     if hasattr(value, "m_as") and isinstance(value, Quantity):
         if not hasattr(value, "units"):  # a quantity of another library, with its own conversion
             return value.m_as(unit or "dimensionless")
@@ -146,8 +146,8 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
 
 
 def require_real(value: object, unit: str, field: str) -> None:
-    """Check that a value is a real number or an array of real numbers. Every number that a user passes is checked by this
-    function.
+    """Check that a value is a real number or an array of real numbers. Every number that is neither text nor a quantity of
+    another library than pint is checked by this function.
 
     **Raises** `InputError` for Booleans, complex numbers, dates, masked values, bytes, lists, None and objects that are not
     numbers.
@@ -215,7 +215,7 @@ def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
         if isinstance(error, InputError):
             raise
         raise _wrong_unit(text, unit, field) from error
-    if angle + hertz == wanted_angle + wanted_hertz:  # 1 Hz is one revolution per second in both units
+    if angle + hertz == wanted_angle + wanted_hertz:  # hertz in either unit counts as 2 pi rad/s
         return magnitude * (2.0 * math.pi) ** (hertz - wanted_hertz)
     if angle != wanted_angle and not rest.keys() - {"second"}:
         if unit == "rad/s":
@@ -254,7 +254,7 @@ def unit_ratio(one: str, other: str) -> float | None:
 def in_own_unit(value: str | Quantity, field: str) -> tuple[float, str]:
     """Return the magnitude in SI and the SI unit of a string or a pint quantity of any dimension; Hz is converted to rad/s.
 
-    **Raises** `InputError` for a string that is not a number with a unit.
+    A plain number has the unit "". **Raises** `InputError` for other strings and for values that are not finite.
 
     >>> in_own_unit("2 mm", "limit")
     (0.002, 'meter')

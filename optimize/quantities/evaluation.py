@@ -29,8 +29,8 @@ from jaxvib.steady.regimes.working import working_regime
 from jaxvib.units.known import is_known
 
 _NO_FOLD = 10.0
-"""Value for a fold that does not exist, at the end of a mode toward higher rotor speeds, in units of the rotor speed of the
-scene."""
+"""Rotor speed that stands for a missing fold at the end of a mode toward higher rotor speeds, divided by the rotor speed of
+the scene."""
 
 _RUN_UP_SAMPLES = 4000
 """Number of stored states of a run-up."""
@@ -50,8 +50,8 @@ class Case(Protocol):
 
 
 Target = tuple[str, int]
-"""Jam or fold that is followed: ("jam", mode), or the fold at an end of the mode, ("below", mode) or ("above", mode) for the
-end at lower or higher load speed."""
+"""Jam or fold that is followed. ("jam", mode): the jam of a mode. ("below", mode), ("above", mode): the fold at the end of the
+mode with the lower, or the higher, load speed."""
 
 Key = tuple[tuple[Case, ...], Target]
 """Followed jam or fold of a scene. The scene is identified by the cases that lead to it from the scene of the design."""
@@ -130,7 +130,7 @@ class Evaluation:
         return self._jams[key]
 
     def folds(self, mode: int) -> tuple[Array, Array]:
-        """Return the rotor speeds, rad/s, of the folds at the ends of a jam mode with lower and with higher load speed.
+        """Return the rotor speeds, rad/s, of the two folds at the ends of a jam mode: first that with the lower load speed.
 
         If there is no fold at an end, the value is 0 at the end toward lower rotor speeds, and ten times the rotor speed of the
         scene at the end toward higher rotor speeds.

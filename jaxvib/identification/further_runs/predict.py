@@ -27,7 +27,7 @@ _NOISE_RATIO = 1.5
 `patterned`."""
 
 _NUMBER_ERROR = 1e-6
-"""Relative standard error at which the numbers of a motion with loads count as known exactly."""
+"""Relative standard error of the numbers of a scene with loads, so small that a fit of the first state does not change them."""
 
 
 class PredictionStatus(eqx.Enumeration):
@@ -91,11 +91,11 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
 
     - The numbers and the gains are those of the fit. The motion at the first sample and the offsets are fitted to the run. The
       zero of the rotor's angle is also fitted, unless the fit and the run both have the mark of a tachometer and no loads move
-      on the rotor
+      on the rotor, or the scene has several exciters
     - A likelihood-ratio test compares two hypotheses: the machine has the same numbers in the run as in the fit, or it has
       other numbers. The test accounts for the errors of the fit and the noise of the run. If the chance of the deviation is
       below 1e-5, the run contradicts the fit, and a note names the number whose change explains most of the deviation. In a run
-      with jammed loads, no number is named if the residuals are much larger than the noise
+      with loads, no number is named if the residuals are more than 1.5 times the noise
 
     **Arguments**: `fit` from `identify`; `run`: a `MeasuredRun`, with its own `change` of numbers.
 
@@ -130,7 +130,8 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     status = PredictionStatus.patterned if notes else PredictionStatus.predicted
     if deviation.chance < CHANCE:
         status = PredictionStatus.contradicted
-        is_far = at.problem.has_loads and bool(np.any(ratio > _NOISE_RATIO))  # the motion of the loads is not linear
+        is_far = at.problem.has_loads and bool(np.any(ratio > _NOISE_RATIO))
+        # Far from the fit, the linearized motion of the loads does not tell which number has changed.
         too_far = (
             f"the run deviates from the fit by more than its errors (chance {deviation.chance:.1g}), too much to name a number"
         )
@@ -152,9 +153,9 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
 class _Predicted(NamedTuple):
     """Run, evaluated with the numbers of a fit.
 
-    **Attributes**: its `problem`; unknowns `x`; `linear` unknowns, with the best state at the first sample and the best
-    offsets; `residuals` (n, C); `taps` of the filters to white noise (C,); `has_mark`: True if the zero of the rotor's angle is
-    that of the fit.
+    **Attributes**: its `problem`; unknowns `x`; `linear`: the unknowns on which the readings depend linearly (unbalances,
+    state at the first sample, offsets), fitted to the run; `residuals` (n, C); `taps` of the filters to white noise (C,);
+    `has_mark`: True if the zero of the rotor's angle is that of the fit.
     """
 
     problem: Problem
@@ -177,7 +178,7 @@ def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
         if name in fit.gain_names:
             x[first + k] = math.log(fit.gains[fit.gain_names.index(name)].value)
     fixed, means, precisions = pairs if has_mark or len(sizes) > 1 else None, problem.means, problem.precisions
-    if problem.has_loads:  # the motion at the first sample is not linear in the readings; the numbers keep their values
+    if problem.has_loads:  # the first state has a nonlinear effect and is searched for; the numbers are held by their priors
         problem = with_first_motion(problem._replace(means=x, precisions=np.full(x.size, _NUMBER_ERROR**-2)))[0]
 
     def with_filters(
@@ -216,6 +217,6 @@ def _deviation(fit: MachineFit, at: _Predicted) -> Disagreement:
     part[np.ix_(in_fit, in_fit)] = eliminate(matrix, in_run)
     gradient[in_fit] = elimination(matrix, in_run).T @ slope
     names = [*fit.names, *(f"the gain of channel {name!r}" for name in fit.gain_names), "the angle (rad) of the unbalance"]
-    # The gradient is moved from the numbers of the fit to the numbers of a common fit of the run and the records of the fit.
+    # The gradient was computed at the numbers of the fit. Here it becomes that at the optimum of a joint fit of all records.
     gradient = fit.information @ pseudoinverse(fit.information + part)[0] @ gradient
     return disagreement(fit.information, part, gradient, names)

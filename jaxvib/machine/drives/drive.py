@@ -66,7 +66,7 @@ class Drive(Part):
 
     @abc.abstractmethod
     def torque_and_inertia(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> tuple[Array, Array] | None:
-        """Return the torque T (N m) at time `t` (s) and the rotor's `speed` (rad/s), and the rotor's inertia J (kg m^2).
+        """Return two values at time `t` (s) and rotor `speed` (rad/s): the torque T (N m), and the rotor's inertia J (kg m^2).
 
         `states` are those of the motor, see `state_units`; without them T is the steady torque. Return None if no torque
         changes the speed.
@@ -93,7 +93,8 @@ class Drive(Part):
 class Directed(Drive):
     """Drive that turns its rotor in a direction: angles, speeds and torques are those of `drive` times `direction`.
 
-    `direction` is 1 or -1 as an array, so that drives of both directions have an equal structure; None for clockwise.
+    `direction` is None for a drive that is known to turn clockwise. As an array of 1 or -1, one compiled program serves both
+    directions. The attribute `speed` is that of `drive`, without a sign.
     """
 
     drive: Drive

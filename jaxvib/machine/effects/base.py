@@ -62,8 +62,9 @@ def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
 def has_half_turn_symmetry(effects: Iterable[Effect]) -> bool:
     """Return True if phi -> phi + pi, q -> -q leaves the equations with these `effects` unchanged.
 
-    The deviation of the load angle in a jam then has even harmonics only. Some friction laws keep this symmetry. Gravity on the
-    loads, an imbalance and forces between loads break it. For every effect other than friction the result is False.
+    In a jam the vibration then has odd harmonics only, and the deviation of the load angle even ones. Some friction laws keep
+    this symmetry. Gravity on the loads, an imbalance and forces between loads break it. For every effect other than friction
+    the result is False.
     """
     terms = [term for effect in effects for term in effect.terms()]
     return all(isinstance(term, ContactFriction) and term.is_half_turn_symmetric for term in terms)
@@ -135,7 +136,8 @@ class Effect(Part):
 
 
 class Gravity(Effect):
-    """Gravity on the loads: V = m g p_up(u), the torque - m g R cos phi on a load on a circle.
+    """Gravity on loads and unbalances: V = m g p_up(u), the torque - m g R cos phi on a load on a circle, - S g cos theta on an
+    unbalance.
 
     Displacements of platforms are measured from static equilibrium under the weight of platforms and loads. Gravity therefore
     adds no force on the platforms.
@@ -258,7 +260,7 @@ class MomentImbalance(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """Return the moment imbalance of `BALANCE_GRADE` with its masses at the radius of gyration on both sides.
+        """Return mass x radius of gyration x `BALANCE_GRADE` / speed: a couple whose lever arm is the radius of gyration.
 
         The result is None if the machine cannot tilt.
         """
