@@ -51,7 +51,7 @@ def label_map(
     'x'
     """
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
-    # Code -1 is the last name.
+    # A code -1 becomes the index of `NO_RESULT`, which is appended as the last name.
     names, codes = [*names, NO_RESULT], np.where(codes < 0, len(names), codes)
     present = np.unique(codes)
     plain = dict(zip(names, map(_light, label_colors(names)), strict=True))
@@ -231,9 +231,10 @@ def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, x_label: str, a
 def tornado_chart(
     names: list[str], low: np.ndarray, high: np.ndarray, middle: float, *, x_label: str, ax: Axes | None = None
 ) -> Drawn:
-    """Draw bars from `low` (n,) to `high` (n,) about `middle`, the longest at the top.
+    """Draw bars from `middle` to `low` (n,) and from `middle` to `high` (n,), the largest difference at the top.
 
-    The ends of a bar are the means of a quantity for the lowest and the highest fifth of the values of a parameter in `names`.
+    Each pair of bars belongs to a parameter in `names`. `low` is the mean of a quantity over the cases in the lowest fifth of
+    the values of the parameter, `high` over those in the highest fifth.
 
     >>> import numpy as np
     >>> figure = tornado_chart(["a", "b"], np.array([1.0, 0.0]), np.array([3.0, 9.0]), 2.0, x_label="force, N")

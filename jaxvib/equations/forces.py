@@ -213,7 +213,7 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     **Arguments**
 
     - `scene` and a `state` of it
-    - `t`, s: the time, which determines the angle of an ideal drive's rotor; typical: 0 without an unbalance
+    - `t`, s: the time, which determines angle and speed of an ideal drive's rotor; typical: that of the state
 
     **Returns** two scalars, W: the power input and the dissipated power; typical: 10 to 5000 W.
 
@@ -326,8 +326,8 @@ def _spin_power(
 ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
     """Return rates and powers of loads that spin and slide.
 
-    **Returns** the rates of the coordinates at which the centre of a rolling load would move with the sliding velocity c; the
-    power of the rotor to loads that spin and slide, W; the power that sliding dissipates, W, without rolling friction.
+    **Returns** the sliding velocity c as rates of the coordinates, c_i / |dp/du_i|; the power of the rotor to loads that
+    spin and slide, W; the power that sliding dissipates, W, without rolling friction.
     """
     loads, spin, zero = exciter.loads, state.spin, jnp.zeros(())
     if spin is None:
@@ -363,7 +363,7 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
     **Arguments**
 
     - `scene`, whose loads have a defined normal force
-    - `t`, s: the time, which determines the angle of the rotor
+    - `t`, s: the time, which determines angle and speed of an ideal drive's rotor
     - `state` of the scene
 
     **Returns** an array (count,), N; typical: m R speed^2, 100 to 5000 N.

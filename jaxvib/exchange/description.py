@@ -26,7 +26,8 @@ _BASE: Mapping[str, Mapping[str, int]] = {
 }
 """Units as exponents of SI base units."""
 
-_STRUCTURED = re.compile(r"(der\()?[A-Za-z_]\w*(\[\d+\])?(\.[A-Za-z_]\w*(\[\d+\])?)*\)?", re.ASCII)
+_STRUCTURED_NAME = re.compile(r"(der\()?[A-Za-z_]\w*(\[\d+\])?(\.[A-Za-z_]\w*(\[\d+\])?)*\)?", re.ASCII)
+"""Names that the naming convention "structured" of FMI permits."""
 
 
 class Variable(NamedTuple):
@@ -34,7 +35,8 @@ class Variable(NamedTuple):
 
     **Attributes**: `name`; `unit`, "" for none; `kind`: the causality in FMI; `start`: the initial value, None if it is
     computed; `about`: a description; bounds `low` and `high`, or None; `state`: for the rate of a state, the index of the
-    state, otherwise None; `nominal`: typical size, or None; `listed`: False for a variable that a description in FMI 2.0 omits.
+    state, otherwise None; `nominal`: typical size, or None; `listed`: False for an event indicator, which is not a variable
+    in FMI 2.0.
     """
 
     name: str
@@ -88,7 +90,7 @@ def describe_model(
     listed = [(reference, variable) for reference, variable in enumerate(variables) if variable.listed or not is_version_2]
     places = {reference: place for place, (reference, _) in enumerate(listed, 1)}
     indicators = [reference for reference, variable in enumerate(variables) if not variable.listed]
-    structured = all(_STRUCTURED.fullmatch(variable.name) for variable in variables)
+    structured = all(_STRUCTURED_NAME.fullmatch(variable.name) for variable in variables)
     attributes = {
         "fmiVersion": fmi,
         "modelName": name,

@@ -35,7 +35,8 @@ PARTS_OF_RUN = 64
 
 
 _DOUBLINGS = 40
-"""Number of doublings with which the first implicit step, 1e-12 of the regular step, grows to the regular step."""
+"""Number of doublings with which the end of the first implicit step, 1e-12 of a regular step, becomes that of a regular
+step."""
 
 
 @fast_diffrax_loop_end()
@@ -63,10 +64,10 @@ def advance(
 def divide_run(
     motion: PackedSystem, packed: IntegratorState, length: Array, step: Array, number: int, *, implicit: bool
 ) -> tuple[IntegratorState, Array, Array]:
-    """Return the first state of the integrator, and the start times and lengths, s, of `number` parts of the same `length`.
+    """Return the first state of the integrator, and the start times and lengths, s, of `number` parts of equal `length`.
 
     Regular implicit steps do not resolve the fast acceleration of loads by drag at the start. Therefore very short steps are
-    taken first, each twice as long as the previous one, and the first part begins at their end.
+    taken first, the end of each at twice the time of the previous one. The first part begins at their end and is shorter.
     """
     begins, lengths = length * jnp.arange(number, dtype=length.dtype), jnp.full(number, length)
     if not implicit:

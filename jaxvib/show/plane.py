@@ -15,10 +15,11 @@ from jaxvib.show.view import BODY, FOUNDATION, View, tie_parts
 from jaxvib.show.wheel import Pose, Wheel, value_text
 
 _WIDTH = 6.0
-"""Width of the area of a body, in units of the drawing, that contains the points to which something is attached."""
+"""Width in the drawing of the rectangle around all points to which something is attached; for a tall one 1.6 times its
+height."""
 
 _OUTLINE_MARGIN = 0.32
-"""Distance of the outline of a body from the points of its supports, and from the rims of its exciters."""
+"""Distance of the outline of a body from its centre of mass, the points of its supports, and the rims of its exciters."""
 
 _SPRING_LENGTH = 1.6
 """Length of a spring from the body to the foundation, in units of the drawing."""
@@ -67,9 +68,10 @@ class PlaneView(View):
         )
         outline = _hull(np.concatenate([circle(tuple(at), r, 41) for at, r in zip(self.scale * points, radii, strict=True)]))
         points_of_body = [*(outline / self.scale), *self._supports, *self._axes, np.zeros(2)]
-        self._rows = np.stack([np.asarray(machine.rows_at(jnp.asarray(at))) for at in points_of_body])
-        self._moved, self._corners = np.asarray(points_of_body), len(outline)
-        self._below = 0.5 * float(np.min(outline[:, 0]) + np.max(outline[:, 0])), float(np.min(outline[:, 1])) - 0.12
+        # Displacement of each point for each coordinate of the body (points, 2, 3).
+        self._point_rows = np.stack([np.asarray(machine.rows_at(jnp.asarray(at))) for at in points_of_body])
+        self._rest_points, self._corner_count = np.asarray(points_of_body), len(outline)
+        self._mass_text_at = 0.5 * float(np.min(outline[:, 0]) + np.max(outline[:, 0])), float(np.min(outline[:, 1])) - 0.12
         self.limits = self._limits(outline)
 
     def _struts(self, k: int, points: np.ndarray) -> list[_Strut]:
@@ -95,8 +97,8 @@ class PlaneView(View):
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """Return the foundation, springs and dampers, the body, its centre of mass, the exciters."""
-        positions = self.scale * self._moved + reach * self._rows @ pose.displacement
-        corners, rest = positions[: self._corners], positions[self._corners :]
+        positions = self.scale * self._rest_points + reach * self._point_rows @ pose.displacement
+        corners, rest = positions[: self._corner_count], positions[self._corner_count :]
         ends, axes, centre = rest[: len(self._supports)], rest[len(self._supports) : -1], rest[-1]
         parts = []
         for strut in self.struts:
@@ -122,7 +124,7 @@ class PlaneView(View):
         mass, inertia = float(self.mass[0, 0]), float(self.mass[2, 2])
         words = f"M = {value_text(mass, 'kg')}, J = {value_text(inertia, 'kg m²')}"
         bottom = self.limits[2]
-        texts = [Text(*self._below, words, {**small, "ha": "center", "va": "top"})]
+        texts = [Text(*self._mass_text_at, words, {**small, "ha": "center", "va": "top"})]
         struts_of_support: dict[int, list[_Strut]] = {}
         for strut in self.struts:
             struts_of_support.setdefault(strut.support, []).append(strut)
@@ -151,7 +153,7 @@ class PlaneView(View):
 
     def support_forces(self, pose: Pose) -> np.ndarray:
         """Return the force of each support on the foundation (supports, 2), N: the sum over its two springs and dampers."""
-        rows = self._rows[self._corners : self._corners + len(self._supports)]
+        rows = self._point_rows[self._corner_count : self._corner_count + len(self._supports)]
         displacement, rate = rows @ pose.displacement, rows @ pose.velocity
         force = np.zeros((len(self._supports), 2))
         for strut in self.struts:

@@ -83,7 +83,7 @@ class View(abc.ABC):
 
     @abc.abstractmethod
     def supports(self) -> list[tuple[float, float]]:
-        """Return the positions of the supports on the foundation."""
+        """Return the positions at which the forces of the supports are drawn."""
 
     @abc.abstractmethod
     def support_forces(self, pose: Pose) -> np.ndarray:

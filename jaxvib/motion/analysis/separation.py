@@ -6,9 +6,10 @@ run show this:
 
     x' = A(t) x,    growth = ln(spectral radius of the transition matrix over whole turns of the loads) / duration
 
-If the loads have equal parameters, x is the difference of the states of two loads of one track. Such a difference does not move
-the carrier, and all differences obey the same equations. Otherwise x is the whole state. The transition matrix is a product of
-exponentials (a Magnus method of order 4 on the samples of the run); therefore strong drag needs no smaller steps.
+If the loads have equal parameters and exert no forces on each other, x is the difference of the states of two loads of one
+track. Such a difference does not move the carrier, and all differences obey the same equations. Otherwise x is the whole
+state. The transition matrix is a product of exponentials (a Magnus method of order 4 on the samples of the run); therefore
+strong drag needs no smaller steps.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ CLUSTER_ANGLE = 1e-3
 """Largest angle between loads that count as coincident if other loads of their track are elsewhere, rad."""
 
 MIN_SEPARATION_GROWTH = 1e-2
-"""Logarithm of the growth over the samples above which loads separate. Smaller values can be errors of the interpolation."""
+"""Logarithm of the growth factor over the samples above which loads are said to separate. Smaller values can be errors of the
+interpolation."""
 
 
 def tracks(scene: Scene, k: int) -> list[np.ndarray]:
@@ -59,8 +61,9 @@ def _wrap_angle(angle: np.ndarray) -> np.ndarray:
 
 
 def nearly_coincident_pairs(scene: Scene, k: int, angle: np.ndarray) -> list[tuple[int, int]]:
-    """Return the numbers of two loads of each group of loads of exciter `k` that stay at nearly one angle on one track.
+    """Return the numbers of two loads of each group of nearly coincident loads of exciter `k`.
 
+    The loads of a group stay at nearly one angle on one track.
     All loads of a track form a group if they stay within `NEARLY_ONE_ANGLE`; otherwise neighbours within `CLUSTER_ANGLE` do.
 
     **Arguments**: `angle` (nt, count) of the loads, rad.
@@ -114,7 +117,8 @@ def smallest_distance(scene: Scene, stretch: Trajectory) -> float:
 
 
 def overlap(scene: Scene, stretch: Trajectory) -> bool:
-    """Return True if loads with a size overlap at some time; the effect `LoadContact` would prevent this."""
+    """Return True if the distance of two loads with a size is below 0.9 diameters at some time, which the effect `LoadContact`
+    would prevent. Smaller overlaps count as contact."""
     return not has_term(scene.all_effects, LoadInteraction) and smallest_distance(scene, stretch) < MIN_DISTANCE
 
 

@@ -38,7 +38,8 @@ def damped_newton(
     - `balance(x, args)`: returns the residuals and auxiliary values. The residuals must be scaled such that they are at most of
       the order of 1 everywhere, because the limit below which they count as rounding errors is absolute
     - `iterations`: maximum number of steps; the iteration ends earlier if only rounding errors are left
-    - `on_scalars`: evaluate on scalars, see `scalarize`, which reduces the time to a third for many starts
+    - `on_scalars`: compile the equations as operations on single numbers instead of arrays, see `scalarize`. For many starts
+      this takes a third of the time, but it takes longer to compile
 
     **Returns** the root and the auxiliary values there.
 
@@ -83,7 +84,8 @@ def damped_newton(
 
 
 def _on_arrays(step: Callable[[_State, Args], _State], begin: _State, args: Args) -> Callable[..., Sequence[Array]]:
-    """Return the step on the arrays of a state, with the sine and cosine of programs on scalars if JAX allows."""
+    """Return the step as a function of the arrays of a state. If this version of JAX permits it, sine and cosine are those of
+    the programs on scalars."""
     program, structure, constants = arrays_program(step, begin, args), jax.tree.structure(begin), jax.tree.leaves(args)
     if program is None:
         return lambda *now: jax.tree.leaves(step(jax.tree.unflatten(structure, now), args))

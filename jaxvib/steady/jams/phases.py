@@ -130,8 +130,9 @@ def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
         T_j = (w^4/2) S_j sum_k S_k Im[exp(i (a_k - a_j)) e^H L_j D(w)^-1 L_k^T e],     S = m R
         D(w) = K - w^2 (M + sum_j m_j L_j^T L_j) + i w (C + n G)
 
-    L_j (directions of the mount, nd) maps the carrier's coordinates to the displacement of the mount at the station of load j;
-    n is the rotor speed.
+    w is `omega` and a is `phase`; e = (1, -i) for two directions of the mount, 1 for one. L_j (directions of the mount, nd)
+    maps the carrier's coordinates to the displacement of the mount at the station of load j; M, C, K and G are the matrices
+    of the carrier, and n is the rotor speed.
 
     **Returns** an array (count,). **Raises** `InputError` for loads that are not on a circle, drives without a prescribed
     speed, and effects that this function does not include.
@@ -195,7 +196,7 @@ def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_scal
     """Solve the torque balance for the load speed and the phases (count,) by Newton's method, differentiable with respect to
     the balance.
 
-    `on_scalars`: evaluate on scalars (`damped_newton`), which is faster for many starts and takes longer to compile.
+    `on_scalars`: compile the equations as operations on single numbers, see `damped_newton`.
     """
 
     def residuals(x: Array, given: TorqueBalance) -> tuple[Array, None]:
@@ -273,7 +274,7 @@ def growth_of_free_loads(scene: Scene, omega: Array) -> np.ndarray:
     if loads.ball_radius is not None or has_term(scene.all_effects, ContactFriction):
         return np.full(speeds.shape, np.nan)
     starts = np.where(is_finite, speeds, float(scene.drive.speed))
-    found = _growths_of_jams(scene, jnp.asarray(starts))
+    found = _coincident_jams(scene, jnp.asarray(starts))
     near = (
         is_finite
         & (np.abs(found.omega - starts) < _SAME_JAM_DISTANCE * starts)
@@ -283,7 +284,7 @@ def growth_of_free_loads(scene: Scene, omega: Array) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _growths_of_jams(scene: Scene, omega: Array) -> PhaseJam:
+def _coincident_jams(scene: Scene, omega: Array) -> PhaseJam:
     together = jnp.zeros(scene.loads.count, omega.dtype)
     return jax.vmap(lambda w: jam_from(scene, w, together))(omega)
 

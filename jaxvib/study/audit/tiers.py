@@ -15,7 +15,6 @@ from jaxvib.equations.linear import jammed_loads
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.envelope.envelope import envelope
-from jaxvib.motion.settle import settle
 from jaxvib.results.status import status_name
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
@@ -34,7 +33,7 @@ class TierRow(NamedTuple):
       quantity itself; for `amplitude` the error of the coordinate with the largest error, in units of the largest amplitude;
       NaN if `applicable` is False
     - `seconds` of a computation; `compile`: additional seconds of the first computation; NaN without timings
-    - `note`: purpose of the tier, or the reason why it cannot compute the quantities
+    - `note`: purpose of the tier, the reason why it cannot compute the quantities, or the motion to which the run left the jam
     """
 
     tier: str
@@ -106,9 +105,8 @@ def _call(
         if not without_integration and "unstable" in reference.kind:
             return "the jam is unstable, and a run leaves it"
         until = 10.0 * WINDOW_PERIODS * slow_period(scene)
-        if tier.name == "full":
-            return lambda: comparison.full(scene)
-        return lambda: tier.jam(scene, comparison.mode, until)
+        jam = tier.jam
+        return (lambda: comparison.full(scene)) if jam is None else lambda: jam(scene, comparison.mode, until)
     if without_integration:
         return "computes jams of this scene, not the motion that this run reaches"
     if tier.name == "full":
@@ -139,15 +137,15 @@ class JamValues(Protocol):
 class Tier(NamedTuple):
     """Method to compute a jam.
 
-    **Attributes**: `name`; `purpose`: text; `require(scene)` raises `InputError` if the tier does not support the scene, and
-    names the property that a part of the scene lacks; `jam(scene, mode, until)` returns the result for a jam mode; the averaged
-    equations are integrated to the time `until`, s.
+    **Attributes**: `name`; `purpose`: text; `require(scene)` raises `InputError` if the tier does not support the scene; the
+    message names the part and the reason; `jam(scene, mode, until)` returns the result for a jam mode, where the averaged
+    equations are integrated to the time `until`, s; None for the full equations, which start from the state of the comparison.
     """
 
     name: str
     purpose: str
     require: Callable[[Scene], object]
-    jam: Callable[[Scene, int, float], JamValues]
+    jam: Callable[[Scene, int, float], JamValues] | None
 
     def refusal(self, scene: Scene) -> str | None:
         """Return a sentence with the reason why the tier does not support the scene; None if the tier supports it.
@@ -188,7 +186,7 @@ TIERS = (
         "full",
         "every motion in time of every scene; no unstable jams",
         lambda scene: None,
-        lambda scene, mode, until: settle(scene, mode=mode, throw=False),
+        None,
     ),
 )
 """Tiers in the order of their computing time; the last tier supports every scene."""
