@@ -56,13 +56,13 @@ def label_map(
     present = np.unique(codes)
     plain = dict(zip(names, map(_light, label_colors(names)), strict=True))
     looks: list[Look] = [HATCHED.get(names[k], {"color": plain[names[k]]}) for k in present]
-    colours = [look.get("facecolor", look.get("color")) for look in looks]
+    colours = [look["facecolor"] if "facecolor" in look else look["color"] for look in looks]
     norm = BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present))
     places, shown = np.searchsorted(present, codes), ListedColormap(colours)
     mesh = axis.pcolormesh(x, y, places, cmap=shown, norm=norm, shading="nearest", rasterized=True)
     for code, look in zip(present, looks, strict=True):
         if "hatch" in look:
-            axis.add_patch(PathPatch(_cells_path(mesh.get_coordinates(), codes == code), rasterized=True, **look))
+            axis.add_patch(PathPatch(_cells_path(np.asarray(mesh.get_coordinates()), codes == code), rasterized=True, **look))
     entries: list[Patch | Line2D] = [Patch(label=names[k], **look) for k, look in zip(present, looks, strict=True)]
     edges = axis.get_xlim(), axis.get_ylim()
     for kind, parts in (lines or {}).items():

@@ -237,7 +237,7 @@ class _Program:
         """Estimated memory, bytes."""
         return MEMORY_PER_PROGRAM + MEMORY_PER_STORED_BYTE * self.size
 
-    def __call__(self, arrays: Iterable[Array | np.ndarray]) -> Any:
+    def __call__(self, arrays: Iterable[Array | np.ndarray | np.generic]) -> Any:
         return self.result.filled(self.run(*arrays))
 
     def compile(self, arrays: Iterable[Array]) -> None:
