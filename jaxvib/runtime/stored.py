@@ -264,11 +264,8 @@ def _no_garbage_collection() -> Iterator[None]:
                 gc.enable()
 
 
-_ARRAYS = (
-    jax.Array,
-    np.ndarray,
-    np.generic,
-)  # a call copies NumPy's arrays to the device in a tenth of the time of `jax.device_put`
+_ARRAYS = (jax.Array, np.ndarray, np.generic)
+"""Types of arrays. A call copies NumPy's arrays to the device in a tenth of the time of `jax.device_put`."""
 
 _UNKNOWN = _Program(lambda *_: [], Skeleton(()))
 """Mark of a program that is not in memory."""

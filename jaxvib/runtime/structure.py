@@ -77,7 +77,7 @@ def leaf_key(leaf: Any) -> Hashable:
 
     It is the abstract value of an array (shape, dtype, weak type), otherwise the leaf itself with its Python type.
     """
-    if isinstance(leaf, (jax.Array, np.ndarray)):
+    if isinstance(leaf, (jax.Array, np.ndarray, np.generic)):
         return jax.typeof(leaf)
     return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 equals -0.0, but their programs differ
 

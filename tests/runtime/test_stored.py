@@ -117,6 +117,13 @@ def test_a_scalar_without_a_type_of_its_own_is_another_program(folder):
     assert kinds == ["float32", "float64"]
 
 
+def test_values_of_numpy_scalars_share_a_program(folder):
+    function = programs.cached(with_sign)
+    signs = [np.float64(2.0), np.float64(-3.0), np.float32(-3.0)]
+    assert [float(function(jnp.asarray(1.0), sign)) for sign in signs] == [1.0, -1.0, -1.0]
+    assert len(function.stored.ready) == 2  # one for each type
+
+
 def with_sign(x, sign):
     return jnp.copysign(x, sign)
 
