@@ -9,6 +9,7 @@ from mutations import file_outcome, mutated_text, numbers_of_csv, record_key, se
 from swings import ROD
 
 import jaxvib as jv
+from jaxvib.units import columns
 
 
 def table(head, separator=",", comma=False, factor=1.0):
@@ -82,6 +83,13 @@ def test_errors_of_tables_name_the_line(tmp_path, text, says):
     with pytest.raises(jv.InputError) as error:
         jv.read_record(path)
     assert says in str(error.value) and str(error.value).startswith(str(path))
+
+
+def test_long_texts_are_no_units(monkeypatch):
+    """Pint takes minutes for 100,000 characters; such texts do not reach it."""
+    monkeypatch.setattr(columns, "unit_ratio", lambda unit, si: 1.0)
+    assert columns.unit_factor("m" * 99, "rad") == 1.0
+    assert columns.unit_factor("m" * 100, "rad") is None and columns.unit_factor("2 " + "m" * 100_000, "rad") is None
 
 
 def test_wrong_records(tmp_path):
