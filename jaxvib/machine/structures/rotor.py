@@ -253,9 +253,10 @@ def rotor(
             damping_up, "machine.damping_up", vertical, lambda: found["mass"] * vertical / jnp.sum(vertical)
         )
         resisting = read(2, damping_up=constants)["damping_up"]
+    station = read(stations=stations)["stations"]
     return Rotor(
         **found,
-        **read(stations=stations),
+        stations=jnp.reshape(station, ()) if station.size == 1 else station,
         transverse_inertia=transverse,
         polar_inertia=polar,
         position=places,
