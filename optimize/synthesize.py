@@ -262,7 +262,7 @@ def _search(
     best: tuple[DesignSpace, Problem, SearchResult] | None = None
     existing = drawn = 0
     for loads in space.counts or (None,):
-        space_of_count = space if loads in (None, space.scene.loads.count) else _with_loads(space, loads)
+        space_of_count = space if loads is None or loads == space.scene.loads.count else _with_loads(space, loads)
         problem = problem_of(space_of_count, objective, demands, options.starts)
         if problem.keys:
             require_drag(jammed_loads(space.scene))

@@ -36,6 +36,9 @@ class QuadraticDrag(CircularLoads):
         slip = speed - rate[0]
         return (self.drag * self.radius**2 * jnp.abs(slip) * slip,)
 
+    def inertia_factor(self):
+        return jnp.asarray(1.4)
+
 
 def with_quadratic_drag():
     balls = jv.balls(count=1, mass=0.4, radius=0.1, drag=1.0)

@@ -6,7 +6,7 @@ import abc
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -100,13 +100,8 @@ class Loads(Part):
     one_sided: ClassVar[bool] = False
     """True if the track only pushes: a load whose normal force is negative would leave it."""
 
-    @property
-    def circular(self) -> bool:
-        """True if position and forces are those of `CircularLoads`, which the analyses of jams and of balance require; a
-        subclass does not change it."""
-        methods = ("position", "resistance", "spin_force", "drilling_spin")
-        own = type(self)
-        return isinstance(self, CircularLoads) and all(getattr(own, name) is getattr(CircularLoads, name) for name in methods)
+    circular: ClassVar[bool] = False
+    """True if position and forces are those of `CircularLoads`, which the analyses of jams and of balance require."""
 
     @property
     def has_bearing(self) -> bool:
@@ -226,6 +221,16 @@ class CircularLoads(Loads):
     kind: str = eqx.field(static=True)
     ball_radius: Array | None = eqx.field(metadata=BALL_RADIUS, default=None)
 
+    circular: ClassVar[bool] = True
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Set `circular` of a subclass: False if it has a position or forces of its own."""
+        super().__init_subclass__(**options)
+        methods = ("position", "resistance", "spin_force", "drilling_spin")
+        cls.circular = not any(
+            name in vars(base) for base in cls.__mro__[: cls.__mro__.index(CircularLoads)] for name in methods
+        )
+
     @property
     def has_bearing(self) -> bool:
         """True for pendulums; balls and rollers roll on their track."""
@@ -253,7 +258,11 @@ class CircularLoads(Loads):
         """Return 7/5 (ball), 3/2 (roller), 1 + J_C/(m R^2) (pendulum)."""
         if self.inertia is not None:
             return 1.0 + self.inertia / (self.mass * self.radius**2)
-        return jnp.asarray({"ball": 1.4, "roller": 1.5}[self.kind], dtype=self.mass.dtype)
+        factors = {"ball": 1.4, "roller": 1.5}
+        if self.kind not in factors:
+            needed = "loads of this kind need a moment of inertia, or a method inertia_factor of their own"
+            raise InputError("loads.kind", f"is {quoted(self.kind)}; {needed}")
+        return jnp.asarray(factors[self.kind], dtype=self.mass.dtype)
 
     def resistance(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...]:
         """Return - b_W R^2 (phi' - speed)."""

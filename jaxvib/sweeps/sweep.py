@@ -274,7 +274,7 @@ def _compute_missing(
     """Compute the missing and the damaged chunks of a store that this process has locked."""
     has_functions = any(measure not in RUN_MEASURES.values() for measure in new_study.measures)
     if has_functions and not new_study.program.startswith(PYTHON) and traced_program(new_study)[1] != new_study.program:
-        problem = "have a function that has changed since the study was created, or that gives another program in each call"
+        problem = "has a function that has changed since the study was created, or that gives another program in each call"
         raise InputError("measure", f"{problem} (a clock, random numbers, a file); pass such numbers as constants")
     opened.require_same(new_study)
     states = opened.states(writing=True)

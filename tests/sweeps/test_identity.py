@@ -157,7 +157,7 @@ def test_a_store_answers_no_other_question(tmp_path, monkeypatch):
     first, store = asked(Quantity("m", "", by_rate)), tmp_path / "study.zarr"
     assert run_study(first, store).data.m.values.tolist() == [50.0, 60.0]
     monkeypatch.setitem(globals(), "RATE", 3.0)
-    with pytest.raises(jv.InputError, match="measures have a function that has changed since the study was created"):
+    with pytest.raises(jv.InputError, match="measure has a function that has changed since the study was created"):
         run_study(first, store)
     with pytest.raises(
         jv.InputError, match=r"contains another study: its program differs \(a parameter of the scene, the function"

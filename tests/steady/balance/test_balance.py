@@ -117,9 +117,11 @@ def test_motion_that_is_not_balanced_is_refused():
 
 
 def test_summaries_state_rates_without_sign():
-    stable, unstable = (BalancedStability(g < 0.0, True, g, np.array([1.0, 0.9]), 1, 1e-9).summary() for g in (-2.065, 3.0))
+    stable, unstable = (
+        BalancedStability(g < 0.0, True, g, np.array([1.0, 0.9]), 1, 1e-9, 60.0).summary() for g in (-2.065, 3.0)
+    )
     assert "decay at 2.065 1/s" in stable and "grow at 3 1/s" in unstable
-    undecided = BalancedStability(False, False, -2e-9, np.array([1.0, 1.0]), 1, 1e-9).summary()
+    undecided = BalancedStability(False, False, -2e-9, np.array([1.0, 1.0]), 1, 1e-9, 60.0).summary()
     assert "than the error of the computation (-2e-09 1/s)" in undecided
     family = jv.balanced_states(loaded(count=4, effects=(jv.StaticImbalance(0.013),))).summary()
     assert "common rotation" not in family and "along the neutral directions" in family
@@ -295,7 +297,7 @@ def test_criterion_improves_for_lighter_loads_and_stronger_drag():
 
 
 def test_map_refuses_what_is_no_range():
-    with pytest.raises(jv.InputError, match="mass must be a list"):
+    with pytest.raises(jv.InputError, match="mass must be an ascending list"):
         jv.criterion_map(loaded(), speeds=[20.0], mass=[1.0, -1.0], drag=[1.0])
 
 
