@@ -97,7 +97,7 @@ def load(path: str | Path) -> Any:
 
 
 _READ_ERRORS = (
-    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError, OSError, RuntimeError,
+    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError, RuntimeError,
     TypeError, ValueError, zipfile.BadZipFile,
 )  # fmt: skip
 """Errors that the reading of a file with arbitrary content may raise; `RecursionError` is a `RuntimeError`."""
