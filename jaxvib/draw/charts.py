@@ -135,10 +135,7 @@ def _branch_rows(
     units: Sequence[str] | None,
 ) -> list[tuple[str, str, list[tuple[str, np.ndarray]]]]:
     """Return the title, the label and the named curves of each panel; more than two coordinates have a panel each."""
-    tilts = [units is not None and each == "rad" for each in units or names]
-    length, factor = length_unit(amplitude[:, ~np.asarray(tilts)])
-    scaled = [(name, (1e3 if tilts[k] else factor) * amplitude[:, k]) for k, name in enumerate(names)]
-    labels = ["mrad" if tilt else length for tilt in tilts]
+    labels, scaled = scaled_amplitudes(amplitude, names, units)
     rows: list[tuple[str, str, list[tuple[str, np.ndarray]]]] = []
     for part in show:
         if part == "speed":
@@ -155,6 +152,22 @@ def _branch_rows(
             ]
             rows.append(("amplitude, zero to peak", label, named))
     return rows
+
+
+def scaled_amplitudes(
+    amplitude: np.ndarray, names: Sequence[str], units: Sequence[str] | None
+) -> tuple[list[str], list[tuple[str, np.ndarray]]]:
+    """Return the display unit of each coordinate, and its name with its amplitudes (n,) in this unit.
+
+    **Arguments**: `amplitude` (n, nd), m or rad; `names` (nd,) of the coordinates; `units` (nd,), "m" or "rad"; None: all m.
+
+    >>> scaled_amplitudes(np.array([[0.01, 0.02]]), ("y1", "tilt"), ("m", "rad"))
+    (['mm', 'mrad'], [('y1', array([10.])), ('tilt', array([20.]))])
+    """
+    tilts = [units is not None and each == "rad" for each in units or names]
+    length, factor = length_unit(amplitude[:, ~np.asarray(tilts)])
+    scaled = [(name, (1e3 if tilts[k] else factor) * amplitude[:, k]) for k, name in enumerate(names)]
+    return ["mrad" if tilt else length for tilt in tilts], scaled
 
 
 def log_limits(

@@ -56,7 +56,7 @@ def campbell(result: Whirl, at: float) -> str:
     groups = critical_groups(critical, critical_sense, right)
     shown = [k for group, _ in groups for k in group]
     top = 1.12 * max(scale * float(np.nanmax(speed)), *critical[shown].tolist(), 1e-300)
-    panel = Panel(FIRST, "whirl speed, rpm", (0.0, right), (0.0, top), wide=2.0 * WIDE + APART)
+    panel = Panel(FIRST, "whirl speed, rpm", (0.0, right), (0.0, top), wide=3.0 * WIDE + 2.0 * APART)
     parts, texts = panel.frame(), panel.texts()
     for word, look in _SENSE_STYLES.items():
         parts += [panel.line(scale * rotor_speed, scale * values, look) for values in whirl_lines(speed, sense == word)]
@@ -73,5 +73,5 @@ def campbell(result: Whirl, at: float) -> str:
         row = next((k for k, end in enumerate(ends) if end < x), len(ends))
         ends[row:] = [x + _LETTER_WIDTH * len(word), *ends[row + 1 :]]
         texts.append(Text(x + 0.08, 0.2 + 0.27 * row, word, {"fontsize": "small", "bbox": {"fc": "white"}}))
-    keys, names = legend(_LEGEND)
+    keys, names = legend([_LEGEND])
     return svg((0.0, FIRST + panel.wide + LAST, -0.6, TALL + 1.1), [[*parts, *keys]], [[*texts, *names]], "", 1.0, 0.0)

@@ -1,12 +1,14 @@
-"""Branch diagram and force chart as an SVG picture."""
+"""Branch diagram with charts of amplitudes and foundation force as an SVG picture."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from jaxvib.display import speed_unit
-from jaxvib.draw.charts import crossings, log_limits, stretches
-from jaxvib.draw.machine.parts import Text
+from jaxvib.draw.charts import crossings, log_limits, scaled_amplitudes, stretches
+from jaxvib.draw.machine.parts import Part, Text
 from jaxvib.draw.machine.svg import svg
 from jaxvib.draw.style import COLORS, GUIDE, join_names
 from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, dot, legend
@@ -29,7 +31,9 @@ _LEGEND = {
 
 
 def chart(result: Branches, max_speed: float) -> str:
-    """Draw the load speed, rpm, and the foundation force (zero to peak) over the rotor speed, rpm, like `Branches.plot`.
+    """Draw load speed, rpm, amplitudes and foundation force (zero to peak) over the rotor speed, rpm, like `Branches.plot`.
+
+    Each coordinate has a colour. If there are more coordinates than colours, only their largest amplitude is drawn.
 
     **Arguments**: `result`: the branches of one scene; `max_speed`: the highest rotor speed in the diagram, rad/s.
 
@@ -43,32 +47,24 @@ def chart(result: Branches, max_speed: float) -> str:
     True
     """
     scale, at = speed_unit("rpm")[1], float(result.scene.drive.speed)
-    omega, stable, force = np.asarray(result.omega), np.asarray(result.stable), np.asarray(result.foundation_force)
-    rotor_speed, resonances = np.asarray(result.rotor_speed), np.asarray(result.resonances)
+    rotor_speed = np.asarray(result.rotor_speed)
     rotor_speed = np.where(rotor_speed <= max_speed, rotor_speed, np.nan)
-    high = scale * float(np.nanmax(rotor_speed))
-    speeds = Panel(FIRST, "load speed, rpm", (0.0, high), (0.0, 1.06 * high))
-    limits = log_limits([force], rotor_speed, omega, resonances)
-    forces = Panel(FIRST + WIDE + APART, "foundation force, N, zero to peak", (0.0, high), limits, log=True)
-    parts, texts = [*speeds.frame(), *forces.frame()], [*speeds.texts(), *forces.texts()]
-    parts += [speeds.line([0.0, high], [scale * w, scale * w], _RESONANCE) for w in resonances.tolist()]
+    panels = _panels(result, scale, rotor_speed)
+    parts, texts = [each for panel, _ in panels for each in panel.frame()], [t for panel, _ in panels for t in panel.texts()]
+    speeds, high = panels[0][0], scale * float(np.nanmax(rotor_speed))
+    parts += [speeds.line([0.0, high], [scale * w, scale * w], _RESONANCE) for w in np.asarray(result.resonances).tolist()]
     parts.append(speeds.line([0.0, high], [0.0, high], ROTOR))
+    stable = np.asarray(result.stable)
     crossed = crossings(rotor_speed, stable, np.asarray(result.mode), at)
-    for panel, values in ((speeds, scale * omega), (forces, force)):
+    for panel, curves in panels:
         parts += [
-            panel.line(scale * rotor_speed[along], values[along], _STABLE if solid else _UNSTABLE)
+            panel.line(scale * rotor_speed[along], values[along], {**(_STABLE if solid else _UNSTABLE), "color": color})
+            for values, color in zip(curves.values(), COLORS, strict=False)
             for along, solid in stretches(stable)
         ]
-        parts.append(panel.line([scale * at] * 2, panel.y, OPERATING))
-        jams = []
-        for i, share, name, filled in crossed:
-            x, y = panel.at(scale * at, float(np.interp(share, [0, 1], values[i : i + 2])))
-            if 0.0 <= y <= TALL:
-                jams.append((y / TALL, name))
-                parts.append(dot(x, y, {"fc": "black" if filled else "white", "ec": "black", "lw": 1.0, "zorder": 4.0}))
-        look = {"fontsize": "small", "fontweight": "bold", "bbox": {"fc": "white"}}
-        x, _ = panel.at(scale * at, panel.y[0])
-        texts += [Text(x + 0.1, TALL * share, name, look) for share, name in join_names(sorted(jams))]
+        dots, numbers = _jams_at_operating_speed(panel, [*curves.values()], crossed, scale * at)
+        parts += [panel.line([scale * at] * 2, panel.y, OPERATING), *dots]
+        texts += numbers
     folds = [
         (scale * n, scale * w)
         for n, w, exists in zip(
@@ -77,7 +73,43 @@ def chart(result: Branches, max_speed: float) -> str:
         if exists and n <= max_speed
     ]
     parts += [dot(*speeds.at(n, w), _FOLD) for n, w in folds]
-    width = FIRST + 2.0 * WIDE + APART + LAST
-    keys, names = legend({**_LEGEND, MARKS["fold"]: _FOLD} if folds else _LEGEND)
+    platforms = {name: {**_STABLE, "color": color} for name, color in zip(panels[1][1], COLORS, strict=False)}
+    keys, names = legend([{**_LEGEND, MARKS["fold"]: _FOLD} if folds else _LEGEND, platforms])
+    width = FIRST + 3.0 * WIDE + 2.0 * APART + LAST
     texts.append(Text(0.5 * width, -0.8, f"stable {STABILITY_CRITERION}", {"fontsize": "small", "ha": "center"}))
     return svg((0.0, width, -0.95, TALL + 1.1), [[*parts, *keys]], [[*texts, *names]], "", 1.0, 0.0)
+
+
+def _panels(result: Branches, scale: float, rotor_speed: np.ndarray) -> list[tuple[Panel, dict[str, np.ndarray]]]:
+    """Return the three panels with their curves by name; `rotor_speed` is NaN at points that are not drawn, and `scale` is the
+    factor from rad/s to rpm."""
+    structure, omega, resonances = result.scene.machine.structure(), np.asarray(result.omega), np.asarray(result.resonances)
+    units, amplitudes = scaled_amplitudes(np.asarray(result.amplitude), structure.coordinates, structure.units)
+    curves = dict(amplitudes)
+    if len(curves) > len(COLORS):
+        curves = {f"largest of {len(curves)}": np.max([*curves.values()], axis=0)}
+    high = scale * float(np.nanmax(rotor_speed))
+    panels = [(Panel(FIRST, "load speed, rpm", (0.0, high), (0.0, 1.06 * high)), {"loads": scale * omega})]
+    for title, drawn in (
+        (f"amplitude, {', '.join(dict.fromkeys(units))}, zero to peak", curves),
+        ("foundation force, N, zero to peak", {"force": np.asarray(result.foundation_force)}),
+    ):
+        limits = log_limits([*drawn.values()], rotor_speed, omega, resonances)
+        panels.append((Panel(FIRST + len(panels) * (WIDE + APART), title, (0.0, high), limits, log=True), drawn))
+    return panels
+
+
+def _jams_at_operating_speed(
+    panel: Panel, curves: Sequence[np.ndarray], crossed: Sequence[tuple[int, float, str, bool]], at: float
+) -> tuple[list[Part], list[Text]]:
+    """Return the dots at which the curves cross the operating speed `at`, and the numbers of the jams beside the highest."""
+    dots, numbers = [], []
+    for i, share, name, filled in crossed:
+        heights = [panel.at(at, float(np.interp(share, [0, 1], values[i : i + 2])))[1] for values in curves]
+        shown = [y for y in heights if 0.0 <= y <= TALL]
+        look = {"fc": "black" if filled else "white", "ec": "black", "lw": 1.0, "zorder": 4.0}
+        dots += [dot(panel.at(at, panel.y[0])[0], y, look) for y in shown]
+        numbers += [(max(shown) / TALL, name)] if shown else []
+    look = {"fontsize": "small", "fontweight": "bold", "bbox": {"fc": "white"}}
+    x = panel.at(at, panel.y[0])[0] + 0.1
+    return dots, [Text(x, TALL * share, name, look) for share, name in join_names(sorted(numbers))]

@@ -11,38 +11,81 @@ def _():
 
     import marimo as mo
 
+    from jaxvib.errors import InputError
     from jaxvib.explore import pictures
     from jaxvib.explore.serve import served_path
-    from jaxvib.explore.sliders import scene_at, sliders_of
+    from jaxvib.explore.sliders import scene_at, sliders_of, typed_value
     from jaxvib.machine.files import load_scene
 
-    return html, load_scene, mo, pictures, scene_at, served_path, sliders_of
+    return InputError, html, load_scene, mo, pictures, scene_at, served_path, sliders_of, typed_value
 
 
 @app.cell
 def _(load_scene, mo, served_path, sliders_of):
     path = served_path()
     scene = load_scene(path)
-    controls = mo.ui.dictionary(
-        {
-            each.name: mo.ui.slider(
-                steps=list(each.steps), value=each.start, label=each.title, show_value=True, full_width=True
-            )
-            for each in sliders_of(scene)
-        }
-    )
-    return controls, path, scene
+    sliders = {each.title: each for each in sliders_of(scene)}
+    # The sliders begin at these values. A move of a slider changes `current` only, so that the sliders are not built anew.
+    starts, set_starts = mo.state({each.name: each.start for each in sliders.values()})
+    current = {}
+    problem, set_problem = mo.state("")
+    return current, path, problem, scene, set_problem, set_starts, sliders, starts
 
 
 @app.cell
-def _(controls, html, mo, path):
+def _(InputError, current, html, mo, path, scene, set_problem, set_starts, sliders, typed_value):
+    def put(typed):
+        try:
+            slider = sliders[typed["name"]]
+            set_starts({**current, slider.name: typed_value(scene, slider, typed["value"])})
+            set_problem("")
+        except InputError as error:
+            set_problem(str(error))
+
+    names = mo.ui.dropdown(
+        list(sliders), value=next(iter(sliders)), allow_select_none=False, label="set a slider to a number", full_width=True
+    )
+    value = mo.ui.text(placeholder="number", full_width=True)
+    field = (
+        mo.md("{name}\n\n{value}").batch(name=names, value=value).form(submit_button_label="Set", bordered=False, on_change=put)
+    )
     # The file name is escaped because it may contain HTML.
-    mo.sidebar([mo.Html(f"<b>{html.escape(path.name)}</b>"), mo.vstack(list(controls.elements.values()))], width="22rem")
+    mo.sidebar([mo.Html(f"<b>{html.escape(path.name)}</b>"), field], width="22rem")
     return
 
 
 @app.cell
-def _(controls, pictures, scene, scene_at):
+def _(mo, sliders, starts):
+    controls = mo.ui.dictionary(
+        {
+            each.name: mo.ui.slider(
+                steps=sorted({*each.steps, starts()[each.name]}),
+                value=starts()[each.name],
+                label=each.title,
+                show_value=True,
+                full_width=True,
+            )
+            for each in sliders.values()
+        }
+    )
+    return (controls,)
+
+
+@app.cell
+def _(html, mo, problem):
+    mo.sidebar(mo.Html(f"<p>{html.escape(problem())}</p>"), width="22rem")
+    return
+
+
+@app.cell
+def _(controls, mo):
+    mo.sidebar([mo.vstack(list(controls.elements.values()))], width="22rem")
+    return
+
+
+@app.cell
+def _(controls, current, pictures, scene, scene_at):
+    current.update(controls.value)
     machine = pictures.scene_or_problem(lambda: scene_at(scene, controls.value))
     return (machine,)
 

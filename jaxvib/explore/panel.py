@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from jaxvib.draw.machine.parts import Part, Text, box, circle
 from jaxvib.draw.style import GUIDE, Look, log_places
 
-WIDE, TALL, FIRST, APART, LAST = 6.3, 3.6, 0.75, 1.1, 0.25
+WIDE, TALL, FIRST, APART, LAST = 4.2, 3.6, 0.75, 1.1, 0.25
 """Width and height of a panel; space to the left of the first panel, between two panels and to the right of the last one; in
 units of the drawing."""
 
@@ -27,8 +27,8 @@ _MAX_TICKS = 5
 _MIN_POINT_DISTANCE = 0.03
 """Minimum distance between two points of a line, in units of the drawing: about two pixels. Nearer points are omitted."""
 
-_COLUMNS = (0.05, 1.9, 4.6)
-"""Positions of the left ends of the columns of the legend."""
+_COLUMNS = ((0.05, 1.6, 3.5), (8.3, 9.6, 10.9, 12.2))
+"""Positions of the left ends of the columns of the legend, for each of its two groups."""
 
 _GRID = {"color": "#e2e2e2", "lw": 0.6, "zorder": 0.5}
 
@@ -112,14 +112,16 @@ def dot(x: float, y: float, look: Look, square: bool = False) -> Part:
     return Part(outline, look, filled=True)
 
 
-def legend(looks: Mapping[str, Look]) -> tuple[list[Part], list[Text]]:
+def legend(groups: Sequence[Mapping[str, Look]]) -> tuple[list[Part], list[Text]]:
     """Return the legend above the charts, with two entries in a column: samples of lines and dots with their names.
 
-    A style with a fill colour ("fc") is drawn as a dot, other styles as a line.
+    A style with a fill colour ("fc") is drawn as a dot, other styles as a line. Each of `groups` begins a column, the second
+    one above the second chart or to the right of it.
     """
     parts, texts = [], []
-    for k, (name, look) in enumerate(looks.items()):
-        x, y = _COLUMNS[k // 2], TALL + (0.95, 0.68)[k % 2]
-        parts.append(dot(x + 0.2, y, look) if "fc" in look else Part(np.array([[x, y], [x + 0.4, y]]), look))
-        texts.append(Text(x + 0.5, y, name, {"fontsize": "small"}))
+    for columns, looks in zip(_COLUMNS, groups, strict=False):
+        for k, (name, look) in enumerate(looks.items()):
+            x, y = columns[k // 2], TALL + (0.95, 0.68)[k % 2]
+            parts.append(dot(x + 0.2, y, look) if "fc" in look else Part(np.array([[x, y], [x + 0.4, y]]), look))
+            texts.append(Text(x + 0.5, y, name, {"fontsize": "small"}))
     return parts, texts

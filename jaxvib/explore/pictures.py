@@ -23,9 +23,9 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.whirl import critical_speeds, whirl
 
 ABOUT = """The sliders of masses, springs, dampers, radii and drags range from a tenth to ten times the value in the file. The
-arrow keys move a slider by one step. Each number of loads needs its own compiled program. The programs for the seven numbers
-next to the number in the file are compiled while the page is open; any other takes one or two seconds the first time and is
-then stored.
+arrow keys move a slider by one step; the field above the sliders sets one to a number. Each number of loads needs its own
+compiled program. The programs for the seven numbers next to the number in the file are compiled while the page is open; any
+other takes one or two seconds the first time and is then stored.
 
 Amplitudes and forces are zero to peak. The page shows the theory of light loads. For exact results, save the machine and run
 `jaxvib simulate` or `jaxvib modes --exact`."""
@@ -129,9 +129,9 @@ def heading(scene: Scene) -> str:
     """Return the heading of `diagram` for this scene, with a reference to other results."""
     if has_branches(scene):
         return (
-            "Jams of light loads: load speed and foundation force over the rotor speed. Solid lines: stable by slope, for "
-            "loads that stay together; dashed lines: unstable. The numbers on the vertical line of the operating speed are "
-            "those of the jam modes at this rotor speed."
+            "Jams of light loads: load speed, amplitudes and foundation force over the rotor speed. Solid lines: stable by "
+            "slope, for loads that stay together; dashed lines: unstable. The numbers on the vertical line of the operating "
+            "speed are those of the jam modes at this rotor speed."
         )
     return (
         "Whirl speeds of the rotor over the rotor speed (Campbell diagram), with the masses of the loads fixed to the rotor, "
@@ -141,7 +141,8 @@ def heading(scene: Scene) -> str:
 
 
 def diagram(scene: Scene, max_speed: float) -> str:
-    """Draw the branch diagram with the force chart for a machine that moves up and down, or the Campbell diagram of a rotor.
+    """Draw the branch diagram, with amplitudes and force, of a machine that moves up and down, or the Campbell diagram of a
+    rotor.
 
     **Arguments**: `max_speed`: the highest rotor speed in the diagram, rad/s; the diagram always reaches at least 1.15 times
     the rotor speed of the scene.

@@ -15,6 +15,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers
 from jaxvib.machine.scene import Scene
+from jaxvib.units.reading import to_float
 
 COUNT = "loads.count"
 """Name of the slider that changes the number of loads."""
@@ -65,6 +66,8 @@ def sliders_of(scene: Scene) -> list[Slider]:
 
     A parameter that is 0 has no slider, because a factor does not change it.
 
+    **Raises** `InputError` for a scene with several exciters, with an unbalance, or with a clockwise rotor.
+
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),
     ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("600 rpm"))
@@ -73,6 +76,12 @@ def sliders_of(scene: Scene) -> list[Slider]:
     >>> sliders_of(scene)[-2].title, sliders_of(scene)[-2].start
     ('stiffness of the support, N/mm', 40.0)
     """
+    if not scene.is_plain:
+        raise InputError(
+            "scene",
+            "has several exciters, an unbalance or a clockwise rotor; the explorer shows machines with one anticlockwise "
+            "exciter that has loads (balls, rollers or pendulums); for others use jaxvib regimes, response, run-up or simulate",
+        )
     sliders = [_slider(scene, find_number(scene, "drive.speed", "slider"), _SPEED_FACTORS)]
     if _has_equal_loads(scene):
         counts = tuple(range(1, min(256, max(8, 2 * scene.loads.count)) + 1))
@@ -112,6 +121,35 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
         return scene
     changed = dataclasses.replace(scene.loads, count=loads.count)
     return scene.replace(loads=rebuild_part(changed, "loads"))
+
+
+def typed_value(scene: Scene, slider: Slider, text: str) -> float:
+    """Return the value of the slider that a user typed: a number in the unit of the slider, or with a unit of its own.
+
+    **Raises** `InputError` for a text that is not such a number, and for a value outside the range of the slider.
+
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("600 rpm"))
+    >>> speed = sliders_of(scene)[0]
+    >>> typed_value(scene, speed, "725"), round(typed_value(scene, speed, "12 Hz"), 6)
+    (725.0, 720.0)
+    """
+    text = text.strip()
+    try:
+        value = float(text)
+    except ValueError:
+        unit = slider.number.unit if slider.number is not None and slider.unit else ""
+        value = float(np.asarray(to_float(text, unit, slider.label)))
+        if unit and slider.number is not None:
+            value = float(f"{value * slider.start / float(slider.number.read(scene)[0]):.12g}")
+    low, high = slider.steps[0], slider.steps[-1]
+    if not low <= value <= high:
+        unit = f" {slider.unit}" if slider.unit else ""
+        raise InputError(slider.label, f"is {value:.6g}{unit}; the slider is from {low:g} to {high:g}{unit}")
+    if slider.number is None and value not in slider.steps:
+        raise InputError(slider.label, f"is {value:g}; it must be a whole number")
+    return value
 
 
 def _is_adjustable(scene: Scene, name: str) -> bool:

@@ -14,12 +14,13 @@ from scenes import TWO_MASS
 import jaxvib as jv
 from jaxvib.cli.app import run
 from jaxvib.draw import whirl
+from jaxvib.draw.style import COLORS
 from jaxvib.explore import pictures, serve
 from jaxvib.explore.campbell import _SENSE_STYLES
 from jaxvib.explore.panel import TALL, WIDE, Panel
 from jaxvib.explore.pictures import SceneOrProblem, scene_or_problem
-from jaxvib.explore.sliders import COUNT, scene_at, sliders_of
-from jaxvib.machine.files import TEMPLATES
+from jaxvib.explore.sliders import COUNT, scene_at, sliders_of, typed_value
+from jaxvib.machine.files import SCREENS, TEMPLATES
 from jaxvib.show.moving import moving_svg
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -68,6 +69,41 @@ def test_each_slider_moves_its_number_alone():
         scene_at(scene, {COUNT: 256})
     with pytest.raises(jv.InputError, match=r"machine\.mass is not a slider of this scene; the sliders are: drive\.speed"):
         scene_at(scene, {"machine.mass": 3.0})  # one slider for each platform
+
+
+def test_a_typed_number_has_the_unit_of_its_slider(two_platforms):
+    sliders = {each.name: each for each in sliders_of(two_platforms)}
+    spring = sliders["machine.stiffness[0]"]
+    assert (spring.unit, typed_value(two_platforms, spring, " 43.7 ")) == ("N/mm", 43.7)
+    assert typed_value(two_platforms, spring, "0.0437 kN/mm") == pytest.approx(43.7, rel=1e-12)
+    assert typed_value(two_platforms, sliders["drive.speed"], "20 Hz") == 1200.0
+    assert typed_value(two_platforms, sliders[COUNT], "5") == 5.0
+    moved = scene_at(two_platforms, {spring.name: 43.7, COUNT: 5.0})
+    assert float(moved.machine.stiffness[0]) == pytest.approx(43700.0, rel=1e-15) and moved.loads.count == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("machine.stiffness[0]", "501", r"stiffness of support 1 is 501 N/mm; the slider is from 5 to 500 N/mm"),
+        ("machine.stiffness[0]", "nan", r"is nan N/mm; the slider is from 5 to 500 N/mm"),
+        ("machine.stiffness[0]", "43,7", r"with a comma"),
+        ("machine.stiffness[0]", "43 kg", r"is '43 kg', which is not in N/m"),
+        ("machine.stiffness[0]", "", r"is '', which is not in N/m"),
+        (COUNT, "2.5", r"number of loads is 2.5; it must be a whole number"),
+        (COUNT, "3 kg", r"number of loads is '3 kg', which is not a plain number"),
+    ],
+)
+def test_a_typed_text_that_does_not_fit_is_refused(two_platforms, name, text, message):
+    slider = {each.name: each for each in sliders_of(two_platforms)}[name]
+    with pytest.raises(jv.InputError, match=message):
+        typed_value(two_platforms, slider, text)
+
+
+@pytest.mark.parametrize("kind", SCREENS)
+def test_the_explorer_refuses_machines_without_loads(kind):
+    with pytest.raises(jv.InputError, match="for others use jaxvib regimes, response"):
+        sliders_of(jv.scene_from_toml(SCREENS[kind]))
 
 
 def test_what_no_factor_can_move_has_no_slider():
@@ -163,6 +199,21 @@ def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
     assert float(again.machine.stiffness[0]) == 2e5
 
 
+def test_the_page_sets_a_slider_to_a_typed_number(one_mass, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXVIB_EXPLORE", str(jv.save_scene(one_mass, tmp_path / "machine.toml")))
+    from jaxvib.explore.page import app
+
+    _, found = app.run()
+    before = found["starts"]()
+    found["put"]({"name": "stiffness of the support, N/mm", "value": "9000"})
+    assert found["problem"]() == "stiffness of the support is 9000 N/mm; the slider is from 5 to 500 N/mm"
+    assert found["starts"]() == before
+    found["current"]["loads.mass"] = 1000.0  # a slider that was moved keeps its place
+    found["put"]({"name": "stiffness of the support, N/mm", "value": "43.7"})
+    assert found["problem"]() == ""
+    assert found["starts"]() == {**before, "machine.stiffness[0]": 43.7, "loads.mass": 1000.0}
+
+
 def _texts(drawn):
     """The texts of a picture: where each stands, what it says, its element."""
     return [(float(t.get("x")), float(t.get("y")), t.text, e) for e in drawn.iter(f"{SVG}text") for t in e.iter(f"{SVG}tspan")]
@@ -199,14 +250,21 @@ def test_the_charts_lines_are_the_branches(kind):
     spans = _texts(drawn)
     wide, tall = float(drawn.get("width")), float(drawn.get("height"))
     assert all(0.0 <= x < wide and 0.0 < y < tall for x, y, _, _ in spans)  # the legend too
-    titles = {text: x for x, _, text, _ in spans if text in ("load speed, rpm", "foundation force, N, zero to peak")}
-    middle = titles["foundation force, N, zero to peak"]
-    for right, values, log in ((False, RPM * found.omega, False), (True, found.foundation_force, True)):
-        across, up = _axes([span for span in spans if (span[0] > middle - 1.0) == right], log)
-        lines = [line for line, _ in _lines(drawn, "#004488")]
-        points = np.concatenate([line for line in lines if (line[0, 0] > middle - 1.0) == right])
-        assert len(points) > 200
-        heights = np.log(np.maximum(values, 1e-300)) if log else values
+    starts = [x for x, _, text, _ in spans if text and text.endswith((", rpm", ", zero to peak")) and text[0] in "laf"]
+    assert len(starts) == 3
+
+    def panel(x):
+        return int(np.searchsorted(starts, x + 1.0)) - 1
+
+    names = found.scene.machine.structure().coordinates
+    curves = [(0, "#004488", RPM * found.omega), (2, "#004488", found.foundation_force)]
+    curves += [(1, color, 1e3 * found.amplitude[:, k]) for k, color in zip(range(len(names)), COLORS, strict=False)]
+    for number, color, values in curves:
+        across, up = _axes([span for span in spans if panel(span[0]) == number], number > 0)
+        lines = [line for line, _ in _lines(drawn, color) if panel(line[0, 0]) == number]
+        points = np.concatenate([line for line in lines if len(line) > 2])  # the legend has two points
+        assert len(points) > 150
+        heights = np.log(np.maximum(values, 1e-300)) if number else values
         there = np.stack([found.rotor_speed * RPM / across[0], heights / up[0]], axis=1)  # in dots
         line = np.stack([np.polyval(across, points[:, 0]) / across[0], np.polyval(up, points[:, 1]) / up[0]], axis=1)
         a, b = there[:-1], there[1:]
@@ -214,17 +272,33 @@ def test_the_charts_lines_are_the_branches(kind):
             share = np.clip(((line[:, None] - a) * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1), 0.0, 1.0)
             away = np.nanmin(np.hypot(*np.moveaxis(line[:, None] - a - share[..., None] * (b - a), -1, 0)), axis=1)
         assert np.max(away) < 0.5
-    modes = jv.jam_modes(scene).mode_numbers()
-    told = [int(number) for _, _, text, e in spans if e.get("font-weight") == "bold" for number in text.split(", ")]
-    assert sorted(told) == sorted(2 * modes)
+    assert set(names) <= {text for *_, text, _ in spans}
     jams = jv.jam_modes(scene)
-    for right, height_of, log in ((False, lambda jam: RPM * jam.omega, False), (True, lambda jam: jam.foundation_force, True)):
-        up = _axes([span for span in spans if (span[0] > middle - 1.0) == right], log)[1]
+    told = [int(number) for _, _, text, e in spans if e.get("font-weight") == "bold" for number in text.split(", ")]
+    assert sorted(told) == sorted(3 * jams.mode_numbers())
+    heights = (lambda jam: RPM * jam.omega, lambda jam: 1e3 * np.max(jam.amplitude), lambda jam: jam.foundation_force)
+    for number, height_of in enumerate(heights):
+        up = _axes([span for span in spans if panel(span[0]) == number], number > 0)[1]
         for x, y, text, e in spans:
-            if (x > middle - 1.0) == right and e.get("font-weight") == "bold" and "," not in text:
+            if panel(x) == number and e.get("font-weight") == "bold" and "," not in text:
                 height = float(height_of(jams.select(int(text))))
                 level = np.polyval(up, y - 0.35 * 11.5)
-                assert level == pytest.approx(np.log(height) if log else height, abs=2.0 * abs(up[0]))
+                assert level == pytest.approx(np.log(height) if number else height, abs=2.0 * abs(up[0]))
+
+
+def test_many_platforms_share_one_curve_of_amplitudes():
+    n = len(COLORS) + 1
+    machine = jv.network(
+        mass=[5.0] * n,
+        stiffness=[1e4] * n,
+        damping=[5.0] * n,
+        links=[(k, k + 1) for k in range(1, n)],
+        link_stiffness=[1e4] * (n - 1),
+        link_damping=[1.0] * (n - 1),
+        exciter=n,
+    )
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(150.0))
+    assert "largest of 9" in pictures.diagram(scene, 200.0)
 
 
 @pytest.mark.parametrize("kind", ["rotor", "planar_rotor"])
