@@ -250,7 +250,8 @@ def test_the_charts_lines_are_the_branches(kind):
     spans = _texts(drawn)
     wide, tall = float(drawn.get("width")), float(drawn.get("height"))
     assert all(0.0 <= x < wide and 0.0 < y < tall for x, y, _, _ in spans)  # the legend too
-    starts = [x for x, _, text, _ in spans if text and text.endswith((", rpm", ", zero to peak")) and text[0] in "laf"]
+    titles = ("load speed, rpm", "amplitude, mm, zero to peak", "foundation force, N, zero to peak")
+    starts = [x for x, _, text, _ in spans if text in titles]
     assert len(starts) == 3
 
     def panel(x):
