@@ -11,6 +11,7 @@ import pytest
 import jaxvib as jv
 from jaxvib.display import shown_unit
 from jaxvib.units import count, in_own_unit, known_number, number, numbers, to_float, unit_ratio
+from jaxvib.units.columns import unit_factor
 from jaxvib.units.reading import _FACTORS
 
 
@@ -218,6 +219,39 @@ def test_a_text_has_its_own_unit_in_si():
     for text in ("", "3 nonsense", "3,4 mm", "nan", "1 " + "m" * 10**6):
         with pytest.raises(jv.InputError, match=r"^x is "):
             in_own_unit(text, "x")
+
+
+@pytest.mark.parametrize(
+    ("text", "beside", "expected"),
+    [
+        ("600 min^-1", "", (20 * np.pi, "radian / second")),
+        ("600 min^-1", "m", (20 * np.pi, "radian / second")),
+        ("600 1/min", "rad/s", (20 * np.pi, "rad/s")),
+        ("600 1/min", "Hz", (10.0, "Hz")),
+        ("1200 rpm", "Hz", (20.0, "Hz")),
+        ("180 1/min", "1/s", (3.0, "1/s")),
+        ("3 1/s", "1/s", (3.0, "1/s")),
+        ("3 1/s", "", (3.0, "1 / second")),
+        ("3 rad/s", "1/s", (3.0, "radian / second")),
+        (pint.Quantity(600.0, "1/min"), "rad/s", (20 * np.pi, "rad/s")),
+    ],
+)
+def test_a_text_per_time_counts_as_its_neighbour(text, beside, expected):
+    value, unit = in_own_unit(text, "x", beside)
+    np.testing.assert_allclose(value, expected[0], rtol=1e-14)
+    assert unit == expected[1]
+
+
+def test_a_text_beside_a_speed_must_say_what_it_counts():
+    with pytest.raises(jv.InputError, match=r"does not state radians or revolutions"):
+        in_own_unit("10 1/s", "x", "rad/s")
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("cps", 2 * np.pi), ("U/min", np.pi / 30), ("min^-1", np.pi / 30), ("1/s", None), ("s^-1", None)]
+)
+def test_a_column_of_speeds_must_say_what_it_counts(unit, factor):
+    assert unit_factor(unit, "rad/s") == (None if factor is None else pytest.approx(factor, rel=1e-15))
 
 
 def test_hertz_count_as_turns_in_every_power():

@@ -42,7 +42,7 @@ _SPELLINGS: dict[str, dict[str, float]] = {
     "rad/s": {
         **dict.fromkeys(("rad/s", "rads"), 1.0),
         **dict.fromkeys(("rpm", "1/min", "r/min", "u/min", "rev/min", "min^-1", "min-1"), np.pi / 30.0),
-        **dict.fromkeys(("hz", "rps", "rev/s", "1/s"), 2.0 * np.pi),
+        **dict.fromkeys(("hz", "cps", "rps", "rev/s"), 2.0 * np.pi),
         "deg/s": np.pi / 180.0,
     },
     "N m": {**dict.fromkeys(("nm", "n m", "n*m", "n.m", "n·m"), 1.0), "knm": 1e3},

@@ -251,10 +251,14 @@ def unit_ratio(one: str, other: str) -> float | None:
         return None
 
 
-def in_own_unit(value: str | Quantity, field: str) -> tuple[float, str]:
+def in_own_unit(value: str | Quantity, field: str, beside: str = "") -> tuple[float, str]:
     """Return the magnitude in SI and the SI unit of a string or a pint quantity of any dimension; Hz is converted to rad/s.
 
-    A plain number has the unit "". **Raises** `InputError` for other strings and for values that are not finite.
+    A plain number has the unit "". A speed is converted to the unit `beside` of the other operand of a ratio if that is a
+    speed. A value in 1/s or 1/min states neither radians nor revolutions: it is converted to `beside` if that is a speed or a
+    rate; otherwise 1/min is rpm.
+
+    **Raises** `InputError` for other strings, for values that are not finite, and for 1/s beside a speed in rad/s.
 
     >>> in_own_unit("2 mm", "limit")
     (0.002, 'meter')
@@ -269,7 +273,14 @@ def in_own_unit(value: str | Quantity, field: str) -> tuple[float, str]:
         given = _quantity(float(parts[1]), (parts[2] + parts[3]).strip(), value, None, field)
     require_real(given.m, "", field)
     try:
-        _, _, hertz = _exponents(pint.get_application_registry().Unit(str(given.units)))
+        units = pint.get_application_registry().Unit(str(given.units))
+        rest, angle, hertz = _exponents(units)
+        if rest == {"second": -1.0}:
+            other, *turns = _exponents(_parsed(beside))
+            if other == rest and (any(turns) or not (angle or hertz)):
+                return _finite(to_float(value, beside, field), field), beside
+            if units == pint.get_application_registry().Unit("1/min"):
+                given = pint.get_application_registry().Quantity(given.m, "rpm")
         given = given.to_base_units() * pint.get_application_registry().Quantity(2.0 * math.pi, "rad") ** hertz
         magnitude = _finite(given.m, field)
     except (pint.PintError, *_UNREADABLE) as error:

@@ -347,12 +347,14 @@ def _constant(value: float, unit: str) -> Combined:
     return Combined(f"{value:.6g} {unit}".strip(), unit, operation="constant", constant=value)
 
 
-def _with_unit(value: Operand, name: str) -> Quantity:
-    """Return a value as a quantity. A number has no unit; a string such as "2 mm" is converted to SI with its own unit."""
+def _with_unit(value: Operand, name: str, beside: Operand = "") -> Quantity:
+    """Return a value as a quantity. A number has no unit; a string such as "2 mm" is converted to SI with its own unit, or with
+    that of the other operand `beside` of a ratio if both are per time."""
     if isinstance(value, Quantity):
         return value
     if isinstance(value, (str, UnitQuantity)):
-        magnitude, unit = in_own_unit(value, f"the value combined with {name}")
+        other = beside.unit if isinstance(beside, Quantity) else ""
+        magnitude, unit = in_own_unit(value, f"the value combined with {name}", other)
         return replace(_constant(magnitude, unit), name=str(value).strip())
     return _constant(number_in(value, "", f"the value combined with {name}"), "")
 
@@ -396,7 +398,7 @@ def _product(one: Operand, other: Operand) -> Quantity:
 
 
 def _ratio(one: Operand, other: Operand) -> Quantity:
-    left, right = _with_unit(one, "a quantity"), _with_unit(other, "a quantity")
+    left, right = _with_unit(one, "a quantity", other), _with_unit(other, "a quantity", one)
     below = f"({right.unit})" if any(c in right.unit for c in " /*") else right.unit
     unit = "" if same_unit(left.unit, right.unit) else left.unit if not right.unit else f"{left.unit or '1'}/{below}"
     return _combine("/", f"{_bracketed(left)} / {_bracketed(right)}", unit, left, right)

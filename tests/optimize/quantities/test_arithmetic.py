@@ -212,6 +212,17 @@ def test_power_of_a_quantity_has_the_power_of_its_unit():
     assert (STIFFNESS**2).unit == "(N/m)**2" and (share**2).unit == ""
 
 
+@pytest.mark.parametrize("text", ["600 min^-1", "600 rpm", "10 Hz"])
+def test_ratios_with_a_speed_count_revolutions(text):
+    speed = Quantity("speed", "rad/s", lambda s: s.drive.speed)
+    turns = Quantity("turns", "Hz", lambda s: s.drive.speed / (2 * np.pi))
+    for ratio in (speed / text, turns / text, 1.0 / (text / speed)):
+        assert ratio.unit == ""
+        np.testing.assert_allclose(ratio(SCENE), SCENE.drive.speed / (20 * np.pi), rtol=1e-14)
+    with pytest.raises(jv.InputError, match="does not state radians or revolutions"):
+        speed / "10 1/s"
+
+
 def test_arithmetic_keeps_the_platforms_of_a_phase():
     for made in (phase(mode=3, of=(2, 1)), -phase(mode=3, of=(2, 1)), 2.0 * phase(mode=3, of=(2, 1))):
         assert made.of == (2, 1)

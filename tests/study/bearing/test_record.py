@@ -92,6 +92,15 @@ def test_long_texts_are_no_units(monkeypatch):
     assert columns.unit_factor("m" * 100, "rad") is None and columns.unit_factor("2 " + "m" * 100_000, "rad") is None
 
 
+@pytest.mark.parametrize("unit", ["m" * 100_000, "1 " + "m" * 100_000])
+def test_long_texts_as_unit_of_a_record_are_refused(tmp_path, unit):
+    path = tmp_path / "swing.csv"
+    path.write_text(table(""))
+    with pytest.raises(jv.InputError) as error:
+        jv.read_record(path, angle_unit=unit)
+    assert "not a unit of angle" in str(error.value) and len(str(error.value)) < 500
+
+
 def test_wrong_records(tmp_path):
     t = np.arange(20.0)
     wrong = [
