@@ -64,7 +64,8 @@ class Growth(Result):
     **Attributes**
 
     - `status`: a `GrowthStatus`
-    - `exponent`: the largest Lyapunov exponent, 1/s, and its standard error `uncertainty`, over the later half of the stretches
+    - `exponent`: the largest Lyapunov exponent, 1/s, over the later half of the stretches, and its `uncertainty`: the standard
+      error, or half of the change of the rate between the quarters of this half if that is larger
     - `horizon`: the time, s, after which rounding errors have grown to the size of the motion itself, ln(1/eps)/exponent. A
       derivative with respect to a parameter has then grown by 1/eps, and predicts nothing about a change that is larger than
       rounding. The horizon is infinite for a regular motion; for an undecided one it is a lower bound,
@@ -181,7 +182,8 @@ def growth(
         state, difference = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, neighbour_end)
         neighbour = _at_distance(state, jax.tree.map(jnp.add, state, difference), scale, separation)
     late = np.array(rates[stretches // 2 :])
-    exponent, uncertainty = float(np.mean(late)), _sum_error(late) / late.size
+    exponent, change = float(np.mean(late)), float(np.subtract(*map(np.mean, np.split(late, [late.size // 2]))))
+    uncertainty = max(_sum_error(late) / late.size, 0.5 * abs(change))
     name = _classify_growth(late * stretch)
     if name == "chaotic" and all(_has_returned(scene, quarter, steps) for quarter in quarters):
         name = "unstable"

@@ -97,6 +97,8 @@ def test_growth_in_proportion_to_time_is_regular():
     found = jv.growth(scene, 40.0, start=start)
     assert found.status_name == "regular" and found.exponent > 3.0 * found.uncertainty
     np.testing.assert_allclose(np.sum(found.rates[20:]) * found.time[0], np.log(2.0), rtol=0.05)
+    quarter = found.time[-1] / 4  # the rate falls from ln(3/2) to ln(4/3) in the quarters of the later half
+    np.testing.assert_allclose(found.uncertainty, 0.5 * np.log(9 / 8) / quarter, rtol=0.05)
 
 
 @pytest.mark.parametrize(
