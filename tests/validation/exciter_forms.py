@@ -284,7 +284,12 @@ FORMS = (
         of(lambda: circular(on_circle(0.9), 3e3, 300.0, stable=False, away=1e-3)),
         (2e-14, 2e-14, 0.0),
     ),
-    ClosedForm("4: the same, light rotors, M l^2 = 9 J", "least Lambda, but unstable", of(light_rotors), (2e-14, 2e-14, 0.0)),
+    ClosedForm(
+        f"4: {TRIANGLE}, in phase, light rotors, M l^2 = 9 J",
+        "least Lambda, but unstable",
+        of(light_rotors),
+        (2e-14, 2e-14, 0.0),
+    ),
     ClosedForm(f"4: {LINE}, above the resonances", "the middle one opposes", of(middle_opposes), (0.01, 0.01, 0.01)),
     ClosedForm(
         f"4: {LINE}, below all resonances",

@@ -140,7 +140,7 @@ CASES = (
     ),
     run_case(
         "one load",
-        hard="none: the next cases are compared with this one",
+        hard="none: it stands beside `1000 loads`, which has the same total mass",
         scene=lambda: published(eps=0.05),
         answer=_RUN,
         reference=_RUN_AGAIN,

@@ -139,7 +139,7 @@ CASES = (
     jam_case(
         "damping 1e-8 of critical",
         hard="peaks of relative width 1e-8 and height 1e8 lie between the points of any uniform grid",
-        against="roots of n(Omega) between points that approach the resonances to 1e-15",
+        against="roots of n(Omega) - n between points that approach the resonances to 1e-15",
         scene=lambda: published(damping=1e-8),
     ),
     jam_case(

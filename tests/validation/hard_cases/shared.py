@@ -57,7 +57,7 @@ def _mode_speeds_again(scene: Scene) -> Reference:
 jam_case = partial(
     Case,
     quantity="load speeds of all jam modes",
-    against="roots of n(Omega) by Brent's method",
+    against="roots of n(Omega) - n by Brent's method",
     answer=_mode_speeds,
     reference=_mode_speeds_again,
     within=(1e-9, 1e-3),
