@@ -66,7 +66,10 @@ SCENES: dict[str, tuple[str, Callable[[], jv.Cost]]] = {
         lambda: jv.work_precision(published_rotor(9.2e-4, "uncoupled"), until=6.0, tolerances=COARSE),
     ),
     "friction": ("jam with dry bearing friction", lambda: jv.work_precision(dry_friction(), mode=1, tolerances=COARSE)),
-    "gradient": ("two-mass jam, with respect to its support stiffnesses", lambda: jv.work_precision(jam(), "gradient", mode=3)),
+    "gradient": (
+        "two-mass jam, largest amplitude, with respect to the stiffnesses",
+        lambda: jv.work_precision(jam(), "gradient", mode=3),
+    ),
 }
 
 
