@@ -112,7 +112,8 @@ def _cost_panel(axes: Axes, panel: CostPanel, error_levels: Sequence[float], loo
 def convergence_chart(
     harmonics: np.ndarray, error: np.ndarray, estimate: np.ndarray, *, names: Sequence[str], ax: Axes | None = None
 ) -> Drawn:
-    """Draw errors (n, w) over the highest harmonic (n,) on a log scale; the dashed lines are estimates of the errors (n, w)."""
+    """Draw errors (n, w) for w load speeds over the highest harmonic (n,) on a log scale; the dashed lines are estimates of the
+    errors (n, w)."""
     figure, (axes,) = panels(1, size=(7.0, 4.0), ax=ax)
     floor = np.finfo(float).eps
     for k, (color, name) in enumerate(zip(itertools.cycle(COLORS), names, strict=False)):
@@ -134,7 +135,8 @@ def stability_chart(
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw a band for each value (n,), shaded at the load speeds `omega` (n, P) that are `stable` (n, P).
+    """Draw a band for each `value` (n,) of the varied parameter, shaded at those of its P load speeds `omega` (n, P) that are
+    `stable` (n, P).
 
     `marks` are points (k, 2) of load speed and value by kind. Speeds are in rad/s and drawn in `unit`.
     """
@@ -221,7 +223,8 @@ def steps_chart(
 ) -> Drawn:
     """Draw the relative `difference` (n, k) between central differences and a derivative over the relative `steps` (k,).
 
-    Each of n `names` has a line. On each line a ring marks the `best` step (n,) and the extrapolated difference `at_best` (n,).
+    Each of n `names` has a line. For each line a ring at the `best` step (n,) shows the extrapolated difference `at_best` (n,),
+    which may lie below the line.
     A dotted line marks the tolerance. `route`: mode of the derivative, "forward" or "reverse".
     """
     figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)

@@ -234,8 +234,8 @@ def vector_field(scene: Scene) -> Dynamics:
     """Return the right-hand side of a scene's equations of motion.
 
         M q'' + (C + speed G) q' + K q + sum_j m_j B_j^T (B_j q'' + d^2 p_j/dt^2) = forces of the effects
-        kappa m J^T J u'' + kappa m J^T (dJ/dt) u' + m J^T B_j q'' = Q_u        (J = dp/du, for each load)
-        J_r theta'' = T(theta') - torque of loads and imbalance                  (under a motor)
+        kappa_j m_j J_j^T J_j u_j'' + kappa_j m_j J_j^T (dJ_j/dt) u_j' + m_j J_j^T B_j q'' = Q_u,      J_j = dp_j/du_j
+        I theta'' = T(theta') - torque of loads and imbalance        (under a motor; I: moment of inertia of the rotor)
 
     **Arguments**: `scene`, on any machine, with any drive and effects.
 
@@ -250,8 +250,8 @@ def vector_field(scene: Scene) -> Dynamics:
     143.8746
 
     Source: the general form of all five papers; for platforms the antiphase paper, equation (2), for stations Artyunin 2013,
-    equation (1). The gyroscopic force depends on the rotor speed only. The term of the rotor's acceleration, C theta'' psi / 2,
-    is neglected as by Artyunin.
+    equation (1). The gyroscopic force depends on the rotor speed only. The term of the rotor's acceleration, half the polar
+    moment of inertia times theta'' times the tilt, is neglected as by Artyunin.
     """
     return dataclasses.replace(dynamics_of(assemble(validate_scene(scene))), has_fences=True)
 

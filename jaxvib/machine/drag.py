@@ -63,17 +63,24 @@ def drag_of(
     - `viscosity` eta of the oil at its working temperature, Pa s; typical: 0.05 to 0.5; `density` rho, kg/m^3; typical: 870
     - `mass` m of the load, kg; typical: 0.1 to 1
     - `rolling_lever` f of the rolling friction, m; typical: 1e-5 to 5e-5 for steel on steel
-    - `friction` mu of the bearing; typical: 0.001 to 0.002 for ball and roller bearings, 0.01 to 0.02 for plain bearings;
-      `diameter` d of its bore, m; typical: 0.005 to 0.05
+    - `friction` mu of the bearing, a coefficient without unit; typical: 0.001 to 0.002 for ball and roller bearings, 0.01 to
+      0.02 for plain bearings, for which it depends strongly on the lubrication; `diameter` d of its bore, m; typical: 0.005 to
+      0.05
 
     **Returns** an array with one number, with derivatives.
 
     **Raises** `InputError` for a missing argument, for one that the cause does not use, and outside the range of validity:
 
-    - oil: Re up to 3e5. The ball must be far from walls: in a channel narrower than about five balls the drag is larger
+    - oil: Re up to 3e5
     - rolling: f up to r/10
-    - bearing: open rolling bearings with good lubrication, at about a tenth of their dynamic load rating; d up to R. Seals add
-      their own friction
+    - bearing: d up to R
+
+    Conditions that are not checked:
+
+    - oil: the oil turns with the rotor. The formula is that of a ball far from walls; a ball on its track, and more so in a
+      channel narrower than about five balls, has a larger drag. Measure it
+    - bearing: the values of mu for rolling bearings hold for open bearings with good lubrication, at about a tenth of their
+      dynamic load rating. Seals add their own friction
 
     >>> import jaxvib as jv
     >>> speeds = dict(radius="120 mm", load_speed="780 rpm", rotor_speed="1500 rpm")
@@ -108,16 +115,16 @@ def drag_of(
     arm, (slow, fast) = read(radius, "m", "radius"), (read(speed, "rad/s", name) for name, speed in speeds.items())
     problem = "is {:.6g} rad/s; it must be less than the rotor_speed of {:.6g} rad/s"
     require_if_known(lambda slow, fast: slow < fast, slow, fast, field="load_speed", problem=problem)
-    sliding_speed, acceleration = arm * (fast - slow), arm * slow**2
+    relative_speed, acceleration = arm * (fast - slow), arm * slow**2
     if cause == "oil":
-        return _oil_drag(sliding_speed, value["ball_radius"], value["viscosity"], value["density"])
+        return _oil_drag(relative_speed, value["ball_radius"], value["viscosity"], value["density"])
     if cause == "rolling":
         lever, problem = value["rolling_lever"], "is {:g} m; it must be at most a tenth of the ball_radius of {:g} m"
         require_if_known(lambda k, r: k <= 0.1 * r, lever, value["ball_radius"], field="rolling_lever", problem=problem)
-        return value["mass"] * acceleration * lever / (value["ball_radius"] * sliding_speed)
+        return value["mass"] * acceleration * lever / (value["ball_radius"] * relative_speed)
     problem = "is {:g} m; it must be at most the radius of {:g} m"
     require_if_known(lambda d, r: d <= r, value["diameter"], arm, field="diameter", problem=problem)
-    return 0.5 * value["friction"] * value["mass"] * acceleration * value["diameter"] / (arm * sliding_speed)
+    return 0.5 * value["friction"] * value["mass"] * acceleration * value["diameter"] / (arm * relative_speed)
 
 
 def _oil_drag(speed: Array, r: Array, viscosity: Array, density: Array) -> Array:

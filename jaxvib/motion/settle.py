@@ -35,11 +35,11 @@ _MEAN_STRETCHES = 32
 the lowest natural frequency."""
 
 _MAX_QUARTER_DIFFERENCE = 3.6
-"""Difference between the means of the four quarters of these stretches, in standard errors, that scatter alone exceeds in 5 %
-of cases."""
+"""Range (largest minus smallest) of the means of the four quarters of these stretches, in standard errors of one mean. For one
+quantity and many stretches, scatter alone exceeds it in about 5 % of cases (studentized range)."""
 
 _MAX_DISTANCE_IN_DRIFTS = 10.0
-"""Largest distance of a settled motion from its steady state, in units of the drift."""
+"""Largest distance of a settled motion from its steady state, divided by the limit of the drift."""
 
 _CREEP_STRETCHES = 4
 """Number of stretches that show whether loads creep."""
@@ -49,7 +49,7 @@ _MAX_CREEP_DIFFERENCE = 0.05
 
 _MAX_UNBALANCE_CHANGE_RATIO = 0.01
 """Largest ratio of the change of the residual unbalance and the change of the angles, in rad, of loads that creep along
-balanced arrangements. In any other direction the ratio is at least 1 divided by the number of loads."""
+balanced arrangements. If a single load moves, the ratio is 1 divided by the number of loads."""
 
 _DECREASE_SLOPE = -3.0
 """Slope of the logarithm of the drift, in standard errors, below which the drift is decreasing."""
@@ -72,10 +72,11 @@ def settle(
 
     Two kinds of motion never repeat themselves and count as settled too:
 
-    - `beating`: the vibration of jammed loads beats with that of an imbalance, which turns faster; some motions never become
-      periodic. The last 32 stretches are considered (of 100 periods of the lowest natural frequency; more if stretches are
-      shorter). The motion is steady in the mean if the drift does not decrease, and if the means of amplitudes, force and speed
-      over the four quarters of these stretches differ by no more than their scatter explains, or by half the drift
+    - `beating`: a motion that never becomes periodic but is steady in the mean, for example the vibration of jammed loads that
+      beats with that of an imbalance, which turns faster. The last 32 stretches are considered (of 100 periods of the lowest
+      natural frequency; more if stretches are shorter). The motion is steady in the mean if the drift does not decrease, and if
+      the means of amplitudes, force and speed over the four quarters of these stretches differ by no more than the larger of
+      two limits: what their scatter explains, and half the drift
     - `creeping`: four loads or more, or three with an imbalance, can balance the rotor in infinitely many arrangements
       (`balanced_states`). Small disturbances such as gravity move the loads slowly from one to the next, for hours. The status
       is `creeping` if the loads balance the rotor, free vibrations of the carrier have decayed, and the loads creep evenly
@@ -87,10 +88,10 @@ def settle(
     - `start`, `mode`: as for `simulate`; default: near the jam mode `mode`; without a mode, at rest
     - `separation`: angle between neighbouring loads at a named start, rad; default: as for `simulate`, in a jam 1 degree
     - `drift`: drift below which a motion has settled, see `Measured`; typical: 1e-3 to 1e-8; default: 1e-6, in single precision
-      1e-3. A drift given here must be reached; with the default, motions that beat or creep also count as settled.
-      In addition, the distance of the motion from its steady state must be below ten times the drift, because with little
-      damping a motion changes slowly long before it has settled. The distance is estimated from the slowest decay of the
-      carrier, or from the decrease of the drift
+      1e-3. A drift given here must be reached; with the default, motions that beat or creep also count as settled. In addition,
+      the estimated distance of the motion from its steady state must be below ten times this limit: with little damping a
+      motion that is still far from its steady state changes only slowly. The distance is estimated from the slowest decay of
+      the carrier, or from the decrease of the drift
     - `periods`: approximate length of a stretch, in periods of the lowest natural frequency; typical: 100 (the default)
     - `stretches`: largest number of stretches; typical: 200 (the default); 1 to 3 suffice at damping ratios of 0.05 to 0.01
     - `stepsize_controller`: as for `simulate`, except `Accuracy`; default: `Tolerance(1e-9)`, in single precision 1e-5
@@ -117,7 +118,8 @@ def settle(
     if throw and not has_settled:
         raise ComputationError(
             "not_settled",
-            f"after {stretches} stretches of {periods} slow periods the motion still changes by {float(run.drift):.1e}; "
+            f"after {stretches} stretches of {periods} periods of the lowest natural frequency the motion still changes "
+            f"by {float(run.drift):.1e}; "
             "it may have no steady state at this speed; otherwise allow more stretches or a larger drift",
         )
     if throw and mode is not None:
@@ -228,8 +230,8 @@ def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
 def _slowest_decay(scene: Scene) -> float:
     """Return the smallest decay rate of free vibrations of the carrier with its loads, 1/s; 0 if a vibration does not decay."""
     mass, stiffness, damping = (np.asarray(matrix, float) for matrix in _matrices(scene))
-    flow = np.linalg.solve(mass, -np.concatenate([stiffness, damping], axis=1))
-    poles = np.linalg.eigvals(np.concatenate([np.eye(len(mass), 2 * len(mass), len(mass)), flow]))
+    accelerations = np.linalg.solve(mass, -np.concatenate([stiffness, damping], axis=1))
+    poles = np.linalg.eigvals(np.concatenate([np.eye(len(mass), 2 * len(mass), len(mass)), accelerations]))
     slowest = float(np.min(-poles.real))
     return slowest if slowest > 1e-12 * float(np.max(np.abs(poles))) else 0.0
 
@@ -239,9 +241,9 @@ def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -
 
     A distance that decays at the rate a decreases by the fraction 1 - exp(-a T) during the time T between the two halves of the
     measuring window; this decrease is the drift. Free vibrations that beat with the jam make some drifts small by chance.
-    Therefore the largest of three drifts is used, unless the vibrations decay within a window. The rate a is the slowest
-    `decay` of the carrier; if a vibration does not decay, it is the rate at which the drift decreases from one stretch, of the
-    length `stretch`, to the next.
+    Therefore the largest of the last three drifts is used; fewer suffice if the vibrations decay within a window. The rate a is
+    the slowest `decay` of the carrier; if a vibration does not decay, it is the rate at which the drift decreases from one
+    stretch, of the length `stretch`, to the next.
     """
     half, recent = 0.5 * float(np.ptp(np.asarray(run.window.time))), max(drifts[-3:])
     if decay == 0.0 and len(drifts) >= 6 and recent > 0.0:
@@ -266,11 +268,11 @@ def _steady_in_the_mean(measured: np.ndarray) -> bool:
         return False
     quarters = values.reshape(4, -1, values.shape[1])
     means = quarters.mean(axis=1)
-    separation = means.max(axis=0) - means.min(axis=0)
+    spread = means.max(axis=0) - means.min(axis=0)
     error = np.sqrt(quarters.var(axis=1, ddof=1).mean(axis=0) / quarters.shape[1])
     size = np.abs(means).mean(axis=0)
     size[2:] = size[2:].max()  # a drift is relative to the largest amplitude
-    return bool(np.all(separation <= np.maximum(_MAX_QUARTER_DIFFERENCE * error, 0.5 * np.median(drift) * size)))
+    return bool(np.all(spread <= np.maximum(_MAX_QUARTER_DIFFERENCE * error, 0.5 * np.median(drift) * size)))
 
 
 def _is_creeping(regimes: Sequence[Regime]) -> bool:

@@ -60,8 +60,8 @@ def animate(
 ) -> Film:
     """Return a film of a run or of an exact jam in slow motion, with a clock.
 
-    Platforms, springs, rotor and loads move. Arrows show the forces of the supports on the foundation (black: their sum). The
-    displacements and the force are plotted over time below the machine.
+    Platforms, springs, rotor and loads move. Arrows show the forces of the supports on the foundation (black: total force on
+    the foundation). The displacements and the force are plotted over time below the machine.
 
     **Arguments**
 

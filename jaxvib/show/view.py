@@ -20,7 +20,7 @@ FORCE: Look = {"fc": COLORS[1], "ec": "none", "zorder": 5.0}
 def tie_parts(
     start: tuple[float, float], end: tuple[float, float], stiffness: float, damping: float, length: float = 1.5
 ) -> list[Part]:
-    """Return a spring and a damper side by side. If the stiffness or the damping is 0, this element is omitted.
+    """Return a spring and a damper side by side. An element with the value 0 is omitted.
 
     **Arguments**: `length`: distance of the ends at rest, in units of the drawing.
     """
@@ -42,7 +42,7 @@ def spring_text(stiffness: float, damping: float) -> str:
 
 
 class View(abc.ABC):
-    """Drawing of a scene in units of the drawing.
+    """Drawing of a scene. Its lengths are in arbitrary units (units of the drawing).
 
     **Attributes**: `limits` (left, right, bottom, top) of the drawing; `scale`: units of the drawing per metre.
     """
@@ -89,7 +89,7 @@ class View(abc.ABC):
     def support_forces(self, pose: Pose) -> np.ndarray:
         """Return the force of each support on the foundation, (supports, 2) N: the horizontal and the upward component.
 
-        Supports that are effects are not included.
+        Nonlinear supports and stops, which are effects (`SupportForce`), are not included.
         """
 
     def arrows(self, pose: Pose, total: np.ndarray, per_newton: float) -> list[Part]:
@@ -112,7 +112,7 @@ class View(abc.ABC):
         ]
 
 
-ARROWS_NOTE = "arrows: forces of the supports on the foundation (black: their sum)"
+ARROWS_NOTE = "arrows: forces of the supports on the foundation (black: total force on the foundation)"
 """Meaning of the arrows, written below films."""
 
 

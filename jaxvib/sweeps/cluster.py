@@ -27,13 +27,14 @@ _STUDIES: dict[str, Study] = {}
 def on_a_cluster(
     study: Study, todo: Iterable[int], *, workers: int | None, scheduler: str | None, timeout: Number
 ) -> Generator[tuple[int, Chunk], None, None]:
-    """Compute chunks by workers, and yield the number and the results of each finished chunk. Only the calling process writes.
+    """Compute chunks by workers, and yield the number and the results of each finished chunk. Only the calling process
+    writes to the store.
 
     If a worker terminates, other workers compute its chunks. If several workers terminated while they computed the same chunk,
     the cases of this chunk have the status "lost".
 
     **Raises** `InputError` if Dask is not installed, the scheduler does not answer, no worker connects, or a worker has other
-    versions.
+    versions of the packages than the store.
     """
     optional_module("distributed", "cluster")
     import dask.config

@@ -33,7 +33,7 @@ def seal_of(store: Path, chunk: int) -> Path:
 
 
 def _digest(files: Mapping[str, Path]) -> str:
-    """Return a digest of the names and contents of files; for a missing file the digest differs too."""
+    """Return a digest of the names and contents of files; a missing file changes the digest too."""
     total = hashlib.sha256()
     for name, path in files.items():
         try:

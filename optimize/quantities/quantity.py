@@ -121,7 +121,7 @@ class Quantity:
 
     @property
     def simplified(self) -> Quantity:
-        """Leading-order quantity of the machine with its nominal parameters, for a first search.
+        """Leading-order quantity of the machine without tolerances, for a first search.
 
         A search with the simplified quantity takes less time than a search with the quantity itself, and its best machines are
         near those of the final search.

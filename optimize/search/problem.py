@@ -5,8 +5,8 @@ Jams are followed from one design to the next: each search for a jam starts near
 The designs are computed in batches of at most 64, which run in parallel on all cores. The main compiled programs are the
 derivatives of a batch (`evaluate`) and a number of steps of the descent (`descent`).
 
-Sizes of arrays: s designs, d free parameters, me held quantities (equalities), mi demands (inequalities), p pieces of the
-objective, q quantities.
+Sizes of arrays: s designs z in [0, 1]^d, in which each of the d free parameters is scaled to its bounds, me held quantities
+(equalities), mi demands (inequalities), p pieces of the objective, q quantities.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ class Problem(eqx.Module):
     **Attributes**
 
     - `space`; `objective`
-    - `demands`, without those limits that are numbers (`Demand.form`); `constants` (mi,): these limits, 0 for other limits
+    - `demands`: each without its limit if the limit is a number, so that demands that differ only in this number share compiled
+      programs (`Demand.form`); `constants` (mi,): these numbers, 0 for a limit that is a quantity
     - `keys`: the jams and folds whose load speeds are followed, see `Key`
     - `scales` (mi,): positive numbers by which the excesses of the demands are divided
     - `batch_size`: the number of designs in a batch
@@ -86,7 +87,7 @@ class Problem(eqx.Module):
         return jnp.concatenate([objective, held, jnp.stack(excess) / self.scales if excess else jnp.zeros((0,))])
 
     def simplified(self) -> Problem | None:
-        """Return the problem of the first search: leading-order quantities of the machine with its nominal parameters.
+        """Return the problem of the first search: leading-order quantities of the machine without tolerances.
 
         Demands on quantities without a leading order are omitted.
 
@@ -129,8 +130,9 @@ class Point(NamedTuple):
     """Designs with their values and derivatives.
 
     **Attributes**: designs `z` (s, d); `values` (s, 1 + me + mi) and their derivatives `slopes` (s, 1 + me + mi, d); the
-    followed speeds `speeds` and their derivatives with respect to z, `speed_slopes` (s, ..., d); the objective's `pieces`
-    (s, p) and their derivatives `piece_gradients` (s, p, d), empty for an objective of one piece.
+    followed speeds `speeds` and their derivatives with respect to z, `speed_slopes` (s, ..., d), zeros if the derivatives were
+    computed in reverse mode; the objective's `pieces` (s, p) and their derivatives `piece_gradients` (s, p, d), empty for an
+    objective of one piece.
     """
 
     z: np.ndarray
@@ -176,8 +178,8 @@ class Point(NamedTuple):
 def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand], starts: int = _MAX_BATCH_SIZE) -> Problem:
     """Return the problem of a search with its followed speeds and the scale of each demand.
 
-    The scale is the limit of the demand, or, if that is 0, its value for the initial design; it is 1 if both are 0 within
-    rounding.
+    The scale is the modulus of the limit. If the limit is 0 or a quantity, it is the larger of the moduli of the demand's
+    quantity and limit for the initial design, or 1 if both are 0 within rounding.
     """
     forms = tuple(demand.form() for demand in demands)
     keys, parts = _keys_and_parts(space, objective, forms)
@@ -190,8 +192,8 @@ def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand
 
 
 def _sizes(space: DesignSpace, quantities: tuple[Quantity, ...]) -> np.ndarray:
-    """Return the modulus of each quantity (q,) for the initial design; 0 if it is negligible beside its change over the
-    bounds."""
+    """Return the modulus of each quantity (q,) for the initial design; 0 if it is negligible beside its values for other
+    designs."""
     z = np.random.default_rng(0).uniform(size=(7, space.size))
     scenes = _scenes_of(space, on_device(space.numbers(z)))
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, scenes)
@@ -205,7 +207,8 @@ def derive(
 ) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
     """Return values, derivatives, followed speeds and their derivatives of one design.
 
-    If `pieces` is True, the pieces of the objective are the last values.
+    If `pieces` is True, the pieces of the objective are the last values. In reverse mode the derivatives of the followed speeds
+    are not computed; zeros take their place.
     """
 
     def values_and_speeds(x: Array) -> tuple[tuple[Array, tuple[Array, ...]], tuple[Array, tuple[Array, ...]]]:

@@ -48,7 +48,7 @@ class GravityField:
 class LoadPotential:
     """Potential energy of each load as a function of the position of this load.
 
-    The energy is a single-valued function of the position. Its mean torque over a turn is therefore 0.
+    The energy is a single-valued function of the position. The mean of its torque over the angle of a turn is therefore 0.
 
     **Attributes**: `energy` of loads at `u`, (count,) J; `is_smooth`: True if the force has all derivatives.
     """
@@ -83,7 +83,8 @@ class LoadResistance:
 @final
 @dataclass(frozen=True)
 class LoadInteraction:
-    """Forces between loads, which cancel in the torque on coincident loads. With these forces, the order of the loads matters.
+    """Forces between loads. Their sum is zero, so that they exert no torque on all loads together. With these forces the loads
+    are not exchangeable: their order on the track matters.
 
     **Attributes**
 
@@ -211,7 +212,8 @@ class DrillingSpinRelease:
 class SlipRelease:
     """Additional degree of freedom: sliding of rolling loads (`Spin.slip`).
 
-    The contact transmits a force along the track of at most `coefficient` times N. A slip below `width`, m/s, decays.
+    The contact transmits a force along the track of at most `coefficient` times N. Below the slip `width`, m/s, the friction is
+    proportional to the slip, which then decays to zero (rolling).
     """
 
     coefficient: Array

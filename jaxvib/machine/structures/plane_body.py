@@ -61,7 +61,7 @@ def support(
     - `at` (2,): the point of the body, (x, y) m from the centre of mass of all parts that the body's `mass` includes
       (unbalances count as masses on the axes of their exciters); typical: 0.2 to 3 m
     - `stiffness` (k1, k2), N/m; typical: 1e4 to 1e6
-    - `damping` (c1, c2), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(k m). It can also be a percentage of the
+    - `damping` (c1, c2), N s/m; typical: 0.01 to 0.08 of the critical damping 2 sqrt(k m). It can also be a percentage of the
       critical damping, with the mass m that this support carries ("5 % of 250 kg"), or a loss factor of rubber at a frequency
       of vibration ("loss factor 0.1 at 16 Hz")
     - `angle` of the first spring, rad, anticlockwise from x; typical: 0 (the default)

@@ -32,7 +32,8 @@ class Rotor(Machine):
         A theta'' + C w psi' + b2 y' + b3 theta' + c2 y + c3 theta = m_y
         A psi'' - C w theta' + b2 z' + b3 psi' + c2 z + c3 psi = m_z
 
-    w is the rotor speed. If the supports have other values vertically, the equations of z and psi have other coefficients b
+    w is the rotor speed; f_y and f_z are the forces, m_y and m_z the moments that increase theta and psi. If the supports have
+    other values vertically, the equations of z and psi have other coefficients b
     and c. A point at the distance s along the axis moves by (y + s theta, z + s psi). A load acts at its station s_j. z is the
     displacement from static equilibrium.
 
@@ -137,8 +138,8 @@ class Rotor(Machine):
         return jnp.eye(2, 4, dtype=self.mass.dtype), jnp.eye(2, 4, 2, dtype=self.mass.dtype)
 
     def support_rows(self) -> tuple[Array, Array]:
-        """Return the rows of both supports; those of the foundation if `stiffness_terms` or `damping_terms` replace
-        supports."""
+        """Return the rows of the force on each of the two supports. If `stiffness_terms` or `damping_terms` replace them,
+        return the rows of one support that carries the whole force."""
         if self.stiffness_terms is not None or self.damping_terms is not None:
             return super().support_rows()
         translation, tilt = self._directions()
@@ -150,7 +151,7 @@ class Rotor(Machine):
         return rows(self.stiffness, self.stiffness_up), rows(self.damping, self.damping_up)
 
     def upward(self) -> np.ndarray:
-        """Return the coordinates of a translation of the rotor upward by 1 m; its axis is horizontal."""
+        """Return the coordinates of a translation by 1 m in the second direction: upward if the axis is horizontal."""
         return np.array([0.0, 1.0, 0.0, 0.0])
 
     @property
@@ -284,7 +285,8 @@ def _require_possible_inertia(transverse: float, polar: float) -> None:
 
 
 class PlanarRotor(Machine):
-    """Rotor on one support, moving horizontally and vertically without tilt.
+    """Rotor on one support, moving without tilt in the two directions across its axis: horizontal and vertical if the axis is
+    horizontal.
 
         M y'' + b y' + k y = f_y,    M z'' + b_up z' + k_up z = f_z
 
@@ -327,7 +329,7 @@ class PlanarRotor(Machine):
         return self.stiffness_up is not None or self.damping_up is not None
 
     def upward(self) -> np.ndarray:
-        """Return the coordinates of a translation of the rotor upward by 1 m; its axis is horizontal."""
+        """Return the coordinates of a translation by 1 m in the second direction: upward if the axis is horizontal."""
         return np.array([0.0, 1.0])
 
     def mount(self, at: Place = None) -> Mount:
@@ -340,7 +342,8 @@ class PlanarRotor(Machine):
 def planar_rotor(
     *, mass: Number, stiffness: Number, damping: Number, stiffness_up: Number | None = None, damping_up: Number | None = None
 ) -> PlanarRotor:
-    """Return a rotor that moves horizontally and vertically on one support.
+    """Return a rotor that moves without tilt on one support, in the two directions across its axis: horizontal and vertical if
+    the axis is horizontal.
 
         M y'' + b y' + k y = f_y,    M z'' + b_up z' + k_up z = f_z
 
