@@ -294,7 +294,7 @@ def plan_synchronous(
     if prescribed:
         start = prescribed[0].drive.speed
     elif speed is not None:
-        start = number(speed, "rad/s", "speed", low=0.0, open_low=True)
+        start = number(speed, "rad/s", "speed" if regime is None else "regime.speed", low=0.0, open_low=True)
     elif motors:
         start = jnp.mean(jnp.stack(motors))
     else:

@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 import jaxvib as jv
+from jaxvib.results.status import status_names
 
 G = 9.81
 
@@ -272,6 +273,8 @@ def test_motors_that_cannot_synchronise_end_in_a_status(general):
         jv.synchronous_orbit(apart, phases=[0.0, 3.0])
     orbit = jv.synchronous_orbit(apart, phases=[0.0, 3.0], throw=False, points=17)
     assert orbit.status_name == "not_converged" and np.isnan(orbit.speed) and not bool(orbit.stable)
+    with pytest.raises(jv.InputError, match=r"^regime\.speed is nan rad/s; a finite number is needed"):
+        jv.synchronous_orbit(apart, orbit)
 
 
 def test_ideal_drives_at_different_speeds_have_a_status():
@@ -305,6 +308,21 @@ def test_limit_of_synchronization_is_the_fold_of_the_motion(general, orbit):
             numbers = (1.5, float(limit.value[end]) * (1.0 + outward * share), 2000.0)
             names.append(jv.synchronous_orbit(with_numbers(general, numbers), **start).status_name)
         assert names == ["found", "not_converged"]
+
+
+@pytest.mark.parametrize(("over", "start"), [("exciters[1].unbalance", 1.0), ("exciters[1].position[0]", 0.9)])
+def test_limit_over_unbalance_and_place_is_the_closed_form(over, start):
+    """Soft supports: W = w^2 S_1 S_2 l_1 l_2 / (2 J) is at least half the difference of the torques."""
+    machine = body((40.0, 40.0), (2.0, 2.0), places=((-1.0, 0.0), (1.0, 0.0)))
+    parts = ((100.0, 1.5, -0.5, 1), (99.0, 1.0, 0.9, -1))
+    exciters = [jv.Exciter(drive=motor(n), unbalance=s, at=(x, 0.0), direction=way) for n, s, x, way in parts]
+    scene = jv.Scene(machine, exciters=exciters)
+    limit = jv.synchronization_limit(scene, jv.synchronous_orbit(scene, phases=[0.0, np.pi + 0.3]), over=over)
+    w = 2.0 / (1.0 / 100.0 + 1.0 / 99.0)
+    half = 300.0 * (w / 99.0 - w / 100.0) / 2.0
+    assert list(status_names(limit.status)) == ["found", "not_found"] and np.isnan(limit.value[1])
+    np.testing.assert_allclose(limit.value[0] / start, half / (w**2 * 1.5 * 0.5 * 0.9 / 1200.0), rtol=5e-3)
+    np.testing.assert_allclose(limit.speed[0], w, rtol=1e-4)
 
 
 def test_motion_near_a_fold_says_so(general, orbit):
