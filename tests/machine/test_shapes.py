@@ -92,6 +92,10 @@ WRONG = {
         loads(position=lambda self, *u: u[0]),
         "loads.position .* a tuple of 2 or 3 coordinates is needed",
     ),
+    "a position on a line": (
+        loads(position=lambda self, *u: (u[0],)),
+        "loads.position returns a tuple of 1; a tuple of 2 or 3 coordinates is needed",
+    ),
     "too few forces": (
         loads(resistance=lambda self, u, rate, speed: (rate[0],)),
         "loads.resistance .* a tuple of 2, one force",
