@@ -1,4 +1,4 @@
-"""Checks of the types and shapes of the values that the parts of a user's file return.
+"""Checks of the values that the parts of a user's file return: their types, shapes, and the mass matrix.
 
 Parts of the package are not checked here, because the tests of the package check them.
 """
@@ -22,6 +22,8 @@ from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import LoadResistance, Term
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import Part
+from jaxvib.machine.structures.matrices import require_definite
+from jaxvib.units.known import is_known
 
 T = TypeVar("T", bound=Part)
 
@@ -52,7 +54,9 @@ def _once_for_each_structure(check: Callable[..., None]) -> Callable[..., None]:
 
 
 def require_machine(machine: Machine, place: Place) -> None:
-    """**Raises** `InputError` for a carrier, or for a mount at the `place`, whose matrices do not fit each other."""
+    """**Raises** `InputError` for a carrier, or a mount at the `place`, whose matrices do not fit each other, and for a mass
+    matrix that is not symmetric and positive definite.
+    """
     if _is_of_package(machine):
         return
     carrier, mount = shapes_of(machine, place)
@@ -74,6 +78,8 @@ def require_machine(machine: Machine, place: Place) -> None:
         _require_shape("machine.mount", "gyroscopic: ", mount.gyroscopic, square)
     if mount.turn is not None:
         _require_shape("machine.mount", "turn: ", mount.turn, (size,))
+    if is_known(machine):
+        require_definite(np.asarray(machine.carrier().mass), "machine.carrier().mass", positive=True)
 
 
 @_once_for_each_structure

@@ -1,4 +1,4 @@
-"""Parts of a user's file whose methods return values of a wrong type or shape are refused when the scene is created."""
+"""Parts of a user's file whose methods return wrong values are refused when the scene is created."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -81,6 +81,11 @@ BRAKE, STEADY = Brake(drag=jnp.asarray(1e-3)), Steady(speed=jnp.asarray(60.0))
 WRONG = {
     "a vector for a matrix": (carrier(stiffness=jnp.ones(2)), r"machine.carrier returns stiffness: .*shape \(2,\).* \(2, 2\)"),
     "the mass of a point": (carrier(mass=jnp.ones((1, 1))), r"machine.carrier returns mass: .*shape \(1, 1\).* \(2, 2\)"),
+    "an asymmetric mass": (
+        carrier(mass=jnp.asarray([[100.0, 1.0], [0.0, 12.0]])),
+        r"machine.carrier\(\).mass is not symmetric",
+    ),
+    "a negative mass": (carrier(mass=jnp.diag(jnp.asarray([100.0, -1.0]))), "mass has the eigenvalue -1; all must be greater"),
     "three directions": (carrier(foundation_damping=jnp.ones((3, 2))), r"returns foundation_damping: .*\(1, 2\) or \(2, 2\)"),
     "no carrier": (dict(machine=with_method(MACHINE, "carrier", lambda self: None)), "machine.carrier returns None; a Carrier"),
     "rows and axes": (mount(jnp.ones((1, 2)), axes=(0, 1)), r"machine.mount returns rows: .*shape \(1, 2\).* \(2, 2\)"),

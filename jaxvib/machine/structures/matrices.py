@@ -113,7 +113,7 @@ def from_matrices(
     rows = _read_places(places, size)
     force = jnp.zeros((2, 1, size), m.dtype) if foundation is None else _read_foundation(foundation, size)
     for name, matrix in (("machine.mass", m), ("machine.stiffness", k)):
-        when_known(lambda matrix, name=name: _require_definite(matrix, name), matrix)
+        when_known(lambda matrix, name=name: require_definite(matrix, name, positive=name == "machine.mass"), matrix)
     limit = size if reduce is None else count(reduce, "machine.reduce")
     if size > limit:
         modes = _lowest_modes(m, k, limit)
@@ -146,15 +146,15 @@ def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:
     return matrix
 
 
-def _require_definite(matrix: np.ndarray | float, name: str) -> None:
-    """**Raises** `InputError` for a matrix that is not symmetric, or not positive (semi-)definite."""
+def require_definite(matrix: np.ndarray | float, name: str, *, positive: bool) -> None:
+    """**Raises** `InputError` for a matrix that is asymmetric, or has eigenvalues below 0 (if `positive`: at most 0)."""
     full = np.atleast_2d(matrix)
     scale = float(np.max(np.abs(full), initial=1e-300))
     if np.max(np.abs(full - full.T)) > _MAX_ASYMMETRY * scale:
         raise InputError(name, "is not symmetric; put skew-symmetric parts into gyroscopic, or take (A + A^T)/2")
     least = float(np.min(np.linalg.eigvalsh(full)))
-    if least <= 0.0 if name == "machine.mass" else least < -_MAX_ASYMMETRY * scale:
-        allowed = "greater than 0" if name == "machine.mass" else "at least 0"
+    if least <= 0.0 if positive else least < -_MAX_ASYMMETRY * scale:
+        allowed = "greater than 0" if positive else "at least 0"
         raise InputError(name, f"has the eigenvalue {least:g}; all must be {allowed}")
 
 
