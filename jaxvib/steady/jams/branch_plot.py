@@ -12,6 +12,7 @@ from jaxvib.display import Drawn, Onto, SpeedUnit, speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.steady.jams.folds import sampled_modes
 
 
 class _Branch(Protocol):
@@ -19,7 +20,6 @@ class _Branch(Protocol):
 
     omega: Array
     rotor_speed: Array
-    slope: Array
     stable: Array
     amplitude: Array
     foundation_force: Array
@@ -70,7 +70,7 @@ def plot_branch(
     - `unit` of the speeds on the axes; `most`: the greatest rotor speed shown, rad/s (default: 4/3 of the scene's rotor speed)
     - `criterion`: text on how stability is determined
     - `show`: names of the panels; `linear`: True for linear axes of amplitudes and force; `ax`: axes to draw onto
-    - `modes`: number of the jam mode at each point, default: from the resonances and the slope
+    - `modes`: number of the jam mode at each point, default: from the folds between the points
     - `resonances` (nd,) rad/s, default: computed here
 
     **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or panel.
@@ -87,7 +87,10 @@ def plot_branch(
     if resonances is None:
         resonances = np.asarray(estimated_frequencies(branch.scene))
     if modes is None:
-        modes = 2 * np.searchsorted(resonances, np.asarray(branch.omega)) + (np.asarray(branch.slope) > 0.0)
+        omega, solved = np.asarray(branch.omega), np.isfinite(rotor_speed)
+        _, found = sampled_modes(omega[solved], rotor_speed[solved], resonances)
+        ends = omega[solved][1:-1]  # a point that could not be solved is given the number of its interval
+        modes = found[np.searchsorted(ends, omega)]
     return branch_diagram(
         np.where(rotor_speed <= top, rotor_speed, np.nan),
         np.asarray(branch.omega),

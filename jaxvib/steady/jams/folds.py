@@ -251,7 +251,7 @@ def piece_modes(cuts: Array, exists: Array, resonances: Array) -> Array:
     Each peak belongs to the nearest resonance, but no two peaks share a resonance, and every peak has one.
     """
     nd = resonances.shape[0]
-    peak = np.arange(nd)
+    peak = np.arange(cuts.shape[0] // 2)
     nearest = 1 + jnp.argmin(jnp.abs(resonances[None, :] - cuts[0::2, None]), axis=1)
     # Numbers of resonances rise by at least 1 from peak to peak, and leave at least one for each later peak.
     owner = peak + jnp.minimum(jax.lax.cummax(nearest - peak), nd + 1 - jnp.sum(exists[1::2]))
@@ -259,6 +259,23 @@ def piece_modes(cuts: Array, exists: Array, resonances: Array) -> Array:
     last = 2 * nd + 1
     rising, falling = (jnp.where(exists[0::2], mode, last) for mode in (2 * owner - 1, 2 * owner))
     return jnp.append(jnp.stack([rising, falling], axis=1).ravel(), last)
+
+
+def sampled_modes(omega: np.ndarray, speeds: np.ndarray, resonances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of the folds of a branch n(Omega) with the samples `omega` and `speeds` (P,), and the mode number of
+    each of its P - 1 intervals.
+    """
+    nd, rising = resonances.shape[0], np.diff(speeds) > 0.0
+    folds = 1 + np.flatnonzero(rising[1:] != rising[:-1])[: 4 * nd]
+    if not rising[0]:  # the samples begin after the first peak
+        folds = np.append(0, folds)[: 4 * nd]
+    padded = np.pad(folds, (0, 4 * nd - folds.size))
+    main = np.asarray(without_ripples(jnp.asarray(speeds[padded]), jnp.asarray(folds.size), 2 * nd))
+    exists = main < folds.size
+    cuts = np.where(exists, omega[padded[main]], np.inf)
+    modes = np.asarray(piece_modes(jnp.asarray(cuts), jnp.asarray(exists), jnp.asarray(resonances)))
+    ends = np.where(exists, padded[main], omega.size)
+    return folds, modes[np.searchsorted(ends, np.arange(omega.size - 1), side="right")]
 
 
 def without_ripples(speeds: Array, count: Array, count_left: int) -> Array:

@@ -12,7 +12,7 @@ from jaxvib.equations.linear import jammed_model
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.folds import fold_points, light_rotor_speed, piece_modes, without_ripples
+from jaxvib.steady.jams.folds import fold_points, light_rotor_speed, sampled_modes
 from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 
 _BRANCH_POINTS, _POINTS_PER_BATCH = 800, 100
@@ -36,19 +36,13 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     The exact branch n(Omega) is computed point by point and cut at its folds; its pieces are numbered as in `jam_modes`.
     """
     crowded, resonances = _search_grid(scene)
-    crowded, target, nd = np.asarray(crowded), float(scene.drive.speed), resonances.shape[0]
+    crowded, resonances, target = np.asarray(crowded), np.asarray(resonances), float(scene.drive.speed)
     crowded = np.unique(np.append(crowded, target))  # a duplicate point would look like a fold
     omega = np.interp(np.linspace(0.0, 1.0, _BRANCH_POINTS), np.linspace(0.0, 1.0, crowded.size), crowded)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
     known = np.isfinite(speed)
     omega, speed = _interpolated(omega[known], speed[known], slope[known])
-    rising = speed[1:] > speed[:-1]
-    turn = 1 + np.flatnonzero(rising[1:] != rising[:-1])[: 4 * nd]
-    padded = np.pad(turn, (0, 4 * nd - turn.size))
-    main = np.asarray(without_ripples(jnp.asarray(speed[padded]), jnp.asarray(turn.size), 2 * nd))
-    exists = main < turn.size
-    cuts = np.where(exists, omega[padded[main]], np.inf)
-    modes = np.asarray(piece_modes(jnp.asarray(cuts), jnp.asarray(exists), resonances))
+    turn, modes = sampled_modes(omega, speed, resonances)
     crossed = (speed[1:] - target) * (speed[:-1] - target) <= 0.0
     near = turn[np.abs(speed[turn] - target) < _NEAR_FOLD_DISTANCE * target]
     close = []
@@ -62,11 +56,11 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     found: dict[int, float] = {}
     for k in np.flatnonzero(crossed):
         part = (target - speed[k]) / (speed[k + 1] - speed[k])
-        found.setdefault(int(modes[np.searchsorted(cuts, omega[k])]), float(omega[k] + part * (omega[k + 1] - omega[k])))
+        found.setdefault(int(modes[k]), float(omega[k] + part * (omega[k + 1] - omega[k])))
     # If a fold lies between two points, the two modes that meet at the fold are near these points.
     for k in close:
-        for side in (k - 1, k + 1):
-            found.setdefault(int(modes[np.searchsorted(cuts, omega[side])]), float(omega[side]))
+        for mode, side in ((modes[k - 1], k - 1), (modes[k], k + 1)):
+            found.setdefault(int(mode), float(omega[side]))
     return found
 
 

@@ -11,7 +11,7 @@ from scenes import published
 import jaxvib as jv
 from jaxvib.equations.linear import linear_model
 from jaxvib.steady.jams import folds
-from jaxvib.steady.jams.folds import jam_rotor_speed, piece_modes, without_ripples
+from jaxvib.steady.jams.folds import jam_rotor_speed, piece_modes, sampled_modes, without_ripples
 
 rotor_speeds = eqx.filter_jit(eqx.filter_vmap(jam_rotor_speed, in_axes=(None, 0)))
 
@@ -167,6 +167,17 @@ def test_folds_are_differentiable():
 def test_peaks_belong_to_the_resonances_they_are_nearest_to(cuts, found, modes):
     cuts = np.array(cuts + [9.0] * (6 - found))
     assert piece_modes(jnp.asarray(cuts), jnp.arange(6) < found, jnp.array([1.0, 2.0, 3.0])).tolist() == modes
+
+
+@pytest.mark.parametrize("begin", [0, 600])
+def test_samples_of_a_branch_have_the_numbers_of_its_pieces(begin):
+    # Sample 600 lies after the first peak of the published machine; its second peak lies above the resonance 1.0.
+    branch = jv.branches(published().scene(), points=2000, most=8.0)
+    omega, speeds, modes = (np.asarray(x)[begin:] for x in (branch.omega, branch.rotor_speed, branch.mode))
+    _, found = sampled_modes(omega, speeds, np.asarray(branch.resonances))
+    assert set(modes) == ({1, 2, 3, 4, 5} if begin == 0 else {2, 3, 4, 5})
+    same = modes[1:] == modes[:-1]  # other intervals contain a fold
+    np.testing.assert_array_equal(found[same], modes[:-1][same])
 
 
 def test_the_ripples_that_span_least_are_left_out():
