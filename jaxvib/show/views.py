@@ -168,14 +168,19 @@ class FrontView(RotorView):
         across, up = reach * (np.asarray(self.mount.rows[0]) @ pose.displacement)
         return float(across), float(up)
 
+    def _supports(self) -> list[tuple[float, float]]:
+        """Return the stiffness and the damping of the horizontal and of the vertical support."""
+        return list(
+            zip(*(np.max(x, axis=1).tolist() for x in (self.foundation_stiffness, self.foundation_damping)), strict=True)
+        )
+
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """Return the foundation below, a wall on the left, springs and dampers, the rotor."""
         x, y = self._centre(pose, reach)
-        k, c = self.foundation_stiffness[1], self.foundation_damping[1]
-        stiffness, damping = float(np.max(k)), float(np.max(c))
+        across, up = self._supports()
         parts = [Part(ground((-1.2, -2.4), (1.6, -2.4)), FOUNDATION), Part(ground((-2.7, 1.2), (-2.7, -1.6)), FOUNDATION)]
-        parts += tie_parts((x, -2.4), (x, y - self.wheel.rim), stiffness, damping)
-        parts += tie_parts((-2.7, y), (x - self.wheel.rim, y), stiffness, damping)
+        parts += tie_parts((x, -2.4), (x, y - self.wheel.rim), *up)
+        parts += tie_parts((-2.7, y), (x - self.wheel.rim, y), *across)
         parts += self.wheel.parts((x, y), pose.rotors[0])
         return parts + (self._section(pose) if self.section else [])
 
@@ -206,13 +211,13 @@ class FrontView(RotorView):
         return parts
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
-        """Return the mass, and the values of the supports, which are equal in both directions."""
-        label = spring_text(float(np.max(self.foundation_stiffness[1])), float(np.max(self.foundation_damping[1])))
+        """Return the mass, and the values of the supports."""
+        across, up = (spring_text(*support) for support in self._supports())
         small: Look = {"fontsize": "small"}
         mass = f"M = {value_text(float(self.mass[0, 0]), 'kg')}"
         texts = [
-            Text(0.55, -1.75, label, {**small, "va": "center"}),
-            Text(-1.95, 0.62, label, {**small, "ha": "center", "va": "center"}),
+            Text(0.55, -1.75, up, {**small, "va": "center"}),
+            Text(-1.95, 0.62, across, {**small, "ha": "center", "va": "center"}),
             Text(1.05, 1.2, mass, small),
         ]
         return [*texts, Text(3.2, -1.15, "section of the track,\naxis to the left", {**small, "ha": "center", "va": "top"})][

@@ -66,6 +66,35 @@ def test_a_tilting_rotors_loads_move_by_their_stations():
         np.testing.assert_allclose(shift[4:], 0.0, atol=1e-12)
 
 
+ROTOR = dict(mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, position=(0.165, -0.155))
+ACROSS = dict(stiffness=(0.6e6, 0.5e6), damping=(420.0, 410.0))
+SPLIT = {
+    "planar": jv.planar_rotor(mass=37.0, stiffness=1e6, damping=800.0, stiffness_up=2e6, damping_up=900.0),
+    "vertical values": jv.rotor(**ROTOR, **ACROSS, stiffness_up=(0.8e6, 0.7e6), damping_up=(520.0, 510.0)),
+    "terms": jv.rotor(**ROTOR, **ACROSS, stiffness_terms=(1e6, 2e4, 3e4), damping_terms=(800.0, 16.0, 20.0)),
+}
+
+
+@pytest.mark.parametrize("name", SPLIT)
+def test_forces_of_split_supports_sum_to_the_force_on_the_foundation(name):
+    scene = jv.Scene(SPLIT[name], jv.balls(count=4, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    size = len(scene.machine.structure().coordinates)
+    pose = at_rest(scene)._replace(displacement=1e-3 * np.arange(1.0, 1.0 + size), velocity=0.1 * np.arange(2.0, 2.0 + size))
+    carrier = scene.machine.carrier()
+    total = carrier.foundation_stiffness @ pose.displacement + carrier.foundation_damping @ pose.velocity
+    np.testing.assert_allclose(np.sum(view_of(scene).support_forces(pose), axis=0)[1], total[1], rtol=1e-12)
+
+
+def test_values_of_split_supports_are_written_beside_them():
+    texts = {}
+    for name in ("planar", "vertical values"):
+        scene = jv.Scene(SPLIT[name], jv.balls(count=4, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+        texts[name] = [text.text for text in view_of(scene).texts(at_rest(scene), REACH)]
+    below, left = texts["planar"][:2]
+    assert "2000 N/mm" in below and "1000 N/mm" in left
+    assert any("800 N/mm" in text for text in texts["vertical values"])
+
+
 def test_loads_are_round():
     for outline in (points for points in drawn("planar_rotor")[1] if len(points) == 31):
         away = np.hypot(*(outline - np.mean(outline[:-1], axis=0)).T)

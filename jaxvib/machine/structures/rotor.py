@@ -138,8 +138,10 @@ class Rotor(Machine):
         return jnp.eye(2, 4, dtype=self.mass.dtype), jnp.eye(2, 4, 2, dtype=self.mass.dtype)
 
     def support_rows(self) -> tuple[Array, Array]:
-        """Return the rows of the force on each of the two supports. If `stiffness_terms` or `damping_terms` replace them,
-        return the rows of one support that carries the whole force."""
+        """Return the rows of the force on each support.
+
+        If `stiffness_terms` or `damping_terms` replace the supports, return those of one support that carries the whole force.
+        """
         if self.stiffness_terms is not None or self.damping_terms is not None:
             return super().support_rows()
         translation, tilt = self._directions()
@@ -156,12 +158,21 @@ class Rotor(Machine):
 
     @property
     def is_split(self) -> bool:
-        """True if horizontal and vertical values of the supports differ."""
+        """True if vertical values of the supports are given."""
         return self.stiffness_up is not None or self.damping_up is not None
 
     def shaft_supports(self) -> list[tuple[float, float, float]]:
-        """Return the two supports."""
-        return list(zip(self.position.tolist(), self.stiffness.tolist(), self.damping.tolist(), strict=True))
+        """Return the two supports with their vertical values; if terms replace these, the values with the same total force."""
+        position = np.asarray(self.position)
+
+        def vertical(across: Array, up: Array | None, terms: Array | None) -> list[float]:
+            if terms is None:
+                return (across if up is None else up).tolist()
+            return np.linalg.lstsq(np.stack([np.ones(2), position]), np.asarray(terms)[:2])[0].tolist()
+
+        stiffness = vertical(self.stiffness, self.stiffness_up, self.stiffness_terms)
+        damping = vertical(self.damping, self.damping_up, self.damping_terms)
+        return list(zip(position.tolist(), stiffness, damping, strict=True))
 
 
 def rotor(
@@ -325,7 +336,7 @@ class PlanarRotor(Machine):
 
     @property
     def is_split(self) -> bool:
-        """True if horizontal and vertical values of the support differ."""
+        """True if vertical values of the support are given."""
         return self.stiffness_up is not None or self.damping_up is not None
 
     def upward(self) -> np.ndarray:
