@@ -3,8 +3,8 @@
 Two kinds of comparison need no model of the machine:
 
 - Rotor speeds that are measured by pulses, by an angle and by a speed must be equal
-- Motions x and y of one point in one direction are derivatives of each other: Y = (i w)^d X with d = 0, 1 or 2 at each
-  frequency w at which they are coherent
+- Motions x and y of one point in one direction: Y = (i w)^d X at each frequency w at which they are coherent; d is the
+  difference of their numbers of derivatives, -2 to 2
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _OTHER_UNITS = {
 """Units that a file may have in place of the stated one."""
 
 _SPEED_ERROR, _MOTION_ERROR, _UNIT_ERROR = 0.03, 0.3, 0.15
-"""Largest allowed relative difference between two speeds, and between two motions; largest relative difference between the
-ratio of two motions and the ratio of two units that explains it."""
+"""Largest allowed relative difference between two speeds, and between two motions; largest relative difference between a ratio
+of motions and a ratio of units, up to which the unit is named as the cause."""
 
 _COHERENT, _STRONG = 0.9, 1e-3
 """Smallest coherence at a frequency that is compared, and smallest power at this frequency relative to the largest power."""
@@ -46,8 +46,12 @@ _SEGMENTS = 8
 _ALIASING_LENGTH, _ALIASING_PIECES = 8192, 64
 """Number of samples of a piece of a record, and largest number of pieces, whose spectrum is examined for aliasing."""
 
-_DRIFT = 3.0
-"""Drift of a clock, relative to its standard error, above which a note reports it."""
+_DRIFT, _DRIFT_ANGLE = 3.0, 0.1
+"""Drift of a clock, relative to its standard error, and error of the rotor's angle at the end of the record, rad, above which
+a note reports the drift."""
+
+_LEAST_DRIFT_ERROR, _MAX_CONDITION = 1e-7, 1e3
+"""Smallest standard error of a drift, and largest condition number of the fit of a drift."""
 
 
 class _Signal(NamedTuple):
@@ -77,18 +81,19 @@ def check_agreement(
 
 
 def rotor_speed(channel: Channel, time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return times, s, and the speed of the rotor, rad/s, from a channel of pulses, angle or speed. For pulses the speed is the
-    average over each turn, because marks may be unevenly spaced."""
+    """Return times, s, and the speed of the rotor, rad/s, from a channel of pulses (`value`: their numbers), angle or speed.
+
+    For pulses the speed is the average over each turn, because marks may be unevenly spaced.
+    """
     if channel.kind == "speed":
         is_finite = np.isfinite(value)
         return time[is_finite], value[is_finite]
-    angles, stride = (
-        (2.0 * np.pi * value / channel.per_turn, channel.per_turn)
-        if channel.kind == "pulses"
-        else (value, max(1, time.size // 500))
-    )
-    is_finite = np.isfinite(angles[::stride])
-    angles, time = angles[::stride][is_finite], time[::stride][is_finite]
+    if channel.kind == "pulses":  # those of one mark, by their numbers
+        angles = 2.0 * np.pi * value / channel.per_turn
+        is_used = np.isfinite(value) & ((value - value[np.isfinite(value)][0]) % channel.per_turn == 0.0)
+    else:
+        angles, is_used = value, np.isfinite(value) & (np.arange(time.size) % max(1, time.size // 500) == 0)
+    angles, time = angles[is_used], time[is_used]
     return 0.5 * (time[1:] + time[:-1]), np.diff(angles) / np.diff(time)
 
 
@@ -105,7 +110,8 @@ def _compare_speeds(reference_signal: _Signal, other: _Signal, source: str) -> l
     if abs(abs(ratio) - 1.0) <= _SPEED_ERROR:
         if ratio < 0.0 and other.channel.kind != "speed":
             raise InputError(where, f"turns against {name}; reverse the sign of one of them")
-        return _drift(reference_signal, other, np.sign(ratio), source)
+        pair = f"{name} and {quoted(other.channel.name)}"
+        return _drift(time, reference, np.sign(ratio) * speed, f"{source}: the clocks of {pair}")
     if other.channel.kind == "speed":
         fitting_unit = _fitting_unit(other.channel, 1.0 / abs(ratio), _SPEED_ERROR)
         if fitting_unit:
@@ -129,35 +135,29 @@ def _fitting_unit(channel: Channel, factor: float, error: float) -> str | None:
     return None
 
 
-def _drift(reference_signal: _Signal, other: _Signal, sign: float, source: str) -> list[str]:
-    """Return a note if the clock of one speed drifts against the clock of the other speed.
+def _drift(time: np.ndarray, reference: np.ndarray, speed: np.ndarray, subject: str) -> list[str]:
+    """Return a note on the `subject` if the clock of one speed drifts against the clock of the other speed.
 
     While the speed changes at the rate a, a delay of d + e t changes the reading by -a (d + e t).
     """
-    inside = (reference_signal.time > other.time[0]) & (reference_signal.time < other.time[-1])
-    time, reference = reference_signal.time[inside], reference_signal.value[inside]
     if time.size < 32:
         return []
     rate = np.gradient(reference, time)
     elapsed = time - time[0]
     columns = np.stack([reference, -rate, -rate * elapsed], axis=1)
-    difference = sign * np.interp(time, other.time, other.value)
     scale = np.linalg.norm(columns, axis=0)
-    if np.min(scale) < 1e-9 * np.max(np.abs(reference)) or np.linalg.cond(columns / scale) > 1e3:
+    columns = columns / scale
+    if np.min(scale) < 1e-9 * np.max(np.abs(reference)) or np.linalg.cond(columns) > _MAX_CONDITION:
         return []
-    coefficients, *_ = np.linalg.lstsq(columns / scale, difference, rcond=None)
-    residuals = difference - columns / scale @ coefficients
-    errors = (
-        np.sqrt(np.sum(residuals**2) / (time.size - 3) * np.diag(np.linalg.inv((columns / scale).T @ (columns / scale))))
-        / scale
-    )
-    drift, error = coefficients[2] / scale[2], max(float(errors[2]), 1e-7)
+    coefficients, *_ = np.linalg.lstsq(columns, speed, rcond=None)
+    residuals = speed - columns @ coefficients
+    errors = np.sqrt(np.sum(residuals**2) / (time.size - 3) * np.diag(np.linalg.inv(columns.T @ columns)))
+    drift, error = coefficients[2] / scale[2], max(float(errors[2] / scale[2]), _LEAST_DRIFT_ERROR)
     final_delay = abs(drift) * elapsed[-1]
-    if abs(drift) < _DRIFT * error or final_delay * float(np.max(np.abs(reference))) < 0.1:
+    if abs(drift) < _DRIFT * error or final_delay * float(np.max(np.abs(reference))) < _DRIFT_ANGLE:
         return []
-    pair = f"{quoted(reference_signal.channel.name)} and {quoted(other.channel.name)}"
     return [
-        f"{source}: the clocks of {pair} drift by {1e3 * final_delay:.3g} ms over the record ({1e6 * abs(drift):.3g} ppm); "
+        f"{subject} drift by {1e3 * final_delay:.3g} ms over the record ({1e6 * abs(drift):.3g} ppm); "
         "record both by one device, or leave one out"
     ]
 
@@ -169,12 +169,7 @@ def _check_motions(motions: Sequence[_Signal], source: str) -> None:
     disagreeing = [pair for pair in pairs if not _agrees(factors[pair[0].channel.name, pair[1].channel.name])]
     for (a, b), (c, d) in itertools.combinations(disagreeing, 2):
         for first, second, third, fourth in ((a, b, c, d), (a, b, d, c)):
-            same_kind = second.channel.kind == fourth.channel.kind
-            if (
-                same_kind
-                and _agrees(_factor(first, fourth), is_required=True)
-                and _agrees(_factor(third, second), is_required=True)
-            ):
+            if second.channel.kind == fourth.channel.kind and _fits(first, second, fourth) and _fits(third, fourth, second):
                 names = f"{quoted(second.channel.name)} and {quoted(fourth.channel.name)}"
                 raise InputError(
                     f"{source}: channels {names}", "are swapped: each fits the other's place; exchange their places"
@@ -200,13 +195,22 @@ def _same_place(one: Channel, other: Channel) -> bool:
     return one.at == other.at and abs(across) < 1e-6
 
 
-def _agrees(factor: complex | None, is_required: bool = False) -> bool:
-    return not is_required if factor is None else abs(factor - 1.0) <= _MOTION_ERROR
+def _agrees(factor: complex | None) -> bool:
+    """Return True if a factor is close to 1, or None."""
+    return factor is None or abs(factor - 1.0) <= _MOTION_ERROR
+
+
+def _fits(one: _Signal, place: _Signal, other: _Signal) -> bool:
+    """Return True if the motion of `one` agrees with the readings of `other` at the place and in the direction of `place`."""
+    factor = _factor(one, other._replace(channel=place.channel))
+    return factor is not None and _agrees(factor)
 
 
 def _factor(one: _Signal, other: _Signal) -> complex | None:
-    """Return the median of Y / ((i w)^d X) of two motions X, Y over the coherent frequencies, with the sign for equal
-    directions; None without coherent frequencies. It is 1 if the channels agree."""
+    """Return the median of Y / ((i w)^d X) of two motions X, Y over the coherent frequencies, or None without such frequencies.
+
+    It is 1 if the channels agree. If their directions are opposite, its sign is reversed.
+    """
     step = max(float(np.median(np.diff(each.time))) for each in (one, other))
     start, end = max(one.time[0], other.time[0]), min(one.time[-1], other.time[-1])
     count = int((end - start) / step)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.identification.records.agreement import rotor_speed
 
 T = np.arange(0.0, 20.0, 1e-3)
 SPEED = 20.0 + 4.0 * T + 3.0 * np.sin(0.7 * T)
@@ -142,6 +143,26 @@ def test_swapped_channels_are_named():
             (sensor("acceleration", 1), noisy(2, SECOND[2] + 0.5 * FIRST[2])),
             (sensor("acceleration", 2), noisy(3, FIRST[2])),
         )
+
+
+def test_swapped_directions_of_one_point_are_named():
+    with pytest.raises(jv.InputError, match=r"channels 'across acceleration' and 'up acceleration' are swapped"):
+        run(
+            (sensor("velocity", direction="across", name="across velocity"), noisy(0, FIRST[1])),
+            (sensor("velocity", direction="up", name="up velocity"), noisy(1, SECOND[1])),
+            (sensor("acceleration", direction="across", name="across acceleration"), noisy(2, SECOND[2])),
+            (sensor("acceleration", direction="up", name="up acceleration"), noisy(3, FIRST[2])),
+        )
+
+
+def test_speed_from_a_wheel_with_a_missing_tooth_is_that_of_one_mark():
+    marks = np.arange(12 * 30)
+    uneven = marks + 0.2 * np.sin(2.0 * np.pi * marks / 12.0)  # the same error in every turn
+    time = np.sqrt(marks[1:].size + uneven) / 10.0  # angle = 100 t^2 - 359 teeth
+    kept = marks % 12 != 11
+    channel = jv.Channel("tacho", "pulses", per_turn=12)
+    found, speeds = rotor_speed(channel, time[kept], marks[kept].astype(float))
+    np.testing.assert_allclose(speeds, 200.0 * found * 2.0 * np.pi / 12.0, rtol=1e-12)
 
 
 def test_rotor_above_half_the_sampling_rate_is_refused():
