@@ -99,7 +99,8 @@ def settle(
       last run shows this, or its status if the run failed
 
     A motion that is stable only as long as loads are coincident does not count as settled: if loads start at one angle
-    (`separation=0`) and would separate after a small disturbance, the status is `would_separate`, see `Run`.
+    (`separation=0`) and would separate after a small disturbance, the status is `would_separate` (see `Run`), `settled` is
+    False, and no error is raised.
 
     **Returns** the `Run` of the last stretch, without a trajectory and without an estimate of its error.
 
@@ -114,8 +115,8 @@ def settle(
     True
     """
     plan = _plan_settle(scene, start, mode, separation, drift, periods, stretches, stepsize_controller, throw=throw)
-    run, has_settled = _integrate_until_settled(plan, throw=throw)
-    if throw and not has_settled:
+    run, is_final = _integrate_until_settled(plan, throw=throw)
+    if throw and not is_final:
         raise ComputationError(
             "not_settled",
             f"after {stretches} stretches of {periods} periods of the lowest natural frequency the motion still changes "
@@ -186,7 +187,10 @@ def _plan_settle(
 
 
 def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
-    """Return the run of the last stretch, and True if the motion has settled, possibly with the status `would_separate`."""
+    """Return the run of the last stretch, and False if an error must be raised.
+
+    No error is raised if the motion has settled or has the status `would_separate` or `overlapping`.
+    """
     length, state = float(plan.first.end), plan.first.state
     coincident, drifts, measured, regimes = True, [], [], []
     while True:
