@@ -76,7 +76,7 @@ SPLIT = {
 
 
 @pytest.mark.parametrize("name", SPLIT)
-def test_forces_of_split_supports_sum_to_the_force_on_the_foundation(name):
+def test_forces_of_split_supports_sum_to_the_foundation_force(name):
     scene = jv.Scene(SPLIT[name], jv.balls(count=4, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
     size = len(scene.machine.structure().coordinates)
     pose = at_rest(scene)._replace(displacement=1e-3 * np.arange(1.0, 1.0 + size), velocity=0.1 * np.arange(2.0, 2.0 + size))

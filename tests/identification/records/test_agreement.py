@@ -155,7 +155,7 @@ def test_swapped_directions_of_one_point_are_named():
         )
 
 
-def test_speed_from_a_wheel_with_a_missing_tooth_is_that_of_one_mark():
+def test_missing_teeth_do_not_change_the_speed_of_a_wheel():
     marks = np.arange(12 * 30)
     uneven = marks + 0.2 * np.sin(2.0 * np.pi * marks / 12.0)  # the same error in every turn
     time = np.sqrt(marks[1:].size + uneven) / 10.0  # angle = 100 t^2 - 359 teeth
