@@ -23,7 +23,7 @@ from jaxvib.machine.effects.terms import LoadResistance, Term
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import Part
 from jaxvib.machine.structures.matrices import require_definite
-from jaxvib.units.known import is_known
+from jaxvib.units.known import when_known
 
 T = TypeVar("T", bound=Part)
 
@@ -78,8 +78,7 @@ def require_machine(machine: Machine, place: Place) -> None:
         _require_shape("machine.mount", "gyroscopic: ", mount.gyroscopic, square)
     if mount.turn is not None:
         _require_shape("machine.mount", "turn: ", mount.turn, (size,))
-    if is_known(machine):
-        require_definite(np.asarray(machine.carrier().mass), "machine.carrier().mass", positive=True)
+    when_known(functools.partial(require_definite, name="machine.carrier().mass", positive=True), machine.carrier().mass)
 
 
 @_once_for_each_structure
