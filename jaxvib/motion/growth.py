@@ -182,8 +182,8 @@ def growth(
         state, difference = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, neighbour_end)
         neighbour = _at_distance(state, jax.tree.map(jnp.add, state, difference), scale, separation)
     late = np.array(rates[stretches // 2 :])
-    exponent, change = float(np.mean(late)), float(np.subtract(*map(np.mean, np.split(late, [late.size // 2]))))
-    uncertainty = max(_sum_error(late) / late.size, 0.5 * abs(change))
+    exponent, (first, last) = float(np.mean(late)), np.split(late, [late.size // 2])
+    uncertainty = max(_sum_error(late) / late.size, 0.5 * abs(float(np.mean(last) - np.mean(first))))
     name = _classify_growth(late * stretch)
     if name == "chaotic" and all(_has_returned(scene, quarter, steps) for quarter in quarters):
         name = "unstable"
