@@ -71,7 +71,7 @@ from jaxvib.steady.jams.jam import Jam, JamModes, JamStatus, jam_modes
 from jaxvib.steady.jams.phases import PhasePattern
 from jaxvib.steady.jams.phase_search import PhaseJams, phase_jams
 from jaxvib.steady.jams.phases import PhaseJam, PhaseStatus
-from jaxvib.steady.shapes import ModeShapes, mode_shapes
+from jaxvib.steady.shapes import ModeShapes, ShapesStatus, mode_shapes
 
 # Response to unbalances
 from jaxvib.steady.response import Response, ResponseStatus, response

@@ -21,7 +21,7 @@ from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import ContactFriction, GravityField, LoadInteraction, LoadPotential, RotorImbalance, Term
 from jaxvib.machine.loads import CircularLoads, Loads
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.validation import validate_scene
+from jaxvib.machine.validation import allowed_unknowns, validate_scene
 from jaxvib.numerics.linalg import (
     MAX_EIGENVALUE_ERROR,
     complex_product,
@@ -52,13 +52,15 @@ _MAX_DIRECT_SIZE = 3
 """Largest number of coordinates for which `small_solve` writes the equations out."""
 
 
+LOST_FREQUENCY = "a natural frequency is lost in rounding errors: use double precision, or stiffnesses and masses that differ less"
+"""Message of the status `lost_digits` of natural frequencies."""
+
+
 class FrequencyStatus(eqx.Enumeration):
     """Outcomes of a computation of natural frequencies. The value of each member is the message shown to the user."""
 
     done = "the result was computed"
-    lost_digits = (
-        "a natural frequency is lost in rounding errors: use double precision, or stiffnesses and masses that differ less"
-    )
+    lost_digits = LOST_FREQUENCY
 
 
 class LinearModel(Model):
@@ -248,7 +250,8 @@ def natural_frequencies(scene: Scene) -> Array:
     finite for equal frequencies, and taken as 0 at frequency 0 (a carrier that is free to drift).
 
     **Raises** `ComputationError` (status "lost_digits") if a frequency is lost in rounding errors, for example in single
-    precision that of a soft spring next to a link 1e8 times as stiff. Under a JAX transformation such a frequency is NaN.
+    precision that of a soft spring next to a link 1e8 times as stiff. Under a JAX transformation such a frequency is NaN, and
+    all are NaN if a parameter has a value that its constructor would reject.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -258,11 +261,14 @@ def natural_frequencies(scene: Scene) -> Array:
 
     Source: the antiphase paper, equations (19), (23).
     """
-    frequencies, lost = _natural_frequencies(validate_scene(scene))
+    scene = validate_scene(scene)
+    frequencies, lost = _natural_frequencies(scene)
     is_lost = when_known(lambda lost, _: bool(np.any(lost)), lost, frequencies)
     if is_lost:
         raise failure(FrequencyStatus.lost_digits)
-    return jnp.where(lost, jnp.nan, frequencies) if is_lost is None else frequencies
+    allowed = allowed_unknowns(scene)
+    missing = lost if allowed is None else lost | ~allowed
+    return jnp.where(missing, jnp.nan, frequencies) if is_lost is None else frequencies
 
 
 def estimated_frequencies(scene: Scene) -> Array:
@@ -275,12 +281,17 @@ def _natural_frequencies(scene: Scene) -> tuple[Array, Array]:
     """Return the natural frequencies (nd,) rad/s, and for each True if it is lost in rounding errors."""
     model = linear_model(scene)
     frequencies, shapes = model.modes()
+    return frequencies, lost_frequencies(model, frequencies, shapes)
+
+
+def lost_frequencies(model: LinearModel, frequencies: Array, shapes: Array) -> Array:
+    """Return True for each of the natural frequencies (nd,) that is lost in rounding errors; `shapes` (nd, nd) has columns."""
     w, x, mass, carrier = jax.lax.stop_gradient((frequencies, shapes, model.mass, model.carrier))
     lost = hermitian_error((carrier.stiffness, mass), w**2, x) > 2.0 * MAX_EIGENVALUE_ERROR
     # A motion of frequency 0 is free to drift unless a spring to the foundation resists it.
     restoring = jnp.max(jnp.abs(carrier.foundation_stiffness @ x), axis=0)
     resisted = restoring > 1e-3 * jnp.max(jnp.abs(carrier.foundation_stiffness)) * jnp.max(jnp.abs(x), axis=0)
-    return frequencies, jnp.where(w > 0.0, lost, resisted)
+    return jnp.where(w > 0.0, lost, resisted)
 
 
 def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) -> Array:

@@ -22,6 +22,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.branch_plot import branch_summary, plot_branch
 from jaxvib.steady.jams.folds import Folds, fold_points, spread_points
 from jaxvib.steady.jams.jam import STABILITY_CRITERION, AbstractJam, Jam, branch_points
+from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
@@ -152,7 +153,7 @@ def branches(
     count(points, "points", low=2, each=1e3)
     top = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
     per_side = max(2, math.ceil(points / (2 * scene.machine.structure().mass.shape[0])))
-    return _branches(scene, top, points, per_side)
+    return outcome(_branches(scene, top, points, per_side), scene)
 
 
 @cached

@@ -9,13 +9,21 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text
-from jaxvib.equations.linear import linear_model
+from jaxvib.equations.linear import LOST_FREQUENCY, linear_model, lost_frequencies
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
-from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.outcome import REFUSED, outcome
+
+
+class ShapesStatus(eqx.Enumeration):
+    """Outcomes of a computation of mode shapes. The value of each member is the message shown to the user."""
+
+    done = "the shapes were computed"
+    lost_digits = LOST_FREQUENCY
+    refused = REFUSED
 
 
 class ModeShapes(Result):
@@ -25,6 +33,7 @@ class ModeShapes(Result):
 
     **Attributes**
 
+    - `status`: a `ShapesStatus`
     - `frequency` (nd,), rad/s
     - `shape` (nd, nd), a row for each mode: the amplitude of each coordinate, divided by the largest one; a tilt (rad) is
       multiplied by its `lever`
@@ -32,8 +41,7 @@ class ModeShapes(Result):
     - `coordinates` (nd,): their names
     """
 
-    status = Computed.done
-
+    status: ShapesStatus
     frequency: Array = eqx.field(metadata=in_unit("rad/s", "shape_mode"))
     shape: Array = eqx.field(metadata=in_unit("", "shape_mode", "coordinate"))
     lever: Array = eqx.field(metadata=in_unit("m", "coordinate"))
@@ -69,7 +77,8 @@ def mode_shapes(scene: Scene) -> ModeShapes:
 
     **Returns** `ModeShapes`; typical: frequencies of 10 to 100 rad/s for platforms, 100 to 500 rad/s for rotors.
 
-    **Raises** `InputError` for an argument that is not a scene.
+    **Raises** `InputError` for an argument that is not a scene, and `ComputationError` (status "lost_digits") if a natural
+    frequency is lost in rounding errors. Under a JAX transformation such a frequency and its shape are NaN.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -80,7 +89,8 @@ def mode_shapes(scene: Scene) -> ModeShapes:
 
     Source: the antiphase paper, equations (19), (23).
     """
-    return _mode_shapes(validate_scene(scene))
+    scene = validate_scene(scene)
+    return outcome(_mode_shapes(scene), scene, throw=True, failures=("lost_digits",))
 
 
 @cached
@@ -94,4 +104,12 @@ def _mode_shapes(scene: Scene) -> ModeShapes:
     # The largest amplitude is 1; if several are equal, the first one counts.
     size = jnp.abs(rows)
     largest = jnp.argmax(size > (1.0 - 1e-6) * jnp.max(size, axis=1, keepdims=True), axis=1)
-    return ModeShapes(frequency, rows / jnp.take_along_axis(rows, largest[:, None], axis=1), lever, model.carrier.coordinates)
+    rows = rows / jnp.take_along_axis(rows, largest[:, None], axis=1)
+    lost = lost_frequencies(model, frequency, vectors)
+    return ModeShapes(
+        status=ShapesStatus.where(jnp.any(lost), ShapesStatus.lost_digits, ShapesStatus.done),
+        frequency=jnp.where(lost, jnp.nan, frequency),
+        shape=jnp.where(lost[:, None], jnp.nan, rows),
+        lever=lever,
+        coordinates=model.carrier.coordinates,
+    )

@@ -13,6 +13,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import allowed_unknowns
 from jaxvib.numerics.extrema import greatest
 from jaxvib.steady.jams.jam import JamModes
 from jaxvib.units import Number, count, in_own_unit
@@ -83,9 +84,12 @@ class Quantity:
 
         **Arguments**: `scene`; `modes`: the jam modes of the scene, default: they are computed.
 
+        **Returns** NaN if a parameter that JAX traces has a value that its constructor would reject.
+
         **Raises** `ComputationError` for a quantity of the working regime if the scene has no stable synchronous regime.
         """
-        return self.read(Evaluation(scene, modes=modes))
+        value, allowed = self.read(Evaluation(scene, modes=modes)), allowed_unknowns(scene)
+        return value if allowed is None else jnp.where(allowed, value, jnp.nan)
 
     def read(self, evaluation: Evaluation) -> Array:
         """Return the value of the quantity, a scalar in `unit`, from an `evaluation` of a scene."""

@@ -11,6 +11,7 @@ from jaxvib.machine.validation import allowed_unknowns
 from jaxvib.results.status import status_names
 from jaxvib.steady.jams.phases import phase_jam
 from jaxvib.steady.outcome import unknown_is_positive
+from optimize import static_deflection, total_mass
 
 BALL = dict(count=1, mass=0.5, radius=0.1, drag=0.5)
 ONE = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0), jv.balls(**BALL), jv.ConstantSpeed(60.0))
@@ -27,6 +28,9 @@ QUESTIONS = {
     "phase_jams": (ROTOR, lambda scene: jv.phase_jams(scene, near=(jnp.asarray(165.0), jnp.zeros(2)))),
     "whirl": (ROTOR, jv.whirl),
     "critical_speeds": (ROTOR, jv.critical_speeds),
+    "mode_shapes": (ONE, jv.mode_shapes),
+    "branches": (ONE, lambda scene: jv.branches(scene, points=20)),
+    "drag_limits": (ONE, jv.drag_limits),
 }
 
 PLACES = {
@@ -54,8 +58,16 @@ def test_numbers_that_are_not_allowed_end_in_a_status(question):
         for wrong in (-values[k], values[k] * jnp.nan):
             found = program([wrong if j == k else value for j, value in enumerate(values)])
             assert set(np.ravel(status_names(found.status))) == {"refused"}, list(PLACES)[k]
-            numbers = [leaf for leaf in jax.tree.leaves(found) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
-            assert all(bool(jnp.all(jnp.isnan(leaf))) for leaf in numbers)
+            leaves = jax.tree.leaves(found, is_leaf=lambda leaf: isinstance(leaf, jv.Scene))
+            numbers = [leaf for leaf in leaves if eqx.is_inexact_array(leaf)]
+            assert numbers and all(bool(jnp.all(jnp.isnan(leaf))) for leaf in numbers)
+
+
+@pytest.mark.parametrize("ask", [jv.natural_frequencies, static_deflection(1), total_mass(), 2.0 * total_mass()])
+def test_numbers_without_status_are_nan_if_not_allowed(ask):
+    program = jax.jit(lambda k, m: ask(eqx.tree_at(lambda s: (s.machine.stiffness, s.machine.mass), ONE, (k[None], m[None]))))
+    np.testing.assert_allclose(program(4e4, 50.0), ask(ONE), rtol=1e-12)
+    assert all(bool(jnp.all(jnp.isnan(program(*numbers)))) for numbers in ((-4e4, 50.0), (4e4, -3.0), (np.nan, 50.0)))
 
 
 def test_each_machine_of_a_batch_is_refused_for_itself():
