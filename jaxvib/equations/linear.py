@@ -52,7 +52,9 @@ _MAX_DIRECT_SIZE = 3
 """Largest number of coordinates for which `small_solve` writes the equations out."""
 
 
-LOST_FREQUENCY = "a natural frequency is lost in rounding errors: use double precision, or stiffnesses and masses that differ less"
+LOST_FREQUENCY = (
+    "a natural frequency is lost in rounding errors: use double precision, or stiffnesses and masses that differ less"
+)
 """Message of the status `lost_digits` of natural frequencies."""
 
 
