@@ -247,6 +247,7 @@ __all__ = [
     "with_spin",
     "natural_frequencies",
     "mode_shapes",
+    "ShapesStatus",
     "ModeShapes",
     "energy",
     "power",

@@ -18,14 +18,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.code_changes import code_state
-from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import primal_of, traced
 from jaxvib.runtime.devices import arrays_on_device
 from jaxvib.runtime.operations import pruned
 from jaxvib.runtime.primitive import CAN_DEFINE_PRIMITIVES, is_zero, primitive, zero_of
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
-from jaxvib.runtime.structure import Skeleton, Undescribable, describe
+from jaxvib.runtime.structure import Skeleton
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -87,9 +86,9 @@ class CachedFunction(Generic[P, T]):
 
     def _transformed(self, tracers: Sequence[Any], leaves: Sequence[Any], treedef: Any, args: Any, kwargs: Any) -> T:
         """Evaluate the function under a JAX transformation."""
-        if CAN_DEFINE_PRIMITIVES and program_folder() is not None and not is_debugging() and all(map(_is_simple, tracers)):
+        if CAN_DEFINE_PRIMITIVES and not is_debugging() and all(map(_is_simple, tracers)):
             call = _CallSignature(self, Skeleton.of(leaves, treedef))
-            if call.is_describable():
+            if call.is_hashable():
                 return call.result(_stored(*(leaf for leaf in leaves if eqx.is_array(leaf)), call=call))
         return self.stored.jitted(*args, **kwargs)
 
@@ -139,25 +138,17 @@ class _CallSignature:
         parts = jax.tree.leaves(jax.tree.map(spread, provided, result, is_leaf=_is_none), is_leaf=_is_none)
         return [part for part, x in zip(parts, jax.tree.leaves(result), strict=True) if eqx.is_array(x)]
 
-    def is_describable(self) -> bool:
-        """Return True if the call can be described in a key of a stored program."""
+    def is_hashable(self) -> bool:
+        """Return True if the call can be the key of a program."""
         try:
-            return _is_describable(self)
-        except TypeError:  # an argument is not hashable
+            hash(self)
+        except TypeError:
             return False
+        return True
 
 
 def _is_none(x: object) -> bool:
     return x is None
-
-
-@functools.lru_cache(256)
-def _is_describable(call: _CallSignature) -> bool:
-    try:
-        describe((call.function, call.arguments), lambda _: None)
-    except Undescribable:
-        return False
-    return True
 
 
 # --- programs of derivatives; `active` is True for arrays with a tangent, `wanted` for outputs with a nonzero cotangent ---
@@ -282,7 +273,8 @@ def _traced_pullback(call: _CallSignature, active: tuple[bool, ...], types: _Typ
 
 
 def _types(arrays: Sequence[Array]) -> _Types:
-    return tuple((x.shape, str(x.dtype), bool(jax.typeof(x).weak_type)) for x in arrays)
+    types = [jax.typeof(x) for x in arrays]  # JAX passes a Python number as an object without a shape
+    return tuple((each.shape, str(each.dtype), bool(each.weak_type)) for each in types)
 
 
 @cached

@@ -151,7 +151,7 @@ def test_an_argument_without_a_hash_is_differentiated_as_before(asked):
         __hash__ = None
 
     call = programs._CallSignature(programs.cached(labelled), structure.Skeleton(((X, Bare()), {})))
-    assert not call.is_describable()
+    assert not call.is_hashable()
 
 
 def test_whole_numbers_have_no_tangent(asked):

@@ -192,6 +192,23 @@ def test_programs_that_cannot_be_stored_are_freed_too(folder, monkeypatch, reaso
     assert traces == ["a", "b", "c", "a"] and not list(folder.iterdir())
 
 
+@pytest.mark.parametrize("reason", ["class of another package", "no folder"])
+def test_gradients_that_cannot_be_stored_are_freed_too(folder, monkeypatch, reason):
+    structure.KNOWN_PACKAGES.discard(__name__)
+    if reason == "no folder":
+        cache.set_program_folder(None)
+    function = programs.cached(doubled)
+    monkeypatch.setattr(function.stored, "jitted", None)  # has a cache without a limit
+    parts = [each.stored for each in (function, programs._vjp_forward, programs._vjp_backward)]
+    monkeypatch.setattr(stored, "_functions", weakref.WeakSet(parts))
+    monkeypatch.setattr(stored, "MAX_PROGRAM_MEMORY", 5 * stored.MEMORY_PER_PROGRAM)
+    for name in ("a", "b", "c", "d", "e", "a"):
+        slope = jax.grad(lambda x, name=name: function(Pair(x, name), 2.0)[0].first[1])(jnp.arange(3.0))
+        assert slope.tolist() == [0.0, 2.0, 0.0]
+        assert 2 <= sum(len(part.ready) for part in parts) <= 4
+    assert len(traces) >= 6 and not list(folder.iterdir())
+
+
 def test_a_stored_program_holds_no_trace(folder):
     """An exported program holds the function to differentiate it, and with it the trace; a deserialized one does not."""
     function = programs.cached(doubled)
