@@ -14,11 +14,12 @@ from jaxvib.equations.dynamics import dynamics_of
 from jaxvib.equations.model import assemble
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import Measured, Trajectory, measure, trajectory, turning_angles
+from jaxvib.motion.analysis.measure import Measured, Peaks, Trajectory, locate_peaks, measure, trajectory, turning_angles
 from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.integrate import angle_wrapping, is_finite
 from jaxvib.motion.system import PackedSystem
+from jaxvib.numerics.extrema import NODES
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.types import Y as IntegratorState
 from jaxvib.runtime.compat import fast_diffrax_loop_end
@@ -33,6 +34,9 @@ _ACCELERATOR_BATCH_SIZE = 2**18
 PARTS_OF_RUN = 64
 """Number of equal parts of a run before its window; the mean speed of each load is measured over each part."""
 
+
+_STEPS_PER_BLOCK = 16
+"""Approximate number of steps of a block, in which the largest values are determined from the state at each step."""
 
 _DOUBLINGS = 40
 """Number of doublings with which the end of the first implicit step, 1e-12 of a regular step, becomes that of a regular
@@ -107,6 +111,7 @@ class BatchPlan(NamedTuple):
     - `each`: number of steps in each of the `PARTS_OF_RUN` parts before the window
     - `between`: number of steps from one sample to the next
     - `implicit`: True if decay is too fast for explicit steps
+    - `blocks`: number of blocks of a part, in each of which the largest values are determined; 0: they are not determined
     """
 
     until: float
@@ -115,6 +120,12 @@ class BatchPlan(NamedTuple):
     each: int
     between: int
     implicit: bool = False
+    blocks: int = 0
+
+    def with_peaks(self) -> BatchPlan:
+        """Return the plan with largest values, which makes at least as many steps."""
+        blocks = -(-self.each // _STEPS_PER_BLOCK)
+        return self._replace(blocks=blocks, each=blocks * max(NODES - 1, -(-self.each // blocks)))
 
 
 class BatchRun(NamedTuple):
@@ -123,7 +134,7 @@ class BatchRun(NamedTuple):
     **Attributes**: `scene`; `window`: trajectory in the measuring window; `measured`: the quantities measured in the window;
     `regime` of the window, None without loads or with several exciters; `part_speed` (PARTS_OF_RUN, count): mean speeds of the
     loads, or of rotors without loads, rad/s, over the equal parts before the window; `part_length` of such a part, s; `finite`:
-    True if the motion stayed finite.
+    True if the motion stayed finite; `peaks` of the whole run, None if the plan has no blocks.
     """
 
     scene: Scene
@@ -133,6 +144,7 @@ class BatchRun(NamedTuple):
     part_speed: Array
     part_length: Array
     finite: Array
+    peaks: Peaks | None = None
 
 
 def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
@@ -148,29 +160,59 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS_OF_RUN
     spacing = plan.window / (plan.samples - 1)
 
-    def part(packed: IntegratorState, at: tuple[Array, Array]) -> tuple[IntegratorState, IntegratorState]:
+    def part(packed: IntegratorState, at: tuple[Array, Array]) -> tuple[IntegratorState, tuple[IntegratorState, Peaks | None]]:
         packed, _ = advance(motion, packed, *at, jnp.asarray(length / plan.each, dtype), implicit=plan.implicit)
-        return packed, packed
+        return packed, (packed, None)
 
     def sample(packed: IntegratorState, k: Array) -> tuple[IntegratorState, IntegratorState]:
         at, step = begin + k * spacing, jnp.asarray(spacing / plan.between, dtype)
         moved, _ = advance(motion, packed, at, jnp.asarray(spacing, dtype), step, implicit=plan.implicit)
         return moved, moved
 
+    def block(packed: IntegratorState, at: tuple[Array, Array]) -> tuple[IntegratorState, Peaks]:
+        """Advance by a block, and return the largest values in it."""
+        (begin, length), number = at, plan.each // plan.blocks
+
+        def single_step(packed: IntegratorState, k: Array) -> tuple[IntegratorState, IntegratorState]:
+            step = length / number
+            moved, _ = advance(motion, packed, begin + k * step, step, step, implicit=plan.implicit)
+            return moved, moved
+
+        last, later = jax.lax.scan(single_step, packed, jnp.arange(number, dtype=dtype))
+        states = motion.unpack(prepend(packed, later))
+        return last, locate_peaks(model, field, begin + length / number * jnp.arange(number + 1, dtype=dtype), states)
+
+    def part_with_peaks(
+        packed: IntegratorState, at: tuple[Array, Array]
+    ) -> tuple[IntegratorState, tuple[IntegratorState, Peaks | None]]:
+        begin, length = at[0], at[1] / plan.blocks
+        begins = begin + length * jnp.arange(plan.blocks, dtype=dtype)
+        packed, peaks = jax.lax.scan(block, packed, (begins, jnp.full(plan.blocks, length)))
+        return packed, (packed, jax.tree.map(lambda peak: jnp.max(peak, axis=0), peaks))
+
     first = motion.pack(state)
     sizes = jnp.asarray(length, dtype), jnp.asarray(length / plan.each, dtype)
     packed, begins, lengths = divide_run(motion, first, *sizes, PARTS_OF_RUN, implicit=plan.implicit)
-    packed, parts = jax.lax.scan(part, packed, (begins, lengths))
+    packed, (parts, part_peaks) = jax.lax.scan(part_with_peaks if plan.blocks else part, packed, (begins, lengths))
     _, later = jax.lax.scan(sample, packed, jnp.arange(plan.samples - 1, dtype=dtype))
-    packed_history = jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, parts)
+    packed_history = prepend(first, parts)
     azimuth, _ = turning_angles(
         scene, lambda: length * jnp.arange(PARTS_OF_RUN + 1, dtype=dtype), motion.unpack(packed_history)
     )
-    states = motion.unpack(jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), packed, later))
+    states = motion.unpack(prepend(packed, later))
     times = begin + spacing * jnp.arange(plan.samples, dtype=dtype)
     window = trajectory(model, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length
     measured = measure(model, field, times, states, natural_units(scene))
     has_regime = len(scene.exciters) == 1 and scene.exciter.loads is not None
     kind = regime(scene, window) if has_regime else None
-    return BatchRun(scene, window, measured, kind, speed, jnp.asarray(length, dtype), is_finite(states))
+    peaks = None
+    if part_peaks is not None:
+        last_peaks = locate_peaks(model, field, times, states)
+        peaks = jax.tree.map(lambda parts, last: jnp.maximum(jnp.max(parts, axis=0), last), part_peaks, last_peaks)
+    return BatchRun(scene, window, measured, kind, speed, jnp.asarray(length, dtype), is_finite(states), peaks)
+
+
+def prepend(first: IntegratorState, later: IntegratorState) -> IntegratorState:
+    """Return a state of the integrator and later ones as one history along a leading axis."""
+    return jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, later)

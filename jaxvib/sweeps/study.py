@@ -122,7 +122,8 @@ def _run_plan(
         raise InputError("until", f"is missing; {runs[0].name} is measured in a run; give the duration of the run")
     end = float(number(until, "s", "until", low=0.0, open_low=True))
     initial_state(scene, start, mode=mode, throw=False)  # raises an error for a start that the scene cannot have
-    return plan_runs_of_cases(scene, axes, end, None if steps is None else count(steps, "steps"))
+    plan = plan_runs_of_cases(scene, axes, end, None if steps is None else count(steps, "steps"))
+    return plan.with_peaks() if any(m.of_whole_run for m in runs) else plan
 
 
 def _traced(study: Study) -> Study:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -241,6 +242,28 @@ def _extrema(model: Model, field: Field, times: Array, states: State) -> tuple[A
     # One output after the other fits the processor's cache.
     values_and_places = jax.lax.map(lambda pair: locate_extrema(*pair), _sampled_outputs(model, field, times, states))
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), values_and_places)
+
+
+class Peaks(NamedTuple):
+    """Largest values of a motion.
+
+    **Attributes**: `displacement` (nd,), m or rad: largest displacement of each coordinate from rest; `force` (nb,), N: largest
+    foundation force in each direction.
+    """
+
+    displacement: Array
+    force: Array
+
+
+def locate_peaks(model: Model, field: Field, times: Array, states: State) -> Peaks:
+    """Return the largest values of an evenly sampled part of a motion, between the samples as in `measure`.
+
+    **Arguments**: as for `measure`.
+    """
+    nd = states.displacement.shape[1]
+    (low, high), _, _ = _extrema(model, field, times, states)
+    largest = jnp.maximum(-low[2], high[2])
+    return Peaks(largest[:nd], largest[nd:])
 
 
 def _sampled_outputs(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array]:
