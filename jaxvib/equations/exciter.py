@@ -60,7 +60,7 @@ class Motion(NamedTuple):
     - `imbalance_derivatives` of the rotor, see `RotorDynamics._imbalance_derivatives`
     - `kinematics` of the loads
     - `drag` (count,): torque of the rotor on the loads
-    - `weight_torque` of the unbalance, see `RotorDynamics.weight_torque`
+    - `weight_torque` of gravity on the rotor, see `RotorDynamics.weight_torque`
     - `rolling`: forces on the loads if all of them roll
     - `housing`: speed at which the housing turns with the machine; None if it does not turn
     - `time`, s
@@ -142,7 +142,7 @@ class RotorDynamics(eqx.Module):
     def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
         """Return the quantities that do not depend on the accelerations, for a rotor that turns at `speed`."""
         no_loads, no_contact = Kinematics([], (), ()), ContactSolution(jnp.ones_like(speed), [], [])
-        drag, weight = jnp.zeros_like(speed), self.weight_torque(t, state)
+        drag, weight = jnp.zeros_like(speed), self._weight_torque_if_needed(t, state, housing)
         return Motion(state, speed, self._imbalance_derivatives(t, state), no_loads, drag, weight, no_contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
@@ -268,14 +268,23 @@ class RotorDynamics(eqx.Module):
         return list(first), second
 
     def weight_torque(self, t: Array, state: ExciterState) -> Array | None:
-        """Return S g cos(theta), the torque of gravity on the unbalance against the rotor's rotation.
+        """Return g dh/dtheta, the torque of gravity against the rotor's rotation.
 
-        None without an unbalance or without gravity in the rotor's plane.
+        h = S sin(theta) + sum M e sin(theta + angle) is the height of the unbalance and of the imbalances of the effects, kg m.
+        None for a rotor without unbalance and imbalances, or without gravity in the rotor's plane.
         """
         g = total_gravity(self.effects)
-        if self.unbalance is None or 1 not in g:
+        imbalances = [term for term in terms_of(self.effects, RotorImbalance) if not term.about_tilts]
+        if 1 not in g or (self.unbalance is None and not imbalances):
             return None
-        return self.unbalance * g[1] * jnp.cos(self.drive.rotor_angle(t, state.rotor))
+        angle = self.drive.rotor_angle(t, state.rotor)
+        torques = [] if self.unbalance is None else [self.unbalance * g[1] * jnp.cos(angle)]
+        torques += [g[1] * term.at(angle).static[0] for term in imbalances]  # d sin/dtheta = cos, the horizontal component
+        return total(torques)
+
+    def _weight_torque_if_needed(self, t: Array, state: ExciterState, housing: Array | None) -> Array | None:
+        """Return `weight_torque`; None under an ideal drive whose reaction on the housing has no effect."""
+        return None if state.rotor is None and housing is None else self.weight_torque(t, state)
 
     def _total(self, values: Array, *levers: Array | None) -> Array:
         """Return the sum of `values` over all loads; for a rotor without loads, return `values` unchanged."""
@@ -302,7 +311,8 @@ class ExciterDynamics(RotorDynamics):
         unsigned = (term.friction(self.loads, state.angle, state.rate, speed, g) for term in terms)
         friction = [each.signed({}) if each.normal is None else each for each in unsigned]
         contact = ContactSolution(self.loads.inertia_factor(), force, friction)
-        return Motion(state, speed, imbalance_derivatives, of_loads, drag, self.weight_torque(t, state), contact, housing, t)
+        weight = self._weight_torque_if_needed(t, state, housing)
+        return Motion(state, speed, imbalance_derivatives, of_loads, drag, weight, contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Express the accelerations of loads and rotor in terms of the accelerations of the mount's rows.

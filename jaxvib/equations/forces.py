@@ -157,8 +157,9 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
         parts += _load_energies(exciter.loads, mount, effects, v, part, rate)
         parts.append(rate * _imbalance_rate(exciter, mount, turn) @ v)
         weight = total_gravity(effects).get(1)
-        if exciter.unbalance is not None and weight is not None:
-            parts.append(exciter.unbalance * weight * jnp.sin(turn))
+        if weight is not None:
+            parts += [] if exciter.unbalance is None else [exciter.unbalance * weight * jnp.sin(turn)]
+            parts += [weight * term.at(turn).static[1] for term in terms_of(effects, RotorImbalance) if not term.about_tilts]
         motor = drive.torque_and_inertia(t, rate, (part.rotor or ())[2:])
         if motor is not None:
             parts.append(0.5 * motor[1] * rate**2)

@@ -18,9 +18,10 @@ from jaxvib.boundary import call_user
 from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.effects.base import total_gravity
+from jaxvib.machine.effects.base import terms_of, total_gravity
+from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.files import rebuild_part
-from jaxvib.machine.scene import Scene, read_unbalance, require_comparable
+from jaxvib.machine.scene import Exciter, Scene, read_unbalance, require_comparable
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.units import conditions_of_traced_values, require_real
@@ -182,7 +183,7 @@ _SWING_SHARE = 0.7246113537767085
 
 def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
     """Return 0.7246 S g, the least constant torque that turns a hanging unbalance over the top, and L(0), the torque of the
-    motor at rest, N m.
+    motor at rest, N m. S contains the static imbalances.
 
     The unbalance swings past the height at which the torque would hold it: torque x > S g (1 - cos x) for every angle x.
 
@@ -193,11 +194,22 @@ def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
     for exciter in scene.exciters:
         zero = jnp.zeros_like(exciter.drive.speed)
         motor = exciter.drive.torque_and_inertia(zero, zero)
-        if exciter.unbalance is None or motor is None or 1 not in gravity:
+        moment = first_moment(exciter)
+        if moment is None or motor is None or 1 not in gravity:
             found.append(None)
         else:
-            found.append((_SWING_SHARE * exciter.unbalance * jnp.abs(gravity[1]), motor[0]))
+            found.append((_SWING_SHARE * moment * jnp.abs(gravity[1]), motor[0]))
     return found
+
+
+def first_moment(exciter: Exciter) -> Array | None:
+    """Return |S + sum M e exp(i angle)| of the unbalance and the static imbalances, kg m; None without them."""
+    terms = [term for term in terms_of(exciter.effects, RotorImbalance) if not term.about_tilts]
+    if not terms:
+        return exciter.unbalance
+    own = jnp.zeros_like(exciter.drive.speed) if exciter.unbalance is None else exciter.unbalance
+    vectors = [term.at(jnp.zeros_like(term.phase)).static for term in terms]
+    return jnp.hypot(own + sum(x for x, _ in vectors), sum(y for _, y in vectors))
 
 
 def start_notes(scene: Scene) -> list[str]:

@@ -28,7 +28,9 @@ def exciter(k, places):
     """Exciters with loads, with an unbalance and with both, in turn, in both directions, under every kind of drive."""
     loads = None if k % 3 == 1 else balls(k)
     unbalance = None if k % 3 == 0 else 0.05 + 0.02 * k
-    return jv.Exciter(loads, drive(k), unbalance=unbalance, at=places[k % len(places)], direction=(1, -1)[(k // 2) % 2])
+    at, direction = places[k % len(places)], (1, -1)[(k // 2) % 2]
+    imbalance = (jv.StaticImbalance(0.03, angle=0.4 + k),) if k % 4 == 1 else ()
+    return jv.Exciter(loads, drive(k), unbalance=unbalance, at=at, direction=direction, effects=imbalance)
 
 
 NETWORK = jv.network(
@@ -61,6 +63,12 @@ def state_of(scene, seed=0):
     leaves, structure = jax.tree.flatten(jv.initial_state(scene))
     sizes = [3.0 * rng.normal(size=np.shape(leaf)) for leaf in leaves]
     return jax.tree.unflatten(structure, [jnp.asarray(x) for x in sizes])
+
+
+def first_moments(e):
+    """First moments and phases of the unbalance and of the imbalance of an exciter."""
+    own = [] if e.unbalance is None else [(e.unbalance, 0.0)]
+    return own + [(effect.moment, effect.angle) for effect in e.effects]
 
 
 def axis_point(machine, at, q):
@@ -97,8 +105,8 @@ def lagrange(scene, state):
                 m, r = e.loads.mass, e.loads.radius
                 own = jnp.stack([-r * rate * jnp.sin(phi), r * rate * jnp.cos(phi)])
                 total += 0.5 * jnp.sum(m * (own + point[:, None]) ** 2) + 0.5 * 0.4 * m * r**2 * jnp.sum(rate**2)
-            if e.unbalance is not None:
-                total += e.unbalance * turn * (-jnp.sin(theta) * point[0] + jnp.cos(theta) * point[1])
+            for moment, phase in first_moments(e):
+                total += moment * turn * (-jnp.sin(theta + phase) * point[0] + jnp.cos(theta + phase) * point[1])
             total += 0.5 * getattr(e.drive, "inertia", 0.1) * turn**2
         return total
 
@@ -107,8 +115,8 @@ def lagrange(scene, state):
         for e, phi, theta in parts(x):
             if e.loads is not None:
                 total += G * e.loads.mass * e.loads.radius * jnp.sum(jnp.sin(phi))
-            if e.unbalance is not None:
-                total += G * e.unbalance * jnp.sin(theta)
+            for moment, phase in first_moments(e):
+                total += G * moment * jnp.sin(theta + phase)
         return total
 
     def resisting(v):

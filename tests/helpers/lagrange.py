@@ -72,6 +72,9 @@ def residual(s, t, state, field):
 
     def potential(x):
         total = g * m * sum(bob(x, j)[1] - centre(x, stations[j])[1] for j in range(n))
+        if "static_imbalance" in kinds:
+            e = kinds["static_imbalance"]
+            total += g * e.moment * jnp.sin(x[-1] + e.angle)
         if vertical:
             k, link = s.machine.stiffness, s.machine.link_stiffness[0]
             total += 0.5 * jnp.sum(k * x[:2] ** 2) + 0.5 * link * (x[0] - x[1]) ** 2

@@ -10,7 +10,7 @@ from scenes import BALLS, machines, scene
 
 import jaxvib as jv
 from jaxvib.machine import validation as module
-from jaxvib.machine.validation import validate_scene
+from jaxvib.machine.validation import lifting_torques, validate_scene
 
 
 def changed(where, value, s=None):
@@ -146,3 +146,12 @@ def test_one_station_in_a_list_is_that_of_all_loads():
         listed, single = (jv.Scene(jv.rotor(stations=s, **parts), loads, jv.ConstantSpeed(60.0)) for s in ([0.1], 0.1))
         validate_scene(listed)
         assert jv.scene_to_toml(listed) == jv.scene_to_toml(single)
+
+
+@pytest.mark.parametrize(("angle", "moment"), [(0.0, 0.7), (np.pi, 0.1), (np.pi / 2, 0.5)])
+def test_motor_lifts_the_sum_of_unbalance_and_imbalance(angle, moment):
+    motor = jv.DCMotor(100.0, stall_torque=2.5, inertia=0.5)
+    exciter = jv.Exciter(drive=motor, unbalance=0.4, effects=jv.StaticImbalance(0.3, angle=angle))
+    table = jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), exciters=[exciter], effects=jv.Gravity())
+    ((needed, start),) = lifting_torques(table)
+    assert float(needed) == pytest.approx(0.724611 * moment * 9.81, rel=1e-6) and float(start) == 2.5

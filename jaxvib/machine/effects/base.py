@@ -192,7 +192,7 @@ class StaticImbalance(Effect):
     """Static imbalance: the offset of the rotor's centre of mass from its axis is e (cos(theta + angle), sin(theta + angle)).
 
     theta is the rotor's angle. The force on the machine at the rotor is - M e d^2/dt^2 (cos(theta + angle), sin(theta +
-    angle)).
+    angle)). With `Gravity` the torque of its weight on the rotor is - M e g cos(theta + angle).
 
     **Arguments** (SI, or strings with a unit)
 

@@ -34,7 +34,7 @@ from jaxvib.machine.effects.base import terms_of, total_gravity
 from jaxvib.machine.effects.terms import LoadPotential
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
-from jaxvib.machine.validation import validate_scene
+from jaxvib.machine.validation import first_moment, validate_scene
 from jaxvib.motion.analysis.measure import MIN_CHANGE_SCALE, Measured, turning_directions
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.analysis.separation import MIN_SEPARATION_GROWTH, nearly_coincident_pairs
@@ -440,10 +440,10 @@ def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes
                 continue
             height, slope = potential
             lifted = field.drag[here] * jnp.max(window.rotor_speeds[k] * exciter.direction) > slope
-        elif gravity is None or exciter.drive.ideal or exciter.unbalance is None:
+        elif gravity is None or exciter.drive.ideal or (moment := first_moment(exciter)) is None:
             continue
         else:
-            height, lifted = 2.0 * exciter.unbalance * jnp.abs(gravity)[None], starts[k]
+            height, lifted = 2.0 * moment * jnp.abs(gravity)[None], starts[k]
         passes = height / field.inertia[here]
         ends = jnp.min(window.load_speed[:, here] ** 2, axis=0) > passes
         each.append(jnp.all(ends & (lifted | (begin.rate[here] ** 2 > passes))))
