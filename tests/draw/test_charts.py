@@ -127,6 +127,18 @@ def test_a_branch_diagram_has_linear_axes_on_request():
     assert axes[1].get_ylim() == pytest.approx((0.0, 1.08 * 25.0e3))
 
 
+def test_small_motions_at_the_end_have_their_own_unit():
+    t = np.linspace(0.0, 1.0, 8001)
+    wave = np.sin(80.0 * np.pi * t)[:, None]
+    one = np.full_like(wave, 100.0)
+    whole = (t, np.hstack([2e-3 * wave, 1e-2 * wave]), one, one, wave)
+    end = (t, np.hstack([7e-8 * wave, 3e-9 * wave]), one, one, wave)
+    axes = time_histories(whole, end, names=("y", "theta"), units=("m", "rad"), directions=("up",)).axes
+    assert [axis.get_ylabel() for axis in axes[:4]] == ["displacement, mm", "displacement, µm", "tilt, mrad", "tilt, µrad"]
+    assert np.max(axes[1].lines[0].get_ydata()) == pytest.approx(0.07, rel=1e-3)
+    assert np.max(axes[3].lines[0].get_ydata()) == pytest.approx(0.003, rel=1e-3)
+
+
 def test_a_history_says_at_what_time_it_begins():
     time = np.linspace(0.0, 50.0, 4000)
     motion = 1e-3 * np.sin(20.0 * time)[:, None]

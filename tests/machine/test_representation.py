@@ -29,3 +29,8 @@ def test_traced_numbers_show_their_shape():
 
 def test_texts_are_shown_as_python_writes_them():
     assert repr(jv.Gravity(9.8125, along="axis")) == "gravity(g=9.8125 m/s^2, along='axis')"
+
+
+def test_a_part_with_arrays_has_no_hash():
+    with pytest.raises(TypeError, match=r"Scene contains arrays and has no hash.*jv\.scene_to_toml\(scene\)"):
+        hash(scene(next(iter(machines())), next(iter(loads()))))

@@ -74,8 +74,8 @@ def time_histories(
 ) -> Drawn:
     """Draw the histories of a run in two columns: the `whole` run as bands between its peaks, and its last periods as curves.
 
-    The rows are displacements in mm or µm, tilts in mrad if there are any, speeds of loads and rotor in `unit`, and the
-    foundation force in N. Loads that move equally are one line.
+    The rows are displacements in mm or µm, tilts in mrad or µrad if there are any, speeds of loads and rotor in `unit`, and the
+    foundation force in N. If the last periods have another unit, it is beside their axis. Loads that move equally are one line.
 
     **Arguments** (nt times, nd coordinates, nb directions of the force)
 
@@ -99,16 +99,8 @@ def time_histories(
     periods = (whole[0][-1] - whole[0][0]) / period
     bins = min(_BINS, int(periods / 1.25)) if periods > _MAX_PLAIN_PERIODS else whole[0].size
     part = [values[last_periods(end[0], end[1])] for values in end]
-    depth = np.argsort(np.argsort(-np.ptp(whole[1], axis=0)))  # signals of larger range are drawn first, below smaller ones
-    for row, (kind, label, factor) in enumerate(kinds):
-        of_kind = [k for k in range(len(names)) if units[k] == kind]
-        left, right = axes[2 * row : 2 * row + 2]
-        for k in of_kind:
-            _draw_band(left, whole[0], factor * whole[1][:, k], k, names[k], bins, depth[k])
-        for k in of_kind:
-            right.plot(part[0], factor * part[1][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.3)
-        left.set_ylabel(label)
-        legend_above(left, 6)
+    for kind, left, right in zip(kinds, axes[0:-4:2], axes[1:-4:2], strict=True):
+        _draw_coordinates(left, right, kind, whole[:2], part[:2], names, units, bins)
     left, right = axes[-4:-2]
     for k, name in _equal_loads(whole[2], part[2]):
         _draw_band(left, whole[0], scale * whole[2][:, k], k, name, bins)
@@ -140,10 +132,39 @@ def time_histories(
     return figure if ax is None else ax
 
 
+def _draw_coordinates(
+    left: Axes,
+    right: Axes,
+    kind: tuple[str, str, float],
+    whole: Sequence[np.ndarray],
+    end: Sequence[np.ndarray],
+    names: Sequence[str],
+    units: Sequence[str],
+    bins: int,
+) -> None:
+    """Draw the coordinates of a `kind`, see `_kinds`, over the whole run and over its last periods.
+
+    The label of the right axis names its unit if it differs from that of the left axis.
+    """
+    unit, label, factor = kind
+    label_at_end, factor_at_end = next(x[1:] for x in _kinds(end[1], units, "displacement", "tilt") if x[0] == unit)
+    depth = np.argsort(np.argsort(-np.ptp(whole[1], axis=0)))  # signals of larger range are drawn first, below smaller ones
+    for k in (k for k in range(len(names)) if units[k] == unit):
+        _draw_band(left, whole[0], factor * whole[1][:, k], k, names[k], bins, depth[k])
+        look = {"color": COLORS[k % len(COLORS)], "ls": STROKES[k % len(STROKES)]}
+        right.plot(end[0], factor_at_end * end[1][:, k], lw=1.3, **look)
+    left.set_ylabel(label)
+    legend_above(left, 6)
+    if label_at_end != label:
+        right.set_ylabel(label_at_end)
+
+
 def _kinds(values: np.ndarray, units: Sequence[str], length: str, tilt: str) -> list[tuple[str, str, float]]:
     """Return the unit, the label and the factor of each kind of coordinates among signals (nt, nd): lengths and tilts."""
     unit, factor = length_unit(values[:, np.asarray(units) == "m"])
-    kinds = (("m", f"{length}, {unit}", factor), ("rad", f"{tilt}, mrad", 1e3))
+    is_small = np.max(np.abs(values[:, np.asarray(units) == "rad"]), initial=0.0) < 1e-6
+    tilt_unit, tilt_factor = ("µrad", 1e6) if is_small else ("mrad", 1e3)
+    kinds = (("m", f"{length}, {unit}", factor), ("rad", f"{tilt}, {tilt_unit}", tilt_factor))
     return [kind for kind in kinds if kind[0] in units]
 
 

@@ -145,6 +145,13 @@ class Part(eqx.Module):
             return f"{name}(\n    {lines},\n)"
         return f"{name}({', '.join(shown)})"
 
+    def __hash__(self) -> int:
+        try:
+            return super().__hash__()
+        except TypeError:
+            problem = f"{type(self).__name__} contains arrays and has no hash, like every equinox.Module with arrays"
+            raise TypeError(f"{problem}; as a key use a text such as jv.scene_to_toml(scene)") from None
+
 
 def _shown(value: object, spec: NumberSpec) -> str:
     if not hasattr(value, "dtype"):
