@@ -19,7 +19,7 @@ jv.prepare_cpu()
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 
-from jaxvib.runtime.operations import operations  # noqa: E402
+from jaxvib.runtime.operations import count_operations  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
@@ -60,7 +60,7 @@ def row(count: int) -> tuple[int, int, float, float]:
         begun = time.process_time()
         jax.block_until_ready(many(state))
         later.append((time.process_time() - begun) / REPEATS)
-    return operations(field, state), flops, first, min(later)
+    return count_operations(field, state), flops, first, min(later)
 
 
 def averaged_row(count: int) -> tuple[float, float]:

@@ -35,8 +35,9 @@ def optimize(
     tolerances: tuple[str, ...],
     output: Output,
 ) -> None:
-    """Search for the best machine of a DESIGN file; --out saves its scene file, the search, the figures and the motion of the
-    verification. Ctrl-C ends the search with the best machine found so far; --resume continues the search."""
+    """Search for the best machine of a DESIGN file; --out saves the scene file of the best machine (found.toml), the search,
+    the figures and the motion of the verification. Ctrl-C ends the search with the best machine found so far; --resume
+    continues the search."""
     from jaxvib.machine.files import read_toml
     from jaxvib.machine.rewrite import rewrite_scene
     from optimize import Synthesis, load_design, synthesize, tolerance_ranges

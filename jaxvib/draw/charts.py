@@ -46,7 +46,7 @@ def branch_diagram(
     units: Sequence[str] | None = None,
     at: float | None = None,
     unit: SpeedUnit | None = None,
-    criterion: str = "",
+    stability_text: str = "",
     show: Sequence[str] = PARTS,
     linear: bool = False,
     ax: Onto = None,
@@ -58,7 +58,7 @@ def branch_diagram(
     **Arguments** (n points, nd coordinates)
 
     - `rotor_speed` (n,), `omega` (n,): rotor speed and load speed, rad/s, drawn in `unit`
-    - `stable` (n,): True if stable; `criterion`: the criterion of stability, written below the figure
+    - `stable` (n,): True if stable; `stability_text`: how stability is determined, written below the figure
     - `amplitude` (n, nd): amplitudes, m, drawn in mm or µm, or rad, drawn in mrad, if `units` (nd,) contains "rad"; `units`
       None: all m
     - `force` (n,): foundation force, N
@@ -107,8 +107,8 @@ def branch_diagram(
         legend_outside(figure, axes, 4 if columns > 1 else 2)
     else:
         legend_above(axes[0], 2)
-    if criterion and ax is None:
-        figure.supxlabel(f"stable {criterion}", fontsize="small", color="#555555")
+    if stability_text and ax is None:
+        figure.supxlabel(f"stable {stability_text}", fontsize="small", color="#555555")
     return figure if ax is None else ax
 
 

@@ -54,7 +54,7 @@ class Dynamics(eqx.Module):
     The accelerations of the carrier are those without exciters plus those due to the forces of the exciters. P contains, one
     below the other, the nP rows of all mounts on which loads or an unbalanced rotor act.
 
-    - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G (or None), (nd, nd)
+    - `stiffness_per_mass` M^-1 K, `damping_per_mass` M^-1 C, `gyroscopic_per_mass` M^-1 G (or None), (nd, nd)
     - `input_matrix` M^-1 P^T (nd, nP): acceleration per force on the rows
     - `accelerance` P M^-1 P^T (nP, nP), and `rows` P (nP, nd)
     - `mass` M (nd, nd) if P has more rows than there are coordinates, otherwise None
@@ -63,9 +63,9 @@ class Dynamics(eqx.Module):
       for each use; time integration has fences of its own
     """
 
-    stiffness: Array
-    damping: Array
-    gyroscopic: Array | None
+    stiffness_per_mass: Array
+    damping_per_mass: Array
+    gyroscopic_per_mass: Array | None
     input_matrix: Array
     accelerance: Array
     rows: Array
@@ -139,9 +139,9 @@ class Dynamics(eqx.Module):
         supports = tuple(_Support(support.rows, every @ support.input_matrix) for support in self.supports)
         return dataclasses.replace(
             self,
-            stiffness=every @ self.stiffness,
-            damping=every @ self.damping,
-            gyroscopic=None if self.gyroscopic is None else every @ self.gyroscopic,
+            stiffness_per_mass=every @ self.stiffness_per_mass,
+            damping_per_mass=every @ self.damping_per_mass,
+            gyroscopic_per_mass=None if self.gyroscopic_per_mass is None else every @ self.gyroscopic_per_mass,
             input_matrix=every @ self.input_matrix,
             rows=jnp.eye(self.rows.shape[0], every.shape[0], dtype=every.dtype),
             supports=supports,
@@ -149,16 +149,16 @@ class Dynamics(eqx.Module):
 
     def _unforced(self, state: State, speeds: Sequence[Array]) -> Array:
         """Return the accelerations of the carrier without exciters."""
-        flow = -times(self.stiffness, state.displacement) - times(self.damping, state.velocity)
-        if self.gyroscopic is not None:
+        acceleration = -times(self.stiffness_per_mass, state.displacement) - times(self.damping_per_mass, state.velocity)
+        if self.gyroscopic_per_mass is not None:
             each = ungroup(self.groups, speeds)
             speed = each[0] if len(each) == 1 else sum(each[1:], each[0]) / len(each)
-            flow = flow - speed * times(self.gyroscopic, state.velocity)
+            acceleration = acceleration - speed * times(self.gyroscopic_per_mass, state.velocity)
         effects = self.exciters[0].effects if self.supports else ()
         for term, support in zip(terms_of(effects, SupportForce), self.supports, strict=True):
             x, v = times(support.rows, state.displacement), times(support.rows, state.velocity)
-            flow = flow - times(support.input_matrix, term.force(x, v))
-        return flow
+            acceleration = acceleration - times(support.input_matrix, term.force(x, v))
+        return acceleration
 
     def _solve_rows(self, parts: Sequence[Eliminated], unforced: Array) -> tuple[list[list[Array]], Array]:
         """Return the accelerations of the rows of each exciter, by group, and those of the carrier."""
@@ -262,8 +262,8 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
     exciters = [_exciter_dynamics(*each, scene.effects) for each in zip(scene.exciters, model.mounts, strict=True)]
     groups, moving = _groups_of_directions(exciters, [exciter.direction for exciter in scene.exciters]), []
     for k in itertools.chain.from_iterable(group.members for group in groups):
-        turn = exciters[k].turn
-        moving += [*model.mounts[k].rows[: exciters[k].row_count], *([] if turn is None else [turn])]
+        housing_row = exciters[k].housing_row
+        moving += [*model.mounts[k].rows[: exciters[k].block_count], *([] if housing_row is None else [housing_row])]
     rows = moving[0] if len(moving) == 1 else jnp.concatenate(moving)
     parts = [carrier.stiffness, carrier.damping, rows.T, *(place.T for place in model.supports)]
     if gyroscopic is not None:
@@ -271,9 +271,9 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
     solved = solve(carrier.mass, jnp.concatenate(parts, axis=1))
     stiffness, damping, input_matrix, *rest = jnp.split(solved, np.cumsum([part.shape[1] for part in parts])[:-1], axis=1)
     return Dynamics(
-        stiffness=stiffness,
-        damping=damping,
-        gyroscopic=None if gyroscopic is None else rest[-1],
+        stiffness_per_mass=stiffness,
+        damping_per_mass=damping,
+        gyroscopic_per_mass=None if gyroscopic is None else rest[-1],
         input_matrix=input_matrix,
         accelerance=rows @ input_matrix,
         rows=rows,
@@ -307,10 +307,10 @@ def _groups_of_directions(exciters: Sequence[RotorDynamics], directions: Sequenc
 def _exciter_dynamics(exciter: Exciter, mount: Mount, shared: tuple[Effect, ...]) -> RotorDynamics:
     """Return the dynamics of an exciter under its own effects and those of the scene."""
     effects, loads = (*shared, *exciter.effects), exciter.loads
-    turn = None if mount.turn is None else mount.turn[None]
-    rotor = (mount.levers, mount.rotor_levers, turn, exciter.turning_drive, exciter.unbalance)
-    row_count = len(mount.rows) if has_term(effects, RotorImbalance) else len(mount.levers)
+    housing_row = None if mount.turn is None else mount.turn[None]
+    rotor = (mount.levers, mount.rotor_levers, housing_row, exciter.turning_drive, exciter.unbalance)
+    block_count = len(mount.rows) if has_term(effects, RotorImbalance) else len(mount.levers)
     if loads is None:
-        return RotorDynamics(*rotor, effects, mount.axes, row_count)
+        return RotorDynamics(*rotor, effects, mount.axes, block_count)
     effects = tuple(effect.prepare(loads, mount) for effect in effects)
-    return ExciterDynamics(*rotor, effects, mount.axes, row_count, loads)
+    return ExciterDynamics(*rotor, effects, mount.axes, block_count, loads)

@@ -6,7 +6,8 @@ obeys u'' = H^-1 (r - E a). Here a is the acceleration of the point that carries
 proportional to the normal force of the load, the factor of a in this friction is subtracted. The load exerts the force
 -(W a + g) on that point, with W = m 1 - m J H^-1 E (1 is the unit matrix) and g = m (J H^-1 r + c). The unbalanced rotor of a
 motor exerts a force of the same form. The added mass and the reaction of the exciter are the sums of W and g over all loads,
-with the levers of the loads on the rows of the mount. These two contain the whole effect of the exciter on the machine.
+with the levers of the loads on the rows of the mount. (The added mass is the apparent mass of the exciter, not that of a
+fluid; the reaction has the sign opposite to the force.) These two contain the whole effect of the exciter on the machine.
 """
 
 from __future__ import annotations
@@ -59,10 +60,10 @@ class Motion(NamedTuple):
     - `state`; `speed` of the rotor, rad/s
     - `imbalance_derivatives` of the rotor, see `RotorDynamics._imbalance_derivatives`
     - `kinematics` of the loads
-    - `drag` (count,): torque of the rotor on the loads
+    - `drag_torque` of the rotor on the loads, (count,) N m; a scalar 0 without loads
     - `weight_torque` of gravity on the rotor, see `RotorDynamics.weight_torque`
     - `rolling`: forces on the loads if all of them roll
-    - `housing`: speed at which the housing turns with the machine; None if it does not turn
+    - `housing_speed` at which the housing turns with the machine, rad/s; None if it does not turn
     - `time`, s
     """
 
@@ -70,16 +71,16 @@ class Motion(NamedTuple):
     speed: Array
     imbalance_derivatives: tuple[list[Array], list[Array]] | None
     kinematics: Kinematics
-    drag: Array
+    drag_torque: Array
     weight_torque: Array | None
     rolling: ContactSolution
-    housing: Array | None
+    housing_speed: Array | None
     time: Array
 
     @property
     def driven_speed(self) -> Array:
         """Speed of the rotor relative to its housing, rad/s."""
-        return self.speed if self.housing is None else self.speed - self.housing
+        return self.speed if self.housing_speed is None else self.speed - self.housing_speed
 
 
 class Eliminated(NamedTuple):
@@ -88,7 +89,8 @@ class Eliminated(NamedTuple):
     **Attributes**
 
     - `acceleration_without_carrier`, `response_to_carrier`: loads move with
-      u'' = `acceleration_without_carrier` - `response_to_carrier` . a_j, where a_j is the acceleration at each load, by axis
+      u'' = `acceleration_without_carrier` - `response_to_carrier` . a_load, where a_load is the acceleration of the point that
+      carries each load, by axis
     - `added_mass`, `reaction`: the force of the exciter on the rows is -(`added_mass` a + `reaction`)
     - `rotor`: the rotor of a motor moves with theta'' = `rotor`[0] - `rotor`[1] . a; None under an ideal drive
     """
@@ -99,10 +101,10 @@ class Eliminated(NamedTuple):
     reaction: Sequence[Array | float]
     rotor: tuple[Array, list[Array]] | None
 
-    def acceleration(self, a: Axes) -> tuple[Array, ...]:
-        """Return u'' from `a`, the accelerations of the points that carry the loads."""
+    def acceleration(self, a_load: Axes) -> tuple[Array, ...]:
+        """Return u'' from `a_load`, the accelerations of the points that carry the loads."""
         return tuple(
-            f - sum(self.response_to_carrier[axis][i] * x for axis, x in a.items())
+            f - sum(self.response_to_carrier[axis][i] * x for axis, x in a_load.items())
             for i, f in enumerate(self.acceleration_without_carrier)
         )
 
@@ -113,22 +115,23 @@ class RotorDynamics(eqx.Module):
     **Attributes**
 
     - `levers` of the loads and `rotor_levers`, see `Mount`
-    - `turn`: row (1, nd) of the rotation of the housing, None if it does not turn
+    - `housing_row`: row (1, nd) of the rotation of the housing, None if it does not turn
     - `drive` in the direction of the exciter
     - `unbalance` about the axis, kg m, or None
     - `effects`, prepared for the loads
     - `axes` of the mount
-    - `row_count`: number of entries of `Mount.rows`, from the first, on which loads or an unbalanced rotor act
+    - `block_count`: number of entries of `Mount.rows`, from the first, on which loads or an unbalanced rotor act. Each entry is
+      a block of scalar rows, one for each of the `axes`; "the mount's rows" are the scalar rows of these blocks
     """
 
     levers: tuple[Array | None, ...]
     rotor_levers: tuple[Array | None, ...]
-    turn: Array | None
+    housing_row: Array | None
     drive: Drive
     unbalance: Array | None
     effects: tuple[Effect, ...]
     axes: tuple[int, ...] = eqx.field(static=True)
-    row_count: int = eqx.field(static=True)
+    block_count: int = eqx.field(static=True)
 
     @property
     def can_slide(self) -> bool:
@@ -137,23 +140,23 @@ class RotorDynamics(eqx.Module):
 
     def housing_speed(self, velocity: Array) -> Array | None:
         """Return the speed at which the housing turns with the machine; None if it does not turn."""
-        return None if self.turn is None else times(self.turn, velocity)[0]
+        return None if self.housing_row is None else times(self.housing_row, velocity)[0]
 
     def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
         """Return the quantities that do not depend on the accelerations, for a rotor that turns at `speed`."""
         no_loads, no_contact = Kinematics([], (), ()), ContactSolution(jnp.ones_like(speed), [], [])
-        drag, weight = jnp.zeros_like(speed), self._weight_torque_if_needed(t, state, housing)
-        return Motion(state, speed, self._imbalance_derivatives(t, state), no_loads, drag, weight, no_contact, housing, t)
+        no_drag, weight = jnp.zeros_like(speed), self._weight_torque_if_needed(t, state, housing)
+        return Motion(state, speed, self._imbalance_derivatives(t, state), no_loads, no_drag, weight, no_contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Express the exciter's own accelerations in terms of the accelerations of the mount's rows.
 
         The friction of `contact` must be linear in the accelerations, see `signed`.
         """
-        n = self.row_count * len(self.axes)
+        n = self.block_count * len(self.axes)
         added_mass: list[list[Array | float]] = [[0.0] * n for _ in range(n)]
-        rotor = self._add_rotor(motion, added_mass, [0.0] * n, motion.drag, {})
-        return self._add_housing(motion, Eliminated((), {}, *rotor), motion.drag, {})
+        rotor = self._add_rotor(motion, added_mass, [0.0] * n, motion.drag_torque, {})
+        return self._add_housing(motion, Eliminated((), {}, *rotor), motion.drag_torque, {})
 
     def at_loads(self, a: Sequence[Array]) -> Axes:
         """Return the accelerations of the points that carry the loads from those of the mount's rows."""
@@ -178,7 +181,12 @@ class RotorDynamics(eqx.Module):
         return (motion.speed, part.rotor[0] - dot(part.rotor[1], a), *rates)
 
     def _add_rotor(
-        self, motion: Motion, added_mass: list[list[Array | float]], reaction: list[Array | float], drag: Array, coupling: Axes
+        self,
+        motion: Motion,
+        added_mass: list[list[Array | float]],
+        reaction: list[Array | float],
+        drag_torque: Array,
+        coupling: Axes,
     ) -> tuple[list[list[Array | float]], list[Array | float], tuple[Array, list[Array]] | None]:
         """Add the rotor's imbalance to the added mass and the reaction.
 
@@ -190,7 +198,7 @@ class RotorDynamics(eqx.Module):
                 reaction = [g + b for g, b in zip(reaction, motion.imbalance_derivatives[1], strict=True)]
             return added_mass, reaction, None
         torque, inertia = motor
-        braking, slopes = self._braking_torque(motion, drag, coupling)
+        braking, slopes = self._braking_torque(motion, drag_torque, coupling)
         free = (torque - braking) / inertia
         row = [f / inertia for f in slopes] + [jnp.zeros_like(free)] * (len(reaction) - len(slopes))
         if motion.imbalance_derivatives is None:
@@ -205,12 +213,12 @@ class RotorDynamics(eqx.Module):
         states = () if motion.state.rotor is None else motion.state.rotor[2:]
         return self.drive.torque_and_inertia(motion.time, motion.driven_speed, states)
 
-    def _braking_torque(self, motion: Motion, drag: Array, coupling: Axes) -> tuple[Array, list[Array]]:
+    def _braking_torque(self, motion: Motion, drag_torque: Array, coupling: Axes) -> tuple[Array, list[Array]]:
         """Return (T, c) of the torque T + c . a, N m, with which loads, gravity and imbalance brake the rotor.
 
-        c has an entry for each of the first rows of the mount; the torque does not depend on the other rows.
+        c has an entry for each of the first scalar rows of the mount; the torque does not depend on the other rows.
         """
-        torque = self._total(drag)
+        torque = self._total(drag_torque)
         torque = torque if motion.weight_torque is None else torque + motion.weight_torque
         by_loads = [self._total(coupling[i], lever) for lever in self.levers for i in self.axes] if coupling else []
         if motion.imbalance_derivatives is None:
@@ -218,13 +226,13 @@ class RotorDynamics(eqx.Module):
         first = motion.imbalance_derivatives[0]
         return torque, [f + d for f, d in zip(by_loads, first, strict=False)] + first[len(by_loads) :]
 
-    def _add_housing(self, motion: Motion, part: Eliminated, drag: Array, coupling: Axes) -> Eliminated:
+    def _add_housing(self, motion: Motion, part: Eliminated, drag_torque: Array, coupling: Axes) -> Eliminated:
         """Add the row of the housing's rotation, on which the reaction torque of the drive acts."""
-        if motion.housing is None:
+        if motion.housing_speed is None:
             return part
         motor, n = self._motor(motion), len(part.reaction)
         if motor is None:
-            torque, row = self._braking_torque(motion, drag, coupling)
+            torque, row = self._braking_torque(motion, drag_torque, coupling)
         else:
             torque, row = motor[0], []
         zero = jnp.zeros_like(torque)
@@ -233,15 +241,16 @@ class RotorDynamics(eqx.Module):
         return part._replace(added_mass=added_mass, reaction=[*part.reaction, torque], rotor=rotor)
 
     def _imbalance_derivatives(self, t: Array, state: ExciterState) -> tuple[list[Array], list[Array]] | None:
-        """Return two derivatives of d(theta), the unbalance and the imbalances of the effects on each row of the mount.
+        """Return two derivatives of d(theta).
 
-        The first is d'. The second is d'' theta'^2 under a motor, and the second time derivative of d under an ideal drive. The
-        result is None for a rotor without unbalance and imbalances.
+        d contains one number for each row of the mount: the first moment of the unbalance and of the imbalances of the effects,
+        kg m (kg m^2 for tilts). The first derivative is d'. The second is d'' theta'^2 under a motor, and the second time
+        derivative of d under an ideal drive. The result is None for a rotor without unbalance and imbalances.
         """
         terms = terms_of(self.effects, RotorImbalance)
         if not terms and self.unbalance is None:
             return None
-        turn, rate = self.drive.rotor_angle(t, state.rotor), self.drive.rotor_speed(t, state.rotor)
+        rotor_angle, rate = self.drive.rotor_angle(t, state.rotor), self.drive.rotor_speed(t, state.rotor)
 
         def imbalance(angle: Array) -> tuple[Array, ...]:
             of_effects = [term.at(angle) for term in terms]
@@ -249,7 +258,7 @@ class RotorDynamics(eqx.Module):
             if self.unbalance is not None:
                 vectors.append((self.unbalance * jnp.cos(angle), self.unbalance * jnp.sin(angle)))
             static = tuple(total(each[axis] for each in vectors) for axis in self.axes)
-            if self.row_count == 1:
+            if self.block_count == 1:
                 return static
             moments = [[each.moment[axis] for each in of_effects] for axis in self.axes]
             for lever in self.rotor_levers[1:]:
@@ -260,7 +269,7 @@ class RotorDynamics(eqx.Module):
         def slope(angle: Array) -> tuple[Array, ...]:
             return jax.jvp(imbalance, (angle,), (jnp.ones_like(angle),))[1]
 
-        first, curvature = jax.jvp(slope, (turn,), (jnp.ones_like(turn),))
+        first, curvature = jax.jvp(slope, (rotor_angle,), (jnp.ones_like(rotor_angle),))
         second = [c * rate**2 for c in curvature]
         acceleration = self.drive.rotor_acceleration(t)
         if acceleration is not None:
@@ -305,14 +314,14 @@ class ExciterDynamics(RotorDynamics):
         """Return the quantities that do not depend on the accelerations, for a rotor that turns at `speed`."""
         imbalance_derivatives = self._imbalance_derivatives(t, state)
         of_loads = kinematics(self.loads, state.angle, state.rate)
-        drag, force = self._forces(state, speed)
+        drag_torque, force = self._forces(state, speed)
         g = total_gravity(self.effects)
         terms = terms_of(self.effects, ContactFriction)
         unsigned = (term.friction(self.loads, state.angle, state.rate, speed, g) for term in terms)
-        friction = [each.signed({}) if each.normal is None else each for each in unsigned]
+        friction = [each.signed({}) if each.normal_force_per_acceleration is None else each for each in unsigned]
         contact = ContactSolution(self.loads.inertia_factor(), force, friction)
         weight = self._weight_torque_if_needed(t, state, housing)
-        return Motion(state, speed, imbalance_derivatives, of_loads, drag, weight, contact, housing, t)
+        return Motion(state, speed, imbalance_derivatives, of_loads, drag_torque, weight, contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Express the accelerations of loads and rotor in terms of the accelerations of the mount's rows.
@@ -320,7 +329,7 @@ class ExciterDynamics(RotorDynamics):
         The friction of `contact` must be linear in the accelerations, see `signed`.
         """
         loads, axes, of_loads = self.loads, self.axes, motion.kinematics
-        drag, force, coupling = self._add_friction(motion.drag, contact)
+        drag_torque, force, coupling = self._add_friction(motion.drag_torque, contact)
         m = loads.mass
         inertia = contact.kappa * m
         solve = small_inverse([[inertia * g for g in row] for row in of_loads.metric])
@@ -331,9 +340,9 @@ class ExciterDynamics(RotorDynamics):
         rows = {axis: [r - p[axis] if p else r for r, p in zip(row, coupling, strict=True)] for axis, row in rows.items()}
         response_to_carrier = {axis: solve(tuple(row)) for axis, row in rows.items()}
         added_mass, reaction = self._reaction_of_loads(of_loads, free, response_to_carrier)
-        added_mass, reaction, rotor = self._add_rotor(motion, added_mass, reaction, drag, coupling[0])
+        added_mass, reaction, rotor = self._add_rotor(motion, added_mass, reaction, drag_torque, coupling[0])
         part = Eliminated(free, response_to_carrier, added_mass, reaction, rotor)
-        return self._add_housing(motion, part, drag, coupling[0])
+        return self._add_housing(motion, part, drag_torque, coupling[0])
 
     def at_loads(self, a: Sequence[Array]) -> Axes:
         """Return the accelerations of the points that carry the loads from those of the mount's rows."""
@@ -380,8 +389,8 @@ class ExciterDynamics(RotorDynamics):
         If `rotation` is False, the forces that turn a load about its own centre are left out.
         """
         loads = self.loads
-        torque = loads.resistance(state.angle, state.rate, speed)
-        force = list(torque)
+        resistance = loads.resistance(state.angle, state.rate, speed)
+        force = list(resistance)
         spin_force = loads.spin_force(state.angle, state.rate, speed) if rotation else None
         if spin_force is not None:
             force = [f + s for f, s in zip(force, spin_force, strict=True)]
@@ -392,22 +401,26 @@ class ExciterDynamics(RotorDynamics):
         for term in terms_of(self.effects, LoadPotential, LoadResistance, LoadInteraction):
             for extra in term.forces(loads, state.angle, state.rate):
                 force = [f + e for f, e in zip(force, extra, strict=True)]
-        return torque[0], force
+        return resistance[0], force
 
-    def _add_friction(self, drag: Array, contact: ContactSolution) -> tuple[Array, list[Array], list[Axes]]:
+    def _add_friction(self, drag_torque: Array, contact: ContactSolution) -> tuple[Array, list[Array], list[Axes]]:
         """Add the friction that does not depend on the accelerations to the drag and to the forces.
 
-        **Returns** both, and for each coordinate of a load the friction per acceleration, by axis; {} without such friction.
+        **Returns** both, and for each coordinate of a load the friction per acceleration, by axis; {} without such friction, as
+        for a rotor without loads.
         """
         force, coupling = list(contact.force), [dict[int, Array]() for _ in contact.force]
         for each in contact.friction:
-            frictions = [lever * each.reaction for lever in (each.lever, *each.others)]
-            drag = drag + frictions[0]
+            frictions = [lever * each.static_normal_force for lever in (each.lever, *each.others)]
+            drag_torque = drag_torque + frictions[0]
             for i, (friction, lever) in enumerate(zip(frictions, (each.lever, *each.others), strict=True)):
                 force[i] = force[i] + friction
-                if each.normal is not None:
-                    coupling[i] = {axis: lever * each.normal[axis] + coupling[i].get(axis, 0.0) for axis in self.axes}
-        return drag, force, coupling
+                if each.normal_force_per_acceleration is not None:
+                    coupling[i] = {
+                        axis: lever * each.normal_force_per_acceleration[axis] + coupling[i].get(axis, 0.0)
+                        for axis in self.axes
+                    }
+        return drag_torque, force, coupling
 
     def _reaction_of_loads(
         self, of_loads: Kinematics, free: tuple[Array, ...], response_to_carrier: Mapping[int, tuple[Array, ...]]
@@ -425,7 +438,7 @@ class ExciterDynamics(RotorDynamics):
             for low in range(len(levers))
             for high in range(low, len(levers))
         }
-        rows = [(row, axis) for row in range(self.row_count) for axis in axes]
+        rows = [(row, axis) for row in range(self.block_count) for axis in axes]
         added_mass = [[moments.get((i, k, min(a, b), max(a, b)), 0.0) for b, k in rows] for a, i in rows]
         load_reaction = {i: m * (dot(columns[i], free) + of_loads.curvature[i]) for i in axes}
         return added_mass, [self._total(load_reaction[i], levers[row]) if row < len(levers) else 0.0 for row, i in rows]
@@ -473,12 +486,12 @@ class ExciterDynamics(RotorDynamics):
 
 def depends_on_acceleration(contact: ContactSolution) -> bool:
     """Return True if a friction is proportional to a normal force that depends on the accelerations."""
-    return any(each.normal is not None for each in contact.friction)
+    return any(each.normal_force_per_acceleration is not None for each in contact.friction)
 
 
 def without_coupling(contact: ContactSolution) -> ContactSolution:
     """Return the contact without the friction that depends on the accelerations."""
-    return contact._replace(friction=[each for each in contact.friction if each.normal is None])
+    return contact._replace(friction=[each for each in contact.friction if each.normal_force_per_acceleration is None])
 
 
 def signed(contact: ContactSolution, at_loads: Axes) -> ContactSolution:
@@ -486,5 +499,7 @@ def signed(contact: ContactSolution, at_loads: Axes) -> ContactSolution:
 
     Each normal force keeps the sign that it has at the accelerations `at_loads`.
     """
-    friction: list[Friction] = [each if each.normal is None else each.signed(at_loads) for each in contact.friction]
+    friction: list[Friction] = [
+        each if each.normal_force_per_acceleration is None else each.signed(at_loads) for each in contact.friction
+    ]
     return contact._replace(friction=friction)

@@ -122,9 +122,7 @@ def resolve_contact(
     along = [jnp.where(fast, -c, f) for c, f in zip(slip, required, strict=True)]
     size = jnp.sqrt(jnp.where(slides, dot(along, along), 1.0))
     levers = [jnp.where(slides, limit.coefficient * f / size, 0.0) * arm for f, arm in zip(along, found.sizes, strict=True)]
-    sliding_friction = Friction(
-        levers[0], normal_force.reaction, normal_force.normal, tuple(levers[1:]), loads.one_sided
-    ).signed(a)
+    sliding_friction = Friction(levers[0], *normal_force, tuple(levers[1:]), loads.one_sided).signed(a)
     # A slip smaller than the width decays while the load rolls.
     slip_decay = [arm * kappa * friction_limit * c / limit.width for c, arm in zip(slip, found.sizes, strict=True)]
     force = [jnp.where(slides, c, r - d) for c, r, d in zip(centre, rolling, slip_decay, strict=True)]

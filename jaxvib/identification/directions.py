@@ -1,8 +1,8 @@
 """Information of the records about the numbers of a scene: covariance, and directions that the records do not determine.
 
 The numbers are compared on a logarithmic scale (numbers of either sign: relative to their size). A direction is a combination
-of relative changes; its standard error is 1/sqrt(eigenvalue) of the information matrix, in which all other unknowns are
-eliminated.
+of relative changes; its standard error is 1/sqrt(eigenvalue) of the information matrix of the scene's numbers, after all
+other unknowns (gains, errors of the angle and others) are eliminated.
 """
 
 from __future__ import annotations
@@ -52,9 +52,11 @@ class Information(NamedTuple):
 
     **Attributes**
 
-    - `names` (k,) of the numbers; `values` (k,), SI; `scale` (k,): change of a number per unit of its coordinate; `logarithmic`
-      (k,): True if the coordinate is the logarithm of the number
-    - `covariance` (k, k) of the coordinates in the determined directions
+    - `names` (k,) of the numbers; `values` (k,), SI
+    - `logarithmic` (k,): each number has a variable of the fit; True if the variable is the logarithm of the number. Otherwise
+      it is the number divided by its scale
+    - `scale` (k,): change of the number per unit of this variable
+    - `covariance` (k, k) of the variables in the determined directions
     - `undetermined` (k, u): directions that the records do not determine; `errors` (u,): their standard errors
     - `determined` (k,): False for numbers that take part in an undetermined direction
     - `vanished` (k,): True for positive numbers that are not distinguishable from 0, because their standard error is larger
@@ -88,20 +90,22 @@ def information_of(fitted: Fitted) -> Information:
     values = np.concatenate([np.asarray(unknowns.values(fitted.x)), sizes[free_exciters]])
     logarithmic = np.concatenate([np.asarray(unknowns.positive), np.ones(len(free_exciters), bool)])
     scale = np.concatenate([np.where(unknowns.positive, values[:number_count], unknowns.scale), sizes[free_exciters]])
-    without_gains = prior.copy()
+    prior_of_free_gains = prior.copy()
     gains = np.arange(number_count, number_count + len(unknowns.gains))
-    without_gains[gains, gains] = 0.0
+    prior_of_free_gains[gains, gains] = 0.0
 
-    with_gains, without_gain_errors = (eliminate(data + known, kept) for known in (prior, without_gains))
-    errors, axes = _errors(with_gains)
+    information, information_of_free_gains = (eliminate(data + known, kept) for known in (prior, prior_of_free_gains))
+    errors, axes = _errors(information)
     single = np.abs(axes) > _SINGLE
     error = np.sum(single * errors, axis=1)
     # Unbalances are left out: if the size of an unbalance tends to 0, its angle is unknown, too.
     vanished = logarithmic & (error > UNDETERMINED) & (error < _UNSEEN) & (np.arange(kept.size) < number_count)
-    factors = np.where(vanished, 10.0 * error, 1.0)  # of a vanished number: ten times its standard error in place of its value
-    determined_part = covariance_of(with_gains * np.outer(factors, factors))
+    # A vanished number is measured in units of ten times its standard error instead of its value, so that it counts as
+    # determined.
+    factors = np.where(vanished, 10.0 * error, 1.0)
+    determined_part = covariance_of(information * np.outer(factors, factors))
     covariance, undetermined = determined_part.covariance, determined_part.undetermined
-    loose_errors, loose_axes = _errors(without_gain_errors * np.outer(factors, factors))
+    loose_errors, loose_axes = _errors(information_of_free_gains * np.outer(factors, factors))
     by_gain = loose_axes[:, loose_errors > UNDETERMINED]
     # Directions that nothing determines are left out of those that the gains determine.
     by_gain = by_gain - undetermined @ (undetermined.T @ by_gain)
@@ -141,7 +145,7 @@ def covariance_of(information: np.ndarray) -> Covariance:
 def combined_information(fitted: Fitted) -> np.ndarray:
     """Return the information about the numbers of a fit, the gains of its sensors, and the angle of the first unbalance.
 
-    The information about the angle is 0 if the runs have different zeros of the rotor's angle.
+    The information about the angle is 0 if the rotor's angle is measured from a different zero position in each run.
     """
     problem, p = fitted.problem, fitted.x.size
     data, prior, _ = in_polar_unbalances(fitted)
@@ -162,20 +166,20 @@ def in_polar_unbalances(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndar
 
     The unknowns are those of the fit, but with (logarithm of the size, angle) instead of (a, b) for each unbalance.
     """
-    turn, sizes = polar_unbalances(fitted.problem, fitted.linear)
-    return turn.T @ fitted.information @ turn, turn.T @ fitted.prior @ turn, sizes
+    jacobian, sizes = polar_unbalances(fitted.problem, fitted.linear)
+    return jacobian.T @ fitted.information @ jacobian, jacobian.T @ fitted.prior @ jacobian, sizes
 
 
 def polar_unbalances(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives (p + L, p + L) of all unknowns by the same unknowns with (logarithm of the size, angle) instead of
     (a, b) for each unbalance, and the sizes (E,) of the unbalances."""
     p, exciters = problem.unknowns.count, len(problem.unbalances)
-    turn, sizes = np.eye(p + linear.size), np.zeros(exciters)
+    jacobian, sizes = np.eye(p + linear.size), np.zeros(exciters)
     for k in range(exciters):
         a, b = linear[2 * k : 2 * k + 2]
         sizes[k] = float(np.hypot(a, b))
-        turn[p + 2 * k : p + 2 * k + 2, p + 2 * k : p + 2 * k + 2] = [[a, -b], [b, a]]
-    return turn, sizes
+        jacobian[p + 2 * k : p + 2 * k + 2, p + 2 * k : p + 2 * k + 2] = [[a, -b], [b, a]]
+    return jacobian, sizes
 
 
 def eliminate(matrix: np.ndarray, kept: np.ndarray) -> np.ndarray:

@@ -24,18 +24,18 @@ BALL_RADIUS = unit("m", low=0.0, open_low=True, words="radius of each {load}")
 
 
 class NormalForce(NamedTuple):
-    """Normal force N = `reaction` + `normal` . a of each load on its track.
+    """Normal force N = `static_normal_force` + `normal_force_per_acceleration` . a of each load on its track.
 
-    a is the acceleration of the point that carries the load. `reaction` (count,) is in N. `normal` (horizontal, up) is in kg,
-    (count,) each.
+    a is the acceleration of the point that carries the load. `static_normal_force` (count,) is in N, and
+    `normal_force_per_acceleration` (horizontal, up) in kg, (count,) each.
     """
 
-    reaction: Array
-    normal: tuple[Array, Array]
+    static_normal_force: Array
+    normal_force_per_acceleration: tuple[Array, Array]
 
     def at(self, a: Mapping[int, Array]) -> Array:
         """Return N (count,) if the points that carry the loads have the acceleration `a`, by axis."""
-        return self.reaction + sum(self.normal[axis] * x for axis, x in a.items())
+        return self.static_normal_force + sum(self.normal_force_per_acceleration[axis] * x for axis, x in a.items())
 
 
 class DrillingSpin(NamedTuple):

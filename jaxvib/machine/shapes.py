@@ -1,4 +1,5 @@
-"""Checks of the values that the parts of a user's file return: their types, shapes, and the mass matrix.
+"""Checks of the values (types, shapes, the mass matrix) that parts return whose classes are defined outside this package:
+machines, loads, drives and effects.
 
 Parts of the package are not checked here, because the tests of the package check them.
 """
@@ -37,11 +38,11 @@ def _is_of_package(part: Part) -> bool:
 def _once_for_each_structure(check: Callable[..., None]) -> Callable[..., None]:
     """Return a function that checks a part, with the other parts on which its result depends, by tracing.
 
-    Parts of the same structure, shapes and precision are traced once. Parts of the package are not checked.
+    Parts of the same structure, shapes and default dtype are traced once. Parts of the package are not checked.
     """
 
     @functools.lru_cache(maxsize=256)
-    def on_shapes(structure: Hashable, shapes: tuple[tuple[Shape, np.dtype], ...], precision: np.dtype) -> None:
+    def on_shapes(structure: Hashable, shapes: tuple[tuple[Shape, np.dtype], ...], dtype: np.dtype) -> None:
         check(*jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*each) for each in shapes]))
 
     @functools.wraps(check)

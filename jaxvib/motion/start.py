@@ -219,7 +219,8 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, rotation: Rotation
         if has_slip:
             assert normal_force is not None
             r = loads.ball_radius  # pyright: ignore[reportAttributeAccessIssue]
-            across, up = (x - r * y / loads.mass for x, y in zip(loads.position(*u), normal_force.normal, strict=False))
+            per_acceleration = normal_force.normal_force_per_acceleration
+            across, up = (x - r * y / loads.mass for x, y in zip(loads.position(*u), per_acceleration, strict=False))
             along = jax.jvp(loads.position, u, rate)[1]
             relative = (along[0] + w * up, along[1] - w * across, *along[2:])
             motion = kinematics(loads, u, rate)

@@ -46,11 +46,11 @@ __all__ = [
     "enumeration_of",
     "evaluating",
     "fast_diffrax_loop_end",
+    "inner_value",
     "jaxpr_as_fun",
     "loops_need_a_flag",
     "no_host_checks",
     "operation_like",
-    "primal_of",
     "rewritten",
     "traced",
     "user_folder",
@@ -74,8 +74,8 @@ except ImportError:
     if TYPE_CHECKING:
         raise
     ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = Var = jaxpr_as_fun = None
-"""Classes of traced programs, from `jax.extend.core`, which may change at any time. Without them, equations are integrated on
-arrays in place of scalars."""
+"""Classes of traced programs, from `jax.extend.core`, which may change at any time. Without them jaxvib.ode cannot rewrite the
+equations as operations on scalars, and integrates them on arrays, which is slower."""
 
 
 def rewritten(
@@ -101,14 +101,14 @@ Instead: TypeAlias = "tuple[list[tuple[JaxprEqn, Atoms]], Var]"
 
 def operation_like(function: Callable[..., object], *like: Any) -> JaxprEqn:
     """Return the only operation of a `function`, with new variables; its arguments have the types of `like`."""
-    shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in (x.aval for x in like)]
+    shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in like]
     # A new lambda, because JAX returns the cached program with the same variables if the function is the same.
     (equation,) = jax.make_jaxpr(lambda *x: function(*x))(*shapes).jaxpr.eqns
     return equation
 
 
 def traced(value: object) -> bool:
-    """Return True if JAX is transforming the computation of `value`, which is then a tracer without a number.
+    """Return True if `value` is a tracer of JAX: its computation is being transformed.
 
     >>> traced(1.0)
     False
@@ -116,8 +116,9 @@ def traced(value: object) -> bool:
     return isinstance(value, Tracer)
 
 
-def primal_of(tracer: object) -> object | None:
-    """Return the value whose derivative or batch `tracer` represents, or None if it has no value, for example inside `jit`."""
+def inner_value(tracer: object) -> object | None:
+    """Return the next inner value of `tracer`, the one whose derivative or batch it represents. This value may be a tracer
+    too. None for a tracer of `jit`."""
     kind = type(tracer).__name__
     return getattr(tracer, {"JVPTracer": "primal", "LinearizeTracer": "primal", "BatchTracer": "val"}.get(kind, ""), None)
 
@@ -142,9 +143,9 @@ def evaluating() -> contextlib.AbstractContextManager[None]:
 def without_source_locations() -> Iterator[None]:
     """Trace without source locations of operations.
 
-    For each run-time check, JAX searches a list of its files to find whether a source file belongs to JAX. The results of this
-    search are cached too. Together the two changes save a tenth of the time until a program is compiled. A change whose private
-    name is missing in JAX is omitted.
+    Two changes are made: no source location is recorded for an operation, and the answer to "does this file belong to JAX?",
+    which JAX looks up for every run-time check (`error_if`), is cached. Together they save a tenth of the time until a program
+    is compiled. A change whose private name is missing in JAX is omitted.
     """
     limit = getattr(sys.modules.get("jax._src.config"), "traceback_in_locations_limit", None)
     frames = sys.modules.get("jax._src.traceback_util")
@@ -184,7 +185,7 @@ def accepted_flags(flags: list[str]) -> list[str]:
         is_accepted = {str(flag): value is True for flag, value in json.loads(path.read_text()).items()}
     untested = [flag for flag in flags if flag not in is_accepted]
     if untested:
-        is_accepted |= {flag: starts_with([flag]) for flag in untested}
+        is_accepted |= {flag: jax_starts_with([flag]) for flag in untested}
         with contextlib.suppress(OSError):
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             path.write_text(json.dumps(is_accepted))
@@ -203,8 +204,9 @@ def loops_need_a_flag() -> bool:
 def wide_vectors_are_right(flags: list[str]) -> bool:
     """Return True if programs with vectors of 512 bits are correct under these XLA_FLAGS.
 
-    Such programs are wrong with the newer code generator of jaxlib 0.10: the arctangent of an array of 64 or more numbers is
-    then 0.
+    Such programs are wrong with XLA's fusion emitters (flag xla_cpu_use_fusion_emitters), the default of jaxlib 0.10: the
+    arctangent of an array of 64 or more numbers is then 0. In jaxlib 0.11 the fusion emitters cannot be switched off; vectors
+    of 512 bits are not used there.
     """
     return "--xla_cpu_use_fusion_emitters=false" in flags or _jaxlib() >= (0, 12)
 
@@ -213,7 +215,7 @@ def _jaxlib() -> tuple[int, ...]:
     return tuple(int(part) for part in importlib.metadata.version("jaxlib").split(".")[:2])
 
 
-def starts_with(flags: list[str]) -> bool:
+def jax_starts_with(flags: list[str]) -> bool:
     """Return True if JAX starts with these XLA_FLAGS in a separate process."""
     environment = {**os.environ, "XLA_FLAGS": " ".join(flags), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", "import jax; jax.devices()"]
@@ -343,7 +345,8 @@ def _source(function: FunctionType) -> str:
 
 
 def ulps_below(x: Array, number: int) -> Array:
-    """Return the floating-point number that is `number` units in the last place below `x`; `x` must not be subnormal."""
+    """Return the floating-point number that is `number` units in the last place below `x`; `x` must be a normal
+    number, not 0."""
     whole = jax.lax.bitcast_convert_type(x, jnp.int64 if x.dtype.itemsize == 8 else jnp.int32)
     return jax.lax.bitcast_convert_type(jnp.where(x > 0.0, whole - number, whole + number), x.dtype)
 

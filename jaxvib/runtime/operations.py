@@ -1,4 +1,4 @@
-"""Text and number of operations of a program, and removal of unused operations."""
+"""Text and number of operations of a program (here a jaxpr, not machine code), and removal of unused operations."""
 
 from __future__ import annotations
 
@@ -15,12 +15,15 @@ from jax import Array
 from jaxvib.runtime.compat import HAS_JAXPRS, ClosedJaxpr, jaxpr_as_fun, rewritten
 
 
-def operations(function: Callable[..., Any], *arguments: Any) -> int:
-    """Count the operations of the program of a function; operations in loop bodies and called programs are counted once.
+def count_operations(function: Callable[..., Any], *arguments: Any) -> int:
+    """Count the operations of the program of a function.
+
+    The operations of a loop body count once, not once for each iteration; those of a called program count once for each call.
+    Loops and calls themselves do not count.
 
     **Arguments**: those of the function; `jax.ShapeDtypeStruct` may stand for arrays. **Returns** a count.
 
-    >>> operations(lambda x: x * x + 1.0, 2.0)
+    >>> count_operations(lambda x: x * x + 1.0, 2.0)
     2
     """
     return sum(1 for _ in _walk(jax.make_jaxpr(function)(*arguments).jaxpr))
@@ -44,7 +47,7 @@ def _programs(value: Any) -> Iterator[Any]:
             yield from _programs(each)
 
 
-_WITHOUT_EFFECT = ("name", "debug_info", "source_info")
+_IRRELEVANT_PARAMETERS = ("name", "debug_info", "source_info")
 """Parameters of operations that do not change results."""
 
 
@@ -61,7 +64,7 @@ def program_text(program: ClosedJaxpr) -> list[str]:
 
 
 def calls_python(program: ClosedJaxpr) -> bool:
-    """Return True if a program calls a Python function, other than a run-time check of Equinox.
+    """Return True if a program calls a Python function whose result it uses, other than a run-time check of Equinox.
 
     >>> calls_python(jax.make_jaxpr(lambda x: jax.pure_callback(np.sin, x, x))(1.0))
     True
@@ -86,7 +89,7 @@ def _lines(closed: Any, depth: int = 0) -> Iterator[str]:
     yield f"{indent}arguments {' '.join(f'{named(v)}:{v.aval.str_short()}' for v in jaxpr.invars)}"
     for equation in jaxpr.eqns:
         inner: list[Any] = []
-        parameters = sorted((key, value) for key, value in equation.params.items() if key not in _WITHOUT_EFFECT)
+        parameters = sorted((key, value) for key, value in equation.params.items() if key not in _IRRELEVANT_PARAMETERS)
         shown = ", ".join(f"{key}={_text(value, inner)}" for key, value in parameters)
         operands = " ".join(named(atom) for atom in equation.invars)
         results = " ".join(f"{named(v)}:{v.aval.str_short()}" for v in equation.outvars)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.code_changes import code_state
-from jaxvib.runtime.compat import primal_of, traced
+from jaxvib.runtime.compat import inner_value, traced
 from jaxvib.runtime.devices import arrays_on_device
 from jaxvib.runtime.operations import pruned
 from jaxvib.runtime.primitive import CAN_DEFINE_PRIMITIVES, is_zero, primitive, zero_of
@@ -95,7 +95,7 @@ class CachedFunction(Generic[P, T]):
 
 def _is_simple(tracer: object) -> bool:
     """Return True if `tracer` belongs to a single derivative or batch, at a value that is not traced."""
-    value = primal_of(tracer)
+    value = inner_value(tracer)
     return value is not None and not traced(value)
 
 

@@ -66,7 +66,12 @@ def diagram(**options):
     marks = [("fold: the jam ends", np.array([7.0]), np.array([3.0]))]
     modes = np.where(omega < 3.0, 1, np.where(omega < 3.6, 2, 3))
     own = dict(
-        amplitude=np.stack([omega, omega**2], 1), modes=modes, marks=marks, names=("y1", "y2"), at=5.0, criterion="by slope"
+        amplitude=np.stack([omega, omega**2], 1),
+        modes=modes,
+        marks=marks,
+        names=("y1", "y2"),
+        at=5.0,
+        stability_text="by slope",
     )
     return branch_diagram(speed, omega, modes != 2, **arrays, **{**own, **options}), speed, omega
 

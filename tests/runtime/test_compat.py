@@ -18,7 +18,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.runtime import compat
-from jaxvib.runtime.operations import operations
+from jaxvib.runtime.operations import count_operations
 
 
 def test_backend_starts_with_the_first_array():
@@ -107,7 +107,7 @@ def test_this_jaxlib_starts_with_the_flags_of_prepare_cpu():
     code = "import os; os.environ.pop('XLA_FLAGS', None); import jaxvib as jv; print(jv.prepare_cpu(2))"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     flags = done.stdout.split()
-    assert len(flags) >= 2 and compat.starts_with(flags)
+    assert len(flags) >= 2 and compat.jax_starts_with(flags)
 
 
 @pytest.mark.parametrize(("version", "known"), [("0.10.2", 2), ("0.11.2", 1), ("0.12.0", 1)])
@@ -129,7 +129,7 @@ def test_a_jaxlib_that_is_not_known_is_asked_once(tmp_path, monkeypatch):
     (tmp_path / "jaxvib" / "flags-99.1.0.json").write_text("{")
     assert compat.accepted_flags(flags) == flags[:1]
     assert json.loads((tmp_path / "jaxvib" / "flags-99.1.0.json").read_text()) == {flags[0]: True, flags[1]: False}
-    monkeypatch.setattr(compat, "starts_with", lambda flags: pytest.fail("asked again"))
+    monkeypatch.setattr(compat, "jax_starts_with", lambda flags: pytest.fail("asked again"))
     assert compat.accepted_flags(flags) == flags[:1]
 
 
@@ -180,11 +180,11 @@ def test_time_loops_find_their_end_at_once(dtype):
         ).ys[0]
 
     end = jnp.asarray(0.7, dtype)
-    plain, expected = operations(run(100), end), run(100)(end)
+    plain, expected = count_operations(run(100), end), run(100)(end)
     with compat.fast_diffrax_loop_end():
-        assert plain - operations(run(101), end) > 290
+        assert plain - count_operations(run(101), end) > 290
         assert run(101)(end) == expected
-    assert operations(run(102), end) == plain
+    assert count_operations(run(102), end) == plain
     with ThreadPoolExecutor(4) as pool:  # sweeps trace in threads
         assert set(pool.map(short_in_a_thread, [run(k) for k in range(103, 111)], [end] * 8)) == {float(expected)}
 

@@ -219,18 +219,18 @@ def test_derivatives_of_jam_modes_equal_those_without_cache(asked):
 
 
 @pytest.mark.parametrize("tracer", ["grad", "jvp", "vmap"])
-def test_primal_of_a_tracer_is_found(tracer):
+def test_inner_value_of_a_tracer_is_found(tracer):
     seen = []
 
     def look(x):
-        seen.append(compat.primal_of(x))
+        seen.append(compat.inner_value(x))
         return x * 1.0
 
     {"grad": jax.grad(look), "jvp": lambda x: jax.jvp(look, (x,), (x,)), "vmap": lambda x: jax.vmap(look)(x[None])}[tracer](
         SHIFT
     )
     assert seen[0] is not None and not compat.traced(seen[0]) and float(jnp.ravel(seen[0])[0]) == float(SHIFT)
-    jax.jit(lambda x: seen.append(compat.primal_of(x)))(SHIFT)
+    jax.jit(lambda x: seen.append(compat.inner_value(x)))(SHIFT)
     assert seen[1] is None
 
 

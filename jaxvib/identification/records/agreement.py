@@ -3,8 +3,8 @@
 Two kinds of comparison need no model of the machine:
 
 - Rotor speeds that are measured by pulses, by an angle and by a speed must be equal
-- Motions x and y of one point in one direction: Y = (i w)^d X at each frequency w at which they are coherent; d is the
-  difference of their numbers of derivatives, -2 to 2
+- For two motions x and y of one point in one direction, Y = (i w)^d X at each frequency w at which they are coherent; d is
+  the difference of their numbers of derivatives, -2 to 2
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.units.columns import unit_factor
 
-_ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+_DERIVATIVES = {"displacement": 0, "velocity": 1, "acceleration": 2}
 """Number of derivatives of the displacement in a kind of motion."""
 
 ROTOR_KINDS = ("pulses", "angle", "speed")
@@ -70,7 +70,7 @@ def check_agreement(
     """
     signals = [_Signal(channel, times[channel.name], values[channel.name]) for channel in channels]
     speeds = [_Signal(each.channel, *rotor_speed(*each)) for each in signals if each.channel.kind in ROTOR_KINDS]
-    motions = [_Signal(each.channel, each.time, _filled(each.value)) for each in signals if each.channel.kind in _ORDERS]
+    motions = [_Signal(each.channel, each.time, _filled(each.value)) for each in signals if each.channel.kind in _DERIVATIVES]
     notes = []
     for one, other in itertools.combinations(sorted(speeds, key=lambda each: each.channel.kind == "speed"), 2):
         notes += _compare_speeds(one, other, source)
@@ -233,7 +233,7 @@ def _factor(one: _Signal, other: _Signal) -> complex | None:
         coherence = np.abs(xy) ** 2 / (xx * yy)
         is_strong = (coherence > _COHERENT) & (xx > _STRONG * np.max(xx[2:])) & (yy > _STRONG * np.max(yy[2:]))
         is_strong &= (np.arange(w.size) >= 2) & (w < 0.8 * np.pi / step)
-        factors = xy / xx / (1j * w) ** (_ORDERS[other.channel.kind] - _ORDERS[one.channel.kind])
+        factors = xy / xx / (1j * w) ** (_DERIVATIVES[other.channel.kind] - _DERIVATIVES[one.channel.kind])
     if np.count_nonzero(is_strong) < 2:
         return None
     return complex(np.median(factors[is_strong].real), np.median(factors[is_strong].imag)) * float(sign)

@@ -59,7 +59,7 @@ class Channel(Readable):
     - `range`: largest absolute reading of the sensor, as a number in `unit` or a string with a unit, such as "50 g"; readings
       of at least 99.9 % of the range count as clipped. Clipping is also detected from the histogram of the readings. Without a
       range (the default), only the histogram is used
-    - `per_turn`: number of pulses per turn; typical: 1 to 60 (default 1)
+    - `per_turn`: number of marks per turn, a missing tooth included (36 for a 36-1 wheel); typical: 1 to 60 (default 1)
 
     **Raises** `InputError` for an unknown kind or direction, a unit of another dimension, and numbers that are not allowed.
 

@@ -93,8 +93,8 @@ class Drive(Part):
 class Directed(Drive):
     """Drive that turns its rotor in a direction: angles, speeds and torques are those of `drive` times `direction`.
 
-    `direction` is None for a drive that is known to turn clockwise. As an array of 1 or -1, one compiled program serves both
-    directions. The attribute `speed` is that of `drive`, without a sign.
+    `direction` is an array of 1 or -1, so that one compiled program serves both directions; None means clockwise, without
+    operations for the direction. The attribute `speed` is that of `drive`, without a sign.
     """
 
     drive: Drive

@@ -96,7 +96,7 @@ class RollingFriction(Effect):
             share = jnp.where(moving, sliding_sign(size, self.width) / jnp.where(moving, size, 1.0), 1.0 / self.width)
             levers = jax.vjp(loads.position, *u)[1](tuple(share * x for x in v))
         first, *others = (-scale * lever for lever in levers)
-        return Friction(first, normal_force.reaction, normal_force.normal, tuple(others), loads.one_sided)
+        return Friction(first, *normal_force, tuple(others), loads.one_sided)
 
     def _lever(self, loads: Loads, u: tuple[Array, ...], i: int, slip: Array) -> Array:
         """Return |dp/du_i| tanh(|dp/du_i| slip / width)."""

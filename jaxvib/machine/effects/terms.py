@@ -141,18 +141,19 @@ class RotorImbalance:
 class Friction(NamedTuple):
     """Friction torque `lever` |N| on each load.
 
-    N = reaction + normal . a is the normal force, a the acceleration of the point that carries the load.
+    N = `static_normal_force` + `normal_force_per_acceleration` . a is the normal force, a the acceleration of the point that
+    carries the load.
 
     - `lever` (count,) m, with the sign of the torque on the load
-    - `reaction` (count,) N
-    - `normal`: two (count,) arrays (horizontal, up) in kg, or None if N does not depend on accelerations
+    - `static_normal_force`: N at a = 0, (count,) N
+    - `normal_force_per_acceleration`: two (count,) arrays (horizontal, up) in kg, or None if N does not depend on accelerations
     - `others`: levers of a load's further coordinates, if friction acts on them
     - `one_sided`: if True, the friction is 0 while N is negative
     """
 
     lever: Array
-    reaction: Array
-    normal: tuple[Array, Array] | None
+    static_normal_force: Array
+    normal_force_per_acceleration: tuple[Array, Array] | None
     others: tuple[Array, ...] = ()
     one_sided: bool = False
 
@@ -162,8 +163,8 @@ class Friction(NamedTuple):
 
     def forces(self, a: Mapping[int, Array]) -> tuple[Array, ...]:
         """Return the torque of the friction, and its generalised forces on the further coordinates of a load."""
-        reaction = self._normal_force(a)
-        size = jnp.maximum(reaction, 0.0) if self.one_sided else jnp.abs(reaction)
+        normal_force = self._normal_force(a)
+        size = jnp.maximum(normal_force, 0.0) if self.one_sided else jnp.abs(normal_force)
         return tuple(lever * size for lever in (self.lever, *self.others))
 
     def signed(self, a: Mapping[int, Array]) -> Friction:
@@ -173,13 +174,13 @@ class Friction(NamedTuple):
 
     def linear(self, a: Mapping[int, Array]) -> tuple[Array, ...]:
         """Return the `forces` of a friction returned by `signed`."""
-        reaction = self._normal_force(a)
-        return tuple(lever * reaction for lever in (self.lever, *self.others))
+        normal_force = self._normal_force(a)
+        return tuple(lever * normal_force for lever in (self.lever, *self.others))
 
     def _normal_force(self, a: Mapping[int, Array]) -> Array:
-        if self.normal is None:
-            return self.reaction
-        return NormalForce(self.reaction, self.normal).at(a)
+        if self.normal_force_per_acceleration is None:
+            return self.static_normal_force
+        return NormalForce(self.static_normal_force, self.normal_force_per_acceleration).at(a)
 
 
 @final

@@ -26,15 +26,16 @@ class _Branch(Protocol):
     scene: Scene
 
 
-def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], criterion: str) -> str:
+def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], stability_text: str) -> str:
     """Return text with the ranges of a branch and its special points.
 
-    **Arguments**: `marks`: special points (kind, load speed, rotor speed); `criterion`: text on how stability is determined.
+    **Arguments**: `marks`: special points (kind, load speed, rotor speed); `stability_text`: how stability is
+    determined.
     """
     omega, stable = np.asarray(branch.omega), np.asarray(branch.stable)
     ends = speed_text([np.min(omega), np.max(omega)], 6, " to ")
     lines = [
-        f"{omega.size} points from {ends}, {np.mean(stable):.1%} of them stable {criterion}; "
+        f"{omega.size} points from {ends}, {np.mean(stable):.1%} of them stable {stability_text}; "
         f"resonances {speed_text(estimated_frequencies(branch.scene), 6)}"
     ]
     names = [(kind.replace("_", " "), w, n) for kind, w, n in marks]
@@ -55,7 +56,7 @@ def plot_branch(
     marks: Sequence[tuple[str, float, float]],
     unit: SpeedUnit | None,
     most: float | None,
-    criterion: str,
+    stability_text: str,
     show: Sequence[str],
     linear: bool,
     ax: Onto,
@@ -68,7 +69,7 @@ def plot_branch(
 
     - `marks`: special points (kind, load speed, rotor speed)
     - `unit` of the speeds on the axes; `most`: the greatest rotor speed shown, rad/s (default: 4/3 of the scene's rotor speed)
-    - `criterion`: text on how stability is determined
+    - `stability_text`: text on how stability is determined
     - `show`: names of the panels; `linear`: True for linear axes of amplitudes and force; `ax`: axes to draw onto
     - `modes`: number of the jam mode at each point, default: from the folds between the points
     - `resonances` (nd,) rad/s, default: computed here
@@ -104,7 +105,7 @@ def plot_branch(
         units=branch.scene.machine.structure().units,
         at=at if at <= top else None,
         unit=unit,
-        criterion=criterion,
+        stability_text=stability_text,
         show=show,
         linear=linear,
         ax=ax,

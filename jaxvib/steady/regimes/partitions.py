@@ -168,7 +168,7 @@ def regime_partitions(scene: Scene, *, stable: bool = True) -> RegimePartitions:
     interaction = in_chunks(_MOTIONS_PER_PROGRAM, _interactions, rows.speed, rows.group, shared=(scene,))
     kept = np.flatnonzero(interaction <= _LARGEST_INTERACTION)
     kept = kept[np.lexsort((np.max(rows.group[kept], axis=1, initial=0), ~rows.stable[kept]))]
-    orders = np.array([exchange.order for exchange in exchanges_in(assemble_for_search(scene))])
+    orders = np.array([exchange.permutation for exchange in exchanges_in(assemble_for_search(scene))])
     kept = kept[_distinct(rows.speed[kept], rows.torque[kept], orders)]
     return RegimePartitions(
         status=RegimeSearchStatus.done if kept.size else RegimeSearchStatus.none,

@@ -7,65 +7,73 @@ from typing import NamedTuple
 import numpy as np
 
 _MAX_EXCHANGES = 5040
-"""Largest number of exchanges: all of 7 masses, 7!. If a machine has more, some regimes may be listed several times."""
+"""Largest number of exchanges that are found: 7!, the number for 7 equal masses. If a machine has more, some regimes may be
+listed several times."""
 
 
 class Exchange(NamedTuple):
-    """Exchange of masses that leaves the balance unchanged: `order` (count,) and the shifts of phases (count,), rad.
+    """Permutation of rotating masses, with shifts of their phases, that leaves the torque balance (`TorqueBalance`) unchanged.
 
-    If alpha is a regime, alpha' with alpha'[order] = alpha + shift is also a regime.
+    Mass i is replaced by mass `permutation[i]`, (count,); the `shift` (count,) of the phases is in rad.
+
+    If alpha is a regime, alpha' with alpha'[permutation] = alpha + shift is also a regime.
     """
 
-    order: np.ndarray
+    permutation: np.ndarray
     shift: np.ndarray
 
 
-def exchanges_of(influence: np.ndarray, numbers: np.ndarray) -> list[Exchange]:
-    """Return all exchanges of equal masses that leave the balance unchanged.
+def exchanges_of(influence: np.ndarray, features: np.ndarray) -> list[Exchange]:
+    """Return at most `_MAX_EXCHANGES` exchanges of equal masses that leave the torque balance unchanged.
 
-    H[order_i, order_k] = exp(i (shift_i - shift_k)) H[i, k] at every speed. Mirror images and rotations of a machine are such
-    exchanges.
+    An exchange satisfies, for the influence coefficients H at every speed,
 
-    **Arguments**: `influence` H (speeds, count, count) at several speeds; `numbers` (count, m) of each mass, such as its
-    unbalance and its torque at several speeds.
+        H[permutation_i, permutation_k] = exp(i (shift_i - shift_k)) H[i, k]
+
+    Mirror images and rotations of a machine are such exchanges, and so is the identity.
+
+    **Arguments**: `influence` H (speeds, count, count) at several speeds; `features` (count, m): numbers of each mass, such as
+    its unbalance and its torque at several speeds, which are equal for masses that can be exchanged.
     """
     tolerance = 100.0 * np.finfo(influence.dtype).eps
-    scale = np.maximum(np.max(np.abs(numbers), axis=0), np.finfo(float).tiny)
-    same = np.all(np.abs(numbers[:, None] - numbers) <= tolerance * scale, axis=2)
+    scale = np.maximum(np.max(np.abs(features), axis=0), np.finfo(float).tiny)
+    same = np.all(np.abs(features[:, None] - features) <= tolerance * scale, axis=2)
     size = np.max(np.abs(influence), axis=(1, 2), keepdims=True)
-    tolerance = np.sqrt(tolerance)
-    orders = _orders(np.abs(influence) / np.where(size > 0.0, size, 1.0), same, tolerance)
-    turned = influence[:, orders[:, :, None], orders[:, None, :]].transpose(1, 0, 2, 3)
+    influence_tolerance = np.sqrt(tolerance)
+    permutations = _permutations(np.abs(influence) / np.where(size > 0.0, size, 1.0), same, influence_tolerance)
+    permuted = influence[:, permutations[:, :, None], permutations[:, None, :]].transpose(1, 0, 2, 3)
     exchanges = []
-    for order, exchanged in zip(orders, turned, strict=True):
-        shift = _shifts(influence, exchanged, tolerance * size)
+    for permutation, exchanged in zip(permutations, permuted, strict=True):
+        shift = _shifts(influence, exchanged, influence_tolerance * size)
         expected = np.exp(1j * (shift[:, None] - shift[None, :])) * influence
-        if np.all(np.abs(exchanged - expected) <= 4.0 * tolerance * size):
-            exchanges.append(Exchange(order, shift))
+        if np.all(np.abs(exchanged - expected) <= 4.0 * influence_tolerance * size):
+            exchanges.append(Exchange(permutation, shift))
     return exchanges
 
 
-def _orders(size: np.ndarray, same: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return the orders (n, count) of the masses that leave `size` |H| (speeds, count, count) unchanged, first the identity.
+def _permutations(size: np.ndarray, same: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return the permutations (n, count) of masses that leave `size` |H| (speeds, count, count) unchanged, first the identity.
 
-    `same` (count, count): True for masses with equal numbers. The orders are built up mass by mass; at most `_MAX_EXCHANGES` of
-    them are continued.
+    `same` (count, count): True for masses with equal features. The permutations are built up mass by mass; at most
+    `_MAX_EXCHANGES` of them are continued.
     """
-    orders = np.zeros((1, 0), int)
+    permutations = np.zeros((1, 0), int)
     for i in range(len(same)):
         k = np.arange(len(same))[None, :, None]
-        others = np.concatenate([orders[:, None, :].repeat(len(same), axis=1), k.repeat(len(orders), axis=0)], axis=2)
-        alike = np.abs(size[:, k, others] - size[:, None, None, i, : i + 1]) <= tolerance
-        alike &= np.abs(size[:, others, k] - size[:, None, None, : i + 1, i]) <= tolerance
-        good = same[i] & np.all(alike, axis=(0, 3)) & np.all(others[:, :, :-1] != k, axis=2)
-        orders = others[good][:_MAX_EXCHANGES]
-    return orders
+        longer = np.concatenate(
+            [permutations[:, None, :].repeat(len(same), axis=1), k.repeat(len(permutations), axis=0)], axis=2
+        )
+        alike = np.abs(size[:, k, longer] - size[:, None, None, i, : i + 1]) <= tolerance
+        alike &= np.abs(size[:, longer, k] - size[:, None, None, : i + 1, i]) <= tolerance
+        good = same[i] & np.all(alike, axis=(0, 3)) & np.all(longer[:, :, :-1] != k, axis=2)
+        permutations = longer[good][:_MAX_EXCHANGES]
+    return permutations
 
 
-def _shifts(influence: np.ndarray, turned: np.ndarray, small: np.ndarray) -> np.ndarray:
+def _shifts(influence: np.ndarray, exchanged: np.ndarray, small: np.ndarray) -> np.ndarray:
     """Return the shifts of the phases (count,), rad: each shift follows from that of a coupled mass whose shift is known."""
     count = influence.shape[1]
-    coupled, place = np.abs(influence) > small, np.argmax(np.abs(influence), axis=0)
+    coupled, best_speed = np.abs(influence) > small, np.argmax(np.abs(influence), axis=0)
     shift, known = np.zeros(count), np.zeros(count, dtype=bool)
     while not known.all():
         links = np.argwhere(np.any(coupled, axis=0) & known[:, None] & ~known[None, :])
@@ -73,8 +81,8 @@ def _shifts(influence: np.ndarray, turned: np.ndarray, small: np.ndarray) -> np.
             known[np.argmin(known)] = True
             continue
         i, k = links[0]
-        at = place[i, k], i, k
-        shift[k] = shift[i] - np.angle(turned[at] / influence[at])
+        at = best_speed[i, k], i, k
+        shift[k] = shift[i] - np.angle(exchanged[at] / influence[at])
         known[k] = True
     return shift
 
@@ -86,18 +94,15 @@ def distinct_regimes(
 
     **Arguments**: `speed` (n,), `phases` (n, count); `tolerance` of speeds, relative, and of exp(i alpha).
     """
-    turn = np.exp(1j * phases)
-    orders, shifts = (np.array(parts) for parts in zip(*exchanges, strict=True))
-    places = np.argsort(orders)
+    phasors = np.exp(1j * phases)
+    permutations, shifts = (np.array(parts) for parts in zip(*exchanges, strict=True))
+    inverses = np.argsort(permutations)
     distinct: list[int] = []
     for k in np.argsort(-speed, kind="stable"):
         # All exchanged forms of this regime, (exchanges, count).
-        forms = np.take_along_axis(turn[k] * np.exp(1j * shifts), places, axis=1)
+        forms = np.take_along_axis(phasors[k] * np.exp(1j * shifts), inverses, axis=1)
         near = [i for i in distinct if abs(speed[i] - speed[k]) <= tolerance[0] * speed[i]]
-        if not near:
-            distinct.append(int(k))
-            continue
-        others = turn[near]
+        others = phasors[near]
         common = np.sum(others[:, None] * forms.conj()[None], axis=-1, keepdims=True)
         common = common / np.where(np.abs(common) > 0.0, np.abs(common), 1.0)
         if not np.any(np.max(np.abs(others[:, None] - common * forms[None]), axis=-1) < tolerance[1]):

@@ -27,9 +27,9 @@ from jaxvib.steady.regimes.local import Slopes, decays, regime_growth, slopes_of
 from jaxvib.steady.regimes.search import is_balanced, relaxed, sets_of_phases
 from jaxvib.steady.regimes.synchronous import RegimeStatus, SynchronousRegime, fields_at, require_one_speed
 
-_PHASES_PER_UNKNOWN = 4
-"""Number of random sets of phases divided by the square of the number of unknown phases. It is small, because a design
-evaluates thousands of machines."""
+_SETS_PER_SQUARED_UNKNOWN = 4
+"""The number of random sets of phases is this factor times the square of the number of unknown phases. It is small, because a
+design evaluates thousands of machines."""
 
 _SPEEDS, _LOWEST_SPEED, _HIGHEST_SPEED = 64, 0.3, 1.01
 """Number and range of the speeds, relative to that of the fastest drive, among which the speed of a start is searched for."""
@@ -43,17 +43,21 @@ _SAME_SPEED = 0.05
 
 @validated
 def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
-    """Return the regime in which the motors of a machine work: the stable synchronous regime nearest to their speeds.
+    """Return the regime in which the motors of a machine work: the stable synchronous regime at their speeds.
 
     Newton's method starts from a fixed list of sets of phases, each at the largest speed at which the sum of all torques is 0.
-    Of the regimes within 5 % of the fastest one, the stable one with the least value of Blekhman's function is returned.
-    Without damping it is the deepest minimum, which the exciters reach from most initial states:
+    Of the regimes whose speeds are within 5 % of that of the fastest regime, the stable one with the least value of Blekhman's
+    function Lambda is returned:
 
         Lambda = -(Omega^4/4) sum_ik S_i S_k Re(exp(i (alpha_k - alpha_i)) H_ik)
 
-    If none of them is stable, slower regimes follow in the order of their speeds. The search takes a hundredth of the time of
-    `synchronous_regimes`, and works under `jit`, `vmap` and `grad`. Derivatives are those of the implicit function theorem.
-    With more than 6 exciters, each start is first moved toward a stable regime, as in `synchronous_regimes`.
+    Without damping this regime is the deepest minimum of Lambda, which the exciters reach from most initial states. (A minimum
+    can be unstable if the rotors are light; such a regime is not returned.) If none of these regimes is stable, groups of
+    slower regimes follow, each 5 % wide.
+
+    The search takes a hundredth of the time of `synchronous_regimes`, and works under `jit`, `vmap` and `grad`. Derivatives are
+    those of the implicit function theorem. With more than 6 exciters, each start is first moved toward a stable regime, as in
+    `synchronous_regimes`.
 
     **Arguments**
 
@@ -91,10 +95,10 @@ def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
 @cached
 def _working(scene: Scene) -> SynchronousRegime:
     balance = assemble_torque_balance(scene)
-    numbers = fields_at(balance, *_stable_solution(jax.lax.stop_gradient(balance)))
-    stable = numbers["stable"]
-    status = RegimeStatus.where(stable, numbers["status"], RegimeStatus.none_stable)
-    fields = {**without_numbers(stable, numbers), "status": status, "can_start": numbers["can_start"]}
+    fields = fields_at(balance, *_stable_solution(jax.lax.stop_gradient(balance)))
+    stable = fields["stable"]
+    status = RegimeStatus.where(stable, fields["status"], RegimeStatus.none_stable)
+    fields = {**without_numbers(stable, fields), "status": status, "can_start": fields["can_start"]}
     return SynchronousRegime(**fields, scene=scene)
 
 
@@ -102,7 +106,7 @@ def _stable_solution(balance: TorqueBalance) -> tuple[Array, Slopes | None, Arra
     """Return the unknowns, the slopes and the growth of the stable regime; of any regime if none is stable."""
     if balance.is_prescribed.all():
         return jnp.zeros(0, balance.unbalance.dtype), None, None
-    sets = sets_of_phases(balance.is_prescribed, balance.unbalance.dtype, _PHASES_PER_UNKNOWN)
+    sets = sets_of_phases(balance.is_prescribed, balance.unbalance.dtype, _SETS_PER_SQUARED_UNKNOWN)
     sets = sets[np.unique(np.mod(sets, 2.0 * np.pi).round(6), axis=0, return_index=True)[1]]
 
     def solve(omega: Array, phase: Array) -> tuple[Array, Array, Array]:
@@ -115,8 +119,8 @@ def _stable_solution(balance: TorqueBalance) -> tuple[Array, Slopes | None, Arra
         return x, jnp.where(is_balanced(balance, x), w, 0.0), _potential(balance, w, angles)
 
     solutions, omega, potential = jax.vmap(solve)(_fastest_starts(balance, sets), jnp.asarray(sets))
-    group = jnp.floor((1.0 - omega / jnp.max(omega, initial=jnp.finfo(omega.dtype).tiny)) / _SAME_SPEED)
-    order = jnp.lexsort((potential, group))
+    speed_band = jnp.floor((1.0 - omega / jnp.max(omega, initial=jnp.finfo(omega.dtype).tiny)) / _SAME_SPEED)
+    order = jnp.lexsort((potential, speed_band))
 
     def growth_of(k: Array) -> tuple[Array, Slopes, Array]:
         x = solutions[order[k]]
@@ -142,8 +146,8 @@ def _fastest_starts(balance: TorqueBalance, sets: np.ndarray) -> Array:
         return jnp.full(len(sets), balance.speed)
     speeds = balance.speed * np.linspace(_LOWEST_SPEED, _HIGHEST_SPEED, _SPEEDS)
     influence, torque = jax.vmap(lambda w: (influence_of(balance, w), balance.driving_torque(w)))(speeds)
-    forces = balance.unbalance[None] * np.exp(1j * sets)
-    vibration = jnp.einsum("ai,gik,ak->ag", forces.conj(), influence, forces).imag * (speeds**4 / 2.0)[None]
+    unbalances = balance.unbalance[None] * np.exp(1j * sets)
+    vibration = jnp.einsum("ai,gik,ak->ag", unbalances.conj(), influence, unbalances).imag * (speeds**4 / 2.0)[None]
     total = jnp.sum(torque, axis=1)[None] + vibration
     falls = (total[:, :-1] > 0.0) & (total[:, 1:] <= 0.0)
     last = jnp.max(jnp.where(falls, jnp.arange(_SPEEDS - 1)[None], 0), axis=1)
@@ -155,6 +159,6 @@ def _fastest_starts(balance: TorqueBalance, sets: np.ndarray) -> Array:
 
 def _potential(balance: TorqueBalance, omega: Array, phase: Array) -> Array:
     """Return Blekhman's function Lambda, N m; infinite if it is not a number."""
-    forces = balance.unbalance * jnp.exp(1j * phase)
-    value = -(omega**4) / 4.0 * (forces.conj() @ influence_of(balance, omega) @ forces).real
+    unbalances = balance.unbalance * jnp.exp(1j * phase)
+    value = -(omega**4) / 4.0 * (unbalances.conj() @ influence_of(balance, omega) @ unbalances).real
     return jnp.nan_to_num(value, nan=jnp.inf)

@@ -20,7 +20,7 @@ from jaxvib.motion.integrate import IntegrationPlan, StepControl, frequency_boun
 from jaxvib.motion.run import Run
 from jaxvib.motion.start import initial_state
 from jaxvib.runtime.cache import compiled_anew
-from jaxvib.runtime.operations import operations
+from jaxvib.runtime.operations import count_operations
 from jaxvib.study.accuracy.cost import timed
 from jaxvib.study.audit.comparisons import JamComparison, MotionValues, RunComparison, without_excluded_effects
 from jaxvib.study.audit.variants import Variant
@@ -133,7 +133,7 @@ def field_operations(scene: Scene) -> int:
     True
     """
     state = eqx.filter_eval_shape(initial_state, scene)
-    return operations(lambda s, t, y: vector_field(s)(t, y), scene, jnp.zeros(()), state)
+    return count_operations(lambda s, t, y: vector_field(s)(t, y), scene, jnp.zeros(()), state)
 
 
 def relative_changes(new: MotionValues, old: MotionValues, own: MotionValues, units: tuple[str, ...]) -> dict[str, float]:

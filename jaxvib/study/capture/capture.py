@@ -34,7 +34,7 @@ from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, random_numbers
 
-MAX_CAPTURED_SLIP = 3e-3
+MAX_CAPTURED_LAG = 3e-3
 """Relative difference of the load speed and the rotor speed below which a load counts as turning with the rotor."""
 
 _SCAN_SPEEDS = 32
@@ -61,15 +61,16 @@ class Capture(Result):
     **Attributes** (S speeds, each with `starts` initial positions)
 
     - `status`: a `CaptureStatus`
-    - `speed` (S,), ascending: psi'/w, -1 for loads at rest in space, 0 for loads that turn with the rotor
+    - `speed` (S,), ascending: (load speed - rotor speed)/(rotor speed), -1 for loads at rest in space, 0 for loads that turn
+      with the rotor
     - `captured` (S, starts): True if all loads turned with the rotor at the end of the run
     - `finite` (S, starts): True if the motion stayed finite
     - `detached` (S, starts): True if a load lost contact with its wall at some time; the equations keep it on the wall
-    - `threshold`: midpoint of two neighbouring computed speeds: the lowest one such that every start at this speed and at all
-      higher speeds was captured, and the one below it
+    - `threshold`: midpoint between v and the next lower computed speed, where v is the lowest speed from which on every start
+      was captured
     - `uncertainty` of the threshold; NaN if there is no threshold. It is the largest of three numbers: half the distance
-      between these two speeds; half the distance from the threshold to the highest speed below it at which at least half of the
-      starts fail; `last_change`
+      between v and the next lower speed; half the distance from the threshold to the highest speed below it at which at least
+      half of the starts fail; `last_change`
     - `last_change`: change of the threshold by the last doubling of the steps, infinite if the threshold appeared or vanished,
       NaN without a doubling
     - `steps`, and `turns` of the rotor, of each run
@@ -142,8 +143,9 @@ class Capture(Result):
 def moving_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> State:
     """Return the state with the carrier at rest, and the loads side by side at the bottom of the tube with a common speed.
 
-    **Arguments**: `speed` psi'/w relative to the rotor, -1 for loads at rest in space; `shift`, rad, of the loads along the
-    ring, a scalar or (count,). The angle between neighbouring loads is 2 atan(r/R), as in the source of `capture`.
+    **Arguments**: `speed`: (load speed - rotor speed)/(rotor speed), -1 for loads at rest in space; `shift`, rad, of the loads
+    along the ring, a scalar or (count,). The angle between neighbouring loads is 2 atan(r/R), as printed in the source of
+    `capture`; that of balls that touch would be 2 asin(r/R).
 
     **Returns** `State`. **Raises** `InputError` for loads that are not in a torus.
 
@@ -156,8 +158,8 @@ def moving_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> Sta
     beside = 2.0 * jnp.arctan2(loads.ball_radius, loads.radius)
     zero = jnp.zeros((loads.count,))
     still = jnp.zeros(scene.machine.structure().mass.shape[:1])
-    turn = scene.drive.speed * (1.0 + jnp.asarray(speed))
-    return State(still, still, (jnp.arange(loads.count) * beside + shift, zero), (turn + zero, zero))
+    load_speed = scene.drive.speed * (1.0 + jnp.asarray(speed))
+    return State(still, still, (jnp.arange(loads.count) * beside + shift, zero), (load_speed + zero, zero))
 
 
 @validated
@@ -179,8 +181,8 @@ def capture(
 
     - For each speed, runs start from `starts` positions of the loads along the ring. Each run is integrated to its end, because
       a capture may occur late
-    - With a `resolution`, the interval between the threshold and the next lower speed is divided by further speeds until it is
-      small enough. The range above the first threshold is not refined: failures in an interval that is narrower than the
+    - With a `resolution`, the interval between the two computed speeds around the threshold is divided by further speeds until
+      it is small enough. The range above the first threshold is not refined: failures in an interval that is narrower than the
       distance of the first speeds may remain undetected
     - The scan is repeated with twice as many steps until the threshold changes by no more than the resolution or, without one,
       by no more than the spacing of the `speeds`
@@ -236,9 +238,9 @@ def capture(
         values = (shared, jnp.asarray(cases[1]), jnp.asarray(cases[2]))
         start_of = _rolling_start if rotation == "rolling" else _sliding_start
         runs = ensemble(start_of, values, end, stepsize_controller=EqualSteps(steps), estimate=False, equations=equations)
-        slip = np.abs(np.asarray(runs.load_speed) / float(scene.drive.speed) - 1.0)
+        lag = np.abs(np.asarray(runs.load_speed) / float(scene.drive.speed) - 1.0)
         finite = np.asarray(runs.finite)
-        flags = (np.all(slip < MAX_CAPTURED_SLIP, axis=1) & finite, finite, np.any(runs.detached, axis=1))
+        flags = (np.all(lag < MAX_CAPTURED_LAG, axis=1) & finite, finite, np.any(runs.detached, axis=1))
         return [flag.reshape(initial_speeds.size, starts) for flag in flags]
 
     def scan(_: np.ndarray, multiple: int) -> list[Capture]:
@@ -378,8 +380,8 @@ _STEPS_PER_RADIAN = 1.0
 statistical error of captured fractions."""
 
 _STEPS_PER_ADDED_RADIAN = 2.0
-"""Number of steps per radian of contacts between balls and of sliding (`Effect.fastest_rate`): about six steps in a
-collision."""
+"""Number of steps per radian of contacts between balls and of sliding (`Effect.fastest_rate`): about six steps in a collision
+in the first scan."""
 
 _DECAY_PER_STEP = 3.0
 """Largest product of decay rate and step. The method of order 8 is stable up to 5.2; the margin is needed because normal forces

@@ -11,7 +11,7 @@ from torus.rigid_ball import RigidBall
 import jaxvib as jv
 from jaxvib.equations.forces import energy, power
 from jaxvib.machine.files import TEMPLATES
-from jaxvib.runtime.operations import operations
+from jaxvib.runtime.operations import count_operations
 
 HEAVY = jv.planar_rotor(mass=1e12, stiffness=0.0, damping=0.0)
 BOTH = (jv.FreeSpin(), jv.Sliding(0.1))
@@ -159,7 +159,7 @@ def test_scene_without_spin_has_no_state_of_it():
     def size(effects):
         s = scene((*published(), *effects))
         state = jv.with_spin(s, some_state())
-        return len(jax.tree.leaves(state)), operations(lambda s, y: jv.vector_field(s)(0.0, y), s, state)
+        return len(jax.tree.leaves(state)), count_operations(lambda s, y: jv.vector_field(s)(0.0, y), s, state)
 
     (bare, plain), (one, spun), (more, slid) = size(()), size(BOTH[:1]), size(BOTH[1:])
     assert (bare, one, more) == (6, 7, 8)

@@ -85,10 +85,10 @@ def test_ring_of_twelve_has_the_exchanges_of_its_rotations():
     gap = np.arange(12)[:, None] - np.arange(12)
     influence = np.exp(-np.minimum(gap % 12, -gap % 12))[None] * (1.0 + 0.2j)
     assert len(exchanges_of(influence, np.ones((12, 1)))) == 24
-    orders = [each.order for each in exchanges_of(influence * np.exp(0.1j * (gap % 12 == 1)), np.ones((12, 1)))]
+    orders = [each.permutation for each in exchanges_of(influence * np.exp(0.1j * (gap % 12 == 1)), np.ones((12, 1)))]
     assert sorted(map(tuple, orders)) == sorted(tuple(np.roll(np.arange(12), k)) for k in range(12))
 
 
 def test_number_of_exchanges_is_bounded():
     found = exchanges_of(np.ones((1, 9, 9)) * (1.0 + 0.1j), np.ones((9, 1)))
-    assert len(found) == 5040 and found[0].order.tolist() == list(range(9))
+    assert len(found) == 5040 and found[0].permutation.tolist() == list(range(9))

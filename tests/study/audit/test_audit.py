@@ -339,7 +339,7 @@ def test_bearing_friction_is_that_of_the_effect():
     of_arguments = jv.DryFriction.typical(scene.machine, PENDULUMS, scene.drive.speed, jnp.zeros(1)).effect
     friction = of_arguments.friction(PENDULUMS, (jnp.zeros(4),), (jnp.full(4, 27.0),), scene.drive.speed, {})
     drag = 4 * 0.14 * 0.08**2 * (60.0 - 27.0)
-    np.testing.assert_allclose(row.value, float(jnp.sum(friction.lever * friction.reaction)) / drag, rtol=1e-9)
+    np.testing.assert_allclose(row.value, float(jnp.sum(friction.lever * friction.static_normal_force)) / drag, rtol=1e-9)
 
 
 def test_a_run_is_compared_if_no_jam_exists():

@@ -20,7 +20,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import require_torus_balls
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.plan import EqualSteps
-from jaxvib.study.capture.capture import DOUBLINGS, MAX_CAPTURED_SLIP, moving_state, refine, steps_per_second
+from jaxvib.study.capture.capture import DOUBLINGS, MAX_CAPTURED_LAG, moving_state, refine, steps_per_second
 from papers.machines import TORUS_SPEED, published_torus
 from papers.printed_torus import TABLES, PublishedRow, cosine_torus, gap_torus, printed_torus
 
@@ -311,7 +311,7 @@ def _outcomes(model: _Model, runs: _Runs, needed: np.ndarray, turns: int) -> np.
             model.make, values, end, stepsize_controller=steps, estimate=False, batch=_LANES, equations=model.equations
         )
         slip = np.abs(np.asarray(ran.load_speed) / TORUS_SPEED - 1.0)
-        captured[block] = (np.all(slip < MAX_CAPTURED_SLIP, axis=1) & np.asarray(ran.finite))[: block.size]
+        captured[block] = (np.all(slip < MAX_CAPTURED_LAG, axis=1) & np.asarray(ran.finite))[: block.size]
     return captured
 
 
