@@ -205,7 +205,9 @@ class Dynamics(eqx.Module):
             return jnp.concatenate([product.reshape(-1, x.shape[1]) for product in products])
 
         if self.mass is not None:
-            mass = self.mass + jnp.matmul(self.rows.T, weighted(self.rows), precision="highest")
+            # XLA may call a library for a product of matrices and then runs the time loop as a chain of small functions.
+            added = [times(self.rows.T, column) for column in weighted(self.rows).T]
+            mass = self.mass + jnp.stack(added, axis=1)
             carrier = solve_definite(mass, times(self.mass, unforced) - times(self.rows.T, reaction))
             a = times(self.rows, carrier)
         else:

@@ -10,7 +10,9 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.equations import model
+from jaxvib.equations.dynamics import dynamics_of
 from jaxvib.equations.linear import linear_model
+from jaxvib.equations.model import assemble
 from jaxvib.equations.torque_balance import resultant_of
 from jaxvib.machine.drives.drive import Directed
 
@@ -109,6 +111,22 @@ def test_fences_reduce_the_sines_of_a_group():
         return jax.jit(lambda y: field(jnp.asarray(0.3), y)).lower(state).compile().as_text().count(" sine(")
 
     assert field.has_fences and sines(field) < sines(dataclasses.replace(field, has_fences=False))
+
+
+@pytest.mark.parametrize("derivative", [False, True])
+def test_loops_over_groups_call_no_library(derivative):
+    """XLA does not compile a loop with library calls into one function; derivatives of runs then take many times as long."""
+    field = dynamics_of(assemble(jv.Scene(PLANAR, exciters=MIXED, effects=jv.Gravity())))
+    state = jv.initial_state(jv.Scene(PLANAR, exciters=MIXED), "rest")
+
+    def step(_, y):
+        if not derivative:
+            return field(jnp.asarray(0.3), y)
+        value, back = jax.vjp(lambda y: field(jnp.asarray(0.3), y), y)
+        return back(value)[0]
+
+    program = jax.jit(lambda y: jax.lax.fori_loop(0, 9, step, y)).lower(state).compile().as_text()
+    assert " while(" in program and "ynn_fusion" not in program and "custom-call" not in program
 
 
 def test_directions_do_not_divide_a_group():
