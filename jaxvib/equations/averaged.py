@@ -157,12 +157,12 @@ class Averaged(eqx.Module):
     def __call__(self, t: Array, state: Amplitudes) -> Amplitudes:
         """Return the time derivative of `state` at time `t`."""
         acceleration, rate, _ = self._accelerations(t, state)
-        turn = 1j * jnp.mean(state.rate)
+        rotation = 1j * jnp.mean(state.rate)
         return Amplitudes(
-            displacement=state.velocity - turn * state.displacement,
-            velocity=acceleration - turn * state.velocity,
+            displacement=state.velocity - rotation * state.displacement,
+            velocity=acceleration - rotation * state.velocity,
             rate=rate,
-            phase=state.rate - turn.imag,
+            phase=state.rate - rotation.imag,
         )
 
     def _accelerations(self, t: Array, state: Amplitudes) -> tuple[Array, Array, Array]:
@@ -213,7 +213,7 @@ class Averaged(eqx.Module):
         """
         _, rate, forward = self._accelerations(t, state)
         omega, nd = jnp.mean(state.rate), state.velocity.shape[0]
-        turn, circle = jnp.cos(state.phase) + 1j * jnp.sin(state.phase), self._circle()
+        phasors, circle = jnp.cos(state.phase) + 1j * jnp.sin(state.phase), self._circle()
         u, v = (jnp.sum(each, axis=1) for each in (self.input_matrix * circle, self.port * jnp.conj(circle)))
         if self.levers is not None:
             u, v = (jnp.matmul(self.levers.T, each, precision="highest") for each in (u, v))
@@ -225,9 +225,9 @@ class Averaged(eqx.Module):
             return self.gyroscopic_speed(self.rotor_speeds(t, w))
 
         by_rate = jax.jvp(free, (state.rate,), (jnp.ones_like(state.rate),))[1]
-        by_phase = self.unbalance * (jnp.conj(turn) * forward).real / (2.0 * self.inertia) / shift
+        by_phase = self.unbalance * (jnp.conj(phasors) * forward).real / (2.0 * self.inertia) / shift
         rate_response = 1.0 / (shift - by_rate - by_phase)
-        force = self.unbalance * turn * (state.rate**2 - 1j * rate)
+        force = self.unbalance * phasors * (state.rate**2 - 1j * rate)
         spin = shift + 1j * omega
 
         def completed(z: Array, r: Amplitudes) -> tuple[Array, Amplitudes]:
@@ -235,10 +235,10 @@ class Averaged(eqx.Module):
             dv, domega = z[:nd] + 1j * z[nd : 2 * nd], z[2 * nd]
             da = spin * dv + 1j * state.velocity * domega - r.velocity
             dy = (dv - 1j * state.displacement * domega + r.displacement) / spin
-            along = mean_torque(self.unbalance, jnp.conj(turn) * jnp.sum(v * da[None, :], axis=-1)) / self.inertia
+            along = mean_torque(self.unbalance, jnp.conj(phasors) * jnp.sum(v * da[None, :], axis=-1)) / self.inertia
             dw = rate_response * (along + r.rate + by_phase * (r.phase - domega))
             dpsi = (dw - domega + r.phase) / shift
-            dforce = self.unbalance * turn * (2.0 * state.rate * dw - 1j * (shift * dw - r.rate)) + 1j * force * dpsi
+            dforce = self.unbalance * phasors * (2.0 * state.rate * dw - 1j * (shift * dw - r.rate)) + 1j * force * dpsi
             carrier = jnp.sum(u * dforce[:, None], axis=0) - times(self.stiffness, dy) - times(self.damping, dv)
             if self.gyroscopic is not None:
                 speed, change = jax.jvp(gyroscopic_speed, (state.rate,), (dw,))

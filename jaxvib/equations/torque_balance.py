@@ -149,7 +149,7 @@ class UnbalancedModel(ExcitedModel):
 
         Y = Omega^2 D(Omega)^-1 f,      f = sum_k S_k exp(i alpha_k) B_k^T e_k,     braking torque = -(Omega^4/2) Im(f^H D^-1 f)
 
-    **Attributes**, in addition to those of `ExcitedModel`: the `balance` of torques; `turn` (count,), the complex numbers
+    **Attributes**, in addition to those of `ExcitedModel`: the `balance` of torques; `phasors` (count,), the complex numbers
     exp(i alpha_k); `resultant` (np,) kg m, complex: sum_k S_k exp(i alpha_k) e_k, the force per Omega^2 in each direction;
     `shaft`: the balance of one mass in place of all masses, which turn as one because their phases are fixed. The
     `unbalance` of this model is 1, and its `force_direction` is f.
@@ -157,7 +157,7 @@ class UnbalancedModel(ExcitedModel):
 
     balance: TorqueBalance
     shaft: TorqueBalance
-    turn: Array
+    phasors: Array
     resultant: Array
     unbalance: Array
     force_direction: Array
@@ -196,7 +196,7 @@ class UnbalancedModel(ExcitedModel):
         **Arguments**: `omega`: speed of the rotors, rad/s; `displacement` (nd,): complex amplitudes.
         """
         forward = omega**2 * (self.balance.direction.conj() @ displacement)
-        return mean_torque(self.balance.unbalance, jnp.conj(self.turn) * forward)
+        return mean_torque(self.balance.unbalance, jnp.conj(self.phasors) * forward)
 
     def drive_torque(self, omega: Array, required: Array) -> Array:
         """Return the torque of each drive, (count,) N m, from the torques that the rotors need, `required_torque`.
@@ -212,10 +212,10 @@ class UnbalancedModel(ExcitedModel):
 
 def unbalanced_model(scene: Scene, phases: Array) -> UnbalancedModel:
     """Assemble the model of a scene whose exciters have unbalances with `phases` (count,), rad."""
-    model, turn = linear_model(scene), jnp.exp(1j * phases)
-    resultant = resultant_of(model, turn)
+    model, phasors = linear_model(scene), jnp.exp(1j * phases)
+    resultant = resultant_of(model, phasors)
     balance = balance_of(with_imbalances(model))
-    model, force = balance.model, (balance.unbalance * turn) @ balance.direction
+    model, force = balance.model, (balance.unbalance * phasors) @ balance.direction
     return UnbalancedModel(
         scene=model.scene,
         carrier=model.carrier,
@@ -224,7 +224,7 @@ def unbalanced_model(scene: Scene, phases: Array) -> UnbalancedModel:
         mass=model.mass,
         balance=balance,
         shaft=balance if len(scene.exciters) == 1 else _on_one_shaft(balance, force),
-        turn=turn,
+        phasors=phasors,
         resultant=resultant,
         unbalance=jnp.ones((), model.mass.dtype),
         force_direction=force,
@@ -322,21 +322,21 @@ def with_imbalances(model: LinearModel) -> LinearModel:
     return dataclasses.replace(model, scene=scene, mounts=tuple(mounts))
 
 
-def resultant_of(model: LinearModel, turn: Array) -> Array:
+def resultant_of(model: LinearModel, phasors: Array) -> Array:
     """Return the resultant of the centrifugal forces per w^2, (np,) kg m complex: sum_j S_j exp(i alpha_j) e_j.
 
-    `turn` (count,): exp(i alpha) of each load, or of the unbalance of an exciter without loads, which includes the static
+    `phasors` (count,): exp(i alpha) of each load, or of the unbalance of an exciter without loads, which includes the static
     imbalance of its rotor. The result is NaN for loads that do not move on a circle.
     """
-    total, first = jnp.zeros((), turn.dtype), 0
+    total, first = jnp.zeros((), phasors.dtype), 0
     for exciter, mount in zip(model.scene.exciters, model.mounts, strict=True):
         loads = exciter.loads
         if loads is None:
             unbalance = 0.0 if exciter.unbalance is None else exciter.unbalance
-            each = turn[first] * sum((amount for amount in _imbalances(exciter, about_tilts=False)), unbalance)
+            each = phasors[first] * sum((amount for amount in _imbalances(exciter, about_tilts=False)), unbalance)
         else:
             size = loads.mass * loads.radius if isinstance(loads, CircularLoads) else jnp.nan
-            each = jnp.sum(size * turn[first : first + loads.count])
+            each = jnp.sum(size * phasors[first : first + loads.count])
         total = total + each * rotating_direction(mount, exciter.direction)
         first += 1 if loads is None else loads.count
     return total
@@ -408,9 +408,9 @@ def response_of(balance: TorqueBalance, omega: Array) -> Array:
     return small_solve(dynamic, balance.direction.T.astype(dynamic.dtype))
 
 
-def torques_at(unbalance: Array, influence: Array, omega: Array, turn: Array) -> Array:
+def torques_at(unbalance: Array, influence: Array, omega: Array, phasors: Array) -> Array:
     """Return V (count,), N m, from unbalances (count,), influence coefficients (count, count) and exp(i alpha) (count,)."""
-    return mean_torque(unbalance, -(omega**4) * jnp.conj(turn) * times(influence, unbalance * turn))
+    return mean_torque(unbalance, -(omega**4) * jnp.conj(phasors) * times(influence, unbalance * phasors))
 
 
 def unknowns_of(balance: TorqueBalance, omega: Array, phase: Array) -> Array:
@@ -439,8 +439,8 @@ def balance_residuals(x: Array, balance: TorqueBalance, factor: Array | None = N
     **Arguments**: `x`, see `unknowns_of`; `factor`, see `TorqueBalance.total_driving_torque`.
     """
     w, angles = motion_of(balance, x)
-    turn = jax.lax.complex(jnp.cos(angles), jnp.sin(angles))
-    torque = torques_at(balance.unbalance, influence_of(balance, w), w, turn)
+    phasors = jax.lax.complex(jnp.cos(angles), jnp.sin(angles))
+    torque = torques_at(balance.unbalance, influence_of(balance, w), w, phasors)
     residual = (balance.total_driving_torque(w, factor) + torque) / balance.torque_scale
     return residual[np.flatnonzero(~balance.is_prescribed)] if any(balance.is_prescribed) else residual
 

@@ -110,7 +110,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
       slightly separated loads would leave it, the status is `would_separate`, and the run is not `settled`. Loads with a
       `ball_radius` that end inside each other have the status `overlapping`, which the effect `LoadContact` prevents
     - `engine` of the integration: "scalar" if the equations are computed on scalars, which is faster for small states, or
-      "array", for states of more than 32 entries, 4 or more coordinates or loads of one exciter, and very long equations
+      "array", for states of more than 32 entries, machines with 4 or more coordinates, exciters with 4 or more loads, and very
+      long equations
     - `evaluations` of the vector field (0 if the method does not count them), and `seconds` of the computation. Both include
       the run with larger steps for the error; `seconds` includes compilation if the program was new, and is NaN under a JAX
       transformation

@@ -159,8 +159,8 @@ class _Bodies(Machine):
     def mount(self, at: Place = None) -> Mount:
         """Return the motion of the axis at the point `at`, and the rotation of the exciter's housing with its body."""
         rows = self.rows_at(at, "at")
-        turn = np.eye(rows.shape[1])[3 * (at.body if isinstance(at, BodyPoint) else 0) + 2]
-        return Mount(rows=(rows,), axes=(0, 1), turn=jnp.asarray(turn, rows.dtype))
+        housing_row = np.eye(rows.shape[1])[3 * (at.body if isinstance(at, BodyPoint) else 0) + 2]
+        return Mount(rows=(rows,), axes=(0, 1), turn=jnp.asarray(housing_row, rows.dtype))
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
         """Return the matrix that gives the displacement of a point (x, y) of a body, m from its centre of mass; None: the
@@ -212,8 +212,8 @@ class _Bodies(Machine):
         rows = self._point_rows(each.at, each.body)
         if each.to is not None and each.at_other is not None:
             rows = rows - self._point_rows(each.at_other, each.to)
-        turn = jnp.stack([jnp.cos(each.angle), jnp.sin(each.angle)])
-        return rows, jnp.stack([turn, jnp.stack([-turn[1], turn[0]])])
+        first = jnp.stack([jnp.cos(each.angle), jnp.sin(each.angle)])
+        return rows, jnp.stack([first, jnp.stack([-first[1], first[0]])])
 
     def _point_rows(self, at: Array, body: int) -> Array:
         """Return the rows (2, nd) of the point `at` of a body."""

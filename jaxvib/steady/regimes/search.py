@@ -96,7 +96,7 @@ def tolerances(dtype: np.dtype) -> tuple[float, float]:
 
 
 def exchanges_in(balance: TorqueBalance) -> list[Exchange]:
-    """Return the exchanges of masses that leave the balance unchanged, see `exchanges_of`."""
+    """Return the exchanges of masses that leave the torque balance unchanged, see `exchanges_of`."""
     speeds = float(balance.speed) * np.array([0.31, 0.57, 0.83, 0.99])
     influence, torque = _data_at(balance, speeds.astype(balance.unbalance.dtype))
     numbers = [balance.unbalance, balance.averaged.inertia, balance.is_prescribed, *torque]
@@ -161,8 +161,8 @@ def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tup
     if balance.is_prescribed.any():
         return np.full(len(sets), np.asarray(balance.speed)), sets
     influence, torque = _data_at(balance, speeds)
-    forces = np.asarray(balance.unbalance) * np.exp(1j * sets)
-    parts = np.array_split(forces, -(-len(forces) // _SETS_AT_ONCE))
+    unbalances = np.asarray(balance.unbalance) * np.exp(1j * sets)
+    parts = np.array_split(unbalances, -(-len(unbalances) // _SETS_AT_ONCE))
     each = [np.einsum("ai,gik,ak->ag", part.conj(), influence, part, optimize=True).imag for part in parts]
     braking = np.concatenate(each) * speeds**4 / 2.0
     total = np.sum(torque, axis=1) + braking

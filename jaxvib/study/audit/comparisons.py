@@ -31,8 +31,8 @@ _MIN_UNCERTAINTY = 1e-9
 """Lower bound of the relative uncertainty of the values of a motion."""
 
 _WINDOW_PERIODS = 100
-"""Length of the measuring window at the end of a run, in slow periods. It must include the beat of an imbalance with jammed
-loads."""
+"""Length of the measuring window at the end of a run, in periods of the lowest natural frequency. It must include the beat of
+an imbalance with jammed loads."""
 
 MIN_AMPLITUDE_SHARE = 0.01
 """Smallest scale of amplitudes, in units of the unbalance radius S/M of the loads. It is used for machines that hardly move,
@@ -162,8 +162,8 @@ class RunComparison(NamedTuple):
     def of_arguments(cls, scene: Scene, until: float | None, start: Literal["rest", "turning"] | State | None) -> RunComparison:
         """Return a comparison by a run.
 
-        By default the run ends at 100 slow periods plus twice the time of the last jump of the drive's acceleration. It starts
-        with "turning" if the rotor speed is constant, otherwise from "rest".
+        By default the run ends at 100 periods of the lowest natural frequency plus twice the time of the last jump of the
+        drive's acceleration. It starts with "turning" if the rotor speed is constant, otherwise from "rest".
         """
         if start is None:
             start = "turning" if scene.drive.constant else "rest"
