@@ -115,11 +115,6 @@ def _vibration_measure(name: str, unit: str, field: str, axis: str = "") -> RunM
     return RunMeasure(name, unit, read, axis)
 
 
-def _peak_force(run: BatchRun) -> Array:
-    assert run.peaks is not None
-    return jnp.sqrt(jnp.sum(run.peaks.force**2))
-
-
 def _support_load(run: BatchRun) -> Array:
     return _STATIC.read(run) + _DYNAMIC.read(run)
 
@@ -141,7 +136,7 @@ RUN_MEASURES = {
         RunMeasure("run.relative_rotation", "rad", _relative_rotation),
         RunMeasure("run.drift", "", "measured.drift"),
         RunMeasure("run.peak_displacement", "m or rad", "peaks.displacement", axis="coordinate", of_whole_run=True),
-        RunMeasure("run.peak_force", "N", _peak_force, of_whole_run=True),
+        RunMeasure("run.peak_force", "N", "peaks.force", of_whole_run=True),
         RunMeasure("run.settling_time", "s", _settling_time),
         _vibration_measure("run.stroke", "m", "stroke", "translation"),
         _vibration_measure("run.acceleration", "", "acceleration", "translation"),
@@ -158,8 +153,8 @@ RUN_MEASURES = {
 
 - regime (see `regime`), jam mode (0: not jammed), ripple and rotor speed. They need a scene with one exciter and loads
 - load speeds, amplitudes and foundation force (zero to peak), drift (see `AbstractMeasured`)
-- peak displacement and peak force: `Run.largest_displacement` and `Run.largest_force` of the whole run (start, passage through
-  resonances, stop)
+- peak displacement and peak force: the largest displacement of each coordinate from rest and the largest magnitude of the
+  foundation force of the whole run (start, passage through resonances, stop), as the quantity `peak_force`
 - relative rotation: the largest difference between the angles through which two loads, or rotors without loads, turn in the
   measuring window
 - settling time: the time after which each load speed differs from its final value by less than 1 % of the rotor speed, with a

@@ -30,7 +30,7 @@ def _times(until: Number, spin_up: Number | None) -> tuple[float, float | None]:
 
 @validated
 def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
-    """Return the largest foundation force, N, of a run from rest (full equations), see `Run.largest_force`.
+    """Return the largest foundation force, N, of a run from rest (full equations).
 
     **Arguments**
 
@@ -50,7 +50,9 @@ def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
 
 
 def _peak(evaluation: Evaluation, tier: Tier, until: float, spin_up: float | None) -> Array:
-    return evaluation.start_up(until, spin_up).largest_force
+    trajectory = evaluation.start_up(until, spin_up).trajectory
+    assert trajectory is not None
+    return jnp.sqrt(jnp.max(jnp.sum(trajectory.foundation_force**2, axis=1)))
 
 
 @validated

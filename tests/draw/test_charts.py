@@ -127,6 +127,14 @@ def test_a_branch_diagram_has_linear_axes_on_request():
     assert axes[1].get_ylim() == pytest.approx((0.0, 1.08 * 25.0e3))
 
 
+@pytest.mark.parametrize(("rotor", "lines"), [(100.005, 2), (100.02, 1)])
+def test_the_rotor_is_drawn_beside_loads_at_its_speed(rotor, lines):
+    t = np.linspace(0.0, 1.0, 401)
+    wave = np.sin(80.0 * np.pi * t)[:, None]
+    arrays = (t, wave, 100.0 + 1e-6 * wave, np.full_like(wave, rotor), wave)
+    assert len(time_histories(arrays, arrays, names=("y",), directions=("up",)).axes[3].lines) == lines
+
+
 def test_small_motions_at_the_end_have_their_own_unit():
     t = np.linspace(0.0, 1.0, 8001)
     wave = np.sin(80.0 * np.pi * t)[:, None]

@@ -108,7 +108,8 @@ def time_histories(
     _draw_rotor_speeds(left, whole[0], scale * whole[3])
     slowest, fastest = np.min(part[2], initial=np.inf), np.max(part[2], initial=-np.inf)
     # The ripple of loads that are much slower than the rotor would be invisible on an axis that includes the rotor.
-    if whole[2].shape[1] == 0 or np.all(np.abs(part[3] - 0.5 * (slowest + fastest)) < fastest - slowest):
+    shown = max(fastest - slowest, _MIN_SPEED_RANGE * fastest)
+    if whole[2].shape[1] == 0 or np.all(np.abs(part[3] - 0.5 * (slowest + fastest)) < shown):
         _draw_rotor_speeds(right, part[0], scale * part[3])
     low, high = right.get_ylim()
     if high - low < (least := _MIN_SPEED_RANGE * max(abs(low), abs(high))):  # rounding errors of a constant speed

@@ -247,8 +247,8 @@ def _extrema(model: Model, field: Field, times: Array, states: State) -> tuple[A
 class Peaks(NamedTuple):
     """Largest values of a motion.
 
-    **Attributes**: `displacement` (nd,), m or rad: largest displacement of each coordinate from rest; `force` (nb,), N: largest
-    foundation force in each direction.
+    **Attributes**: `displacement` (nd,), m or rad: largest displacement of each coordinate from rest; `force`, N: largest
+    magnitude of the foundation force.
     """
 
     displacement: Array
@@ -256,14 +256,19 @@ class Peaks(NamedTuple):
 
 
 def locate_peaks(model: Model, field: Field, times: Array, states: State) -> Peaks:
-    """Return the largest values of an evenly sampled part of a motion, between the samples as in `measure`.
+    """Return the largest values of an evenly sampled part of a motion, for arguments as in `measure`.
 
-    **Arguments**: as for `measure`.
+    Values between the samples are those of the polynomials of `locate_extrema`. The largest magnitude of the force is that at
+    the largest square of the force.
     """
     nd = states.displacement.shape[1]
-    (low, high), _, _ = _extrema(model, field, times, states)
-    largest = jnp.maximum(-low[2], high[2])
-    return Peaks(largest[:nd], largest[nd:])
+    values, slopes = _sampled_outputs(model, field, times, states)
+    (low, high), _, _ = jax.vmap(locate_extrema, out_axes=-1)(values[:nd], slopes[:nd])
+    force, change = values[nd:], slopes[nd:]
+    _, first, position = locate_extrema(jnp.sum(force**2, axis=0), 2.0 * jnp.sum(force * change, axis=0))
+    at, place = first[1, 2] + jnp.arange(NODES), position[1, 2]
+    largest_force = jax.vmap(lambda x, v: extremum_value(x[at], v[at], place))(force, change)
+    return Peaks(jnp.maximum(-low[2], high[2]), jnp.sqrt(jnp.sum(largest_force**2)))
 
 
 def _sampled_outputs(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array]:
