@@ -237,14 +237,16 @@ def directions_of(information: Information) -> tuple[tuple[Direction, ...], tupl
 
 
 def _sentences(information: Information, axes: np.ndarray, errors: np.ndarray, effect: str, advice: str) -> list[Direction]:
-    common = np.array([_in_common_factor(name) for name in information.names], float)
+    common = np.array([_kind_with_kg(name) is not None for name in information.names], float)
     sentences = []
     if axes.size and np.any(common):
         common /= np.linalg.norm(common)
         inside = axes @ (axes.T @ common)
         if np.linalg.norm(inside) > _MIN_COMMON_PART:
-            kinds = _kinds(information.names)
-            text = f"multiplying all {kinds} by one number{effect}: {advice}"
+            present = {_kind_with_kg(name) for name in information.names}
+            kinds = [kind for kind in _KINDS_WITH_KG.values() if kind in present]
+            listed = " and ".join(filter(None, [", ".join(kinds[:-1]), kinds[-1]]))
+            text = f"multiplying all {listed} by one number{effect}: {advice}"
             weights = (axes.T @ common) * errors
             sentences.append(Direction(text, information.names, tuple(map(float, common)), float(np.linalg.norm(weights))))
             spread = axes * errors
@@ -264,20 +266,21 @@ def _sentences(information: Information, axes: np.ndarray, errors: np.ndarray, e
     return sentences
 
 
-def _in_common_factor(name: str) -> bool:
-    """Return True for numbers whose unit contains kg once, in products such as N s/m or kg m."""
-    return any(word in name for word in ("mass", "inertia", "stiffness", "damping", "drag", "unbalance", "torque"))
+_KINDS_WITH_KG = {
+    "mass": "masses",
+    "inertia": "inertias",
+    "stiffness": "stiffnesses",
+    "damping": "dampings",
+    "drag": "drags",
+    "unbalance": "unbalances",
+    "torque": "torques",
+    "power": "powers",
+    "bearing": "frictions of bearings",
+}
+"""Words in the names of numbers whose unit contains kg once, in products such as N s/m or kg m, and their plurals."""
 
 
-def _kinds(names: tuple[str, ...]) -> str:
-    words = {
-        "mass": "masses",
-        "inertia": "inertias",
-        "stiffness": "stiffnesses",
-        "damping": "dampings",
-        "drag": "drags",
-        "unbalance": "unbalances",
-        "torque": "torques",
-    }
-    present = [plural for word, plural in words.items() if any(word in name.rpartition(".")[2] for name in names)]
-    return present[0] if len(present) == 1 else ", ".join(present[:-1]) + " and " + present[-1]
+def _kind_with_kg(name: str) -> str | None:
+    """Return the kind of a number whose unit contains kg once; None for other numbers."""
+    last = name.rpartition(".")[2]
+    return next((plural for word, plural in _KINDS_WITH_KG.items() if word in last), None)

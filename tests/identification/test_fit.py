@@ -8,7 +8,7 @@ import pytest
 from run_ups_by_scipy import TOP, TRUTH, Ramp, accelerations, bound, free_motions, ramp, record, scene_of
 
 import jaxvib as jv
-from jaxvib.identification.directions import _in_common_factor
+from jaxvib.identification.directions import _kind_with_kg
 
 T = 0.002 * np.arange(8000)
 NOISE = 0.05
@@ -139,8 +139,9 @@ def test_common_factor_of_all_numbers_is_undetermined():
 
 def test_places_and_torques_do_not_share_the_common_factor():
     inside = ("machine.mass[0]", "machine.link_damping", "exciters[1].unbalance", "exciters[0].drive.inertia")
-    assert all(map(_in_common_factor, inside))
-    assert not any(map(_in_common_factor, ("machine.supports[0].angle", "machine.supports[1].at[0]")))
+    assert all(map(_kind_with_kg, inside))
+    assert [_kind_with_kg(f"drive.{name}") for name in ("power", "bearing")] == ["powers", "frictions of bearings"]
+    assert not any(map(_kind_with_kg, ("machine.supports[0].angle", "machine.supports[1].at[0]")))
 
 
 def test_known_mass_that_is_added_determines_all_numbers():
