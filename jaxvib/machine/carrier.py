@@ -1,7 +1,5 @@
 """Machines: their linear structure, places on it, and the mounts of exciters there."""
 
-from __future__ import annotations
-
 import abc
 import functools
 from collections.abc import Hashable, Sequence

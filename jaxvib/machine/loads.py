@@ -1,7 +1,5 @@
 """Loads on a circle: balls, rollers and pendulums."""
 
-from __future__ import annotations
-
 import abc
 import math
 from collections.abc import Mapping
@@ -59,8 +57,7 @@ class Loads(Part):
     Arrays have one entry per load, or are scalars shared by all loads; functions act elementwise on (count,) arrays.
 
     A load has one or several coordinates u. The first is its angle about the rotor's axis, rad; its generalised force is the
-    torque that the load takes from the rotor. The analyses of jams and of balance accept `CircularLoads` only. A
-    subclass without `__init__` takes its arguments by name, because the fields of the base class come first.
+    torque that the load takes from the rotor. The analyses of jams and of balance accept `CircularLoads` only.
 
     **Attributes**
 

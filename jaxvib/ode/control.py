@@ -1,7 +1,5 @@
 """Step-size controllers for diffrax."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -80,7 +78,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         """Norm of implicit solvers, see `rtol`."""
         return optimistix.rms_norm
 
-    def wrap(self, direction: IntScalarLike) -> PIController:
+    def wrap(self, direction: IntScalarLike) -> "PIController":
         """Return the controller itself, because time runs forward only."""
         return self
 

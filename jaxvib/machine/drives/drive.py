@@ -1,7 +1,5 @@
 """Drives of the rotor: ideal drives with a prescribed speed, and motors of limited power."""
 
-from __future__ import annotations
-
 import abc
 from typing import ClassVar, cast
 
@@ -84,7 +82,7 @@ class Drive(Part):
         """Return the times at which the acceleration jumps, which must be ends of steps."""
         return ()
 
-    def settled(self) -> Drive:
+    def settled(self) -> "Drive":
         """Return the drive in its final state: an ideal drive at its working speed, or a motor switched off if it is switched
         off at some time."""
         return self
@@ -207,8 +205,7 @@ class Motor(Drive):
         J theta'' = T(theta') - torque of the loads on the rotor
 
     J (`inertia`) is the moment of inertia of the whole rotor about its axis. It includes the unbalance of the rotor but not
-    the loads; typical: 0.005 to 1 kg m^2. A subclass without `__init__` takes its arguments by name, because the fields of the
-    base class come first.
+    the loads; typical: 0.005 to 1 kg m^2.
 
     >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
     >>> class Turbine(jv.Motor):

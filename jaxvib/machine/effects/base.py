@@ -1,7 +1,5 @@
 """Base class of effects; gravity and imbalances. The traced program contains only the effects of the scene."""
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Iterable
 from typing import ClassVar, Literal, NamedTuple, TypeVar
@@ -31,11 +29,11 @@ _AXES = {"up": 1, "axis": 2}
 class Typical(NamedTuple):
     """Effect with typical values, for a scene that does not have it; `note` describes these values."""
 
-    effect: Effect
+    effect: "Effect"
     note: str
 
 
-def terms_of(effects: Iterable[Effect], *kinds: type[T]) -> list[T]:
+def terms_of(effects: Iterable["Effect"], *kinds: type[T]) -> list[T]:
     """Return the terms of these `kinds` that the effects add.
 
     >>> import jaxvib as jv
@@ -45,12 +43,12 @@ def terms_of(effects: Iterable[Effect], *kinds: type[T]) -> list[T]:
     return [term for effect in effects for term in effect.terms() if isinstance(term, kinds)]
 
 
-def has_term(effects: Iterable[Effect], *kinds: type[Term]) -> bool:
+def has_term(effects: Iterable["Effect"], *kinds: type[Term]) -> bool:
     """Return True if an effect adds a term of one of these `kinds`."""
     return bool(terms_of(effects, *kinds))
 
 
-def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
+def total_gravity(effects: Iterable["Effect"]) -> dict[int, Array]:
     """Return the acceleration of gravity of a scene with these `effects`, m/s^2, by axis. Gravity points in the negative
     direction of the axis."""
     total: dict[int, Array] = {}
@@ -59,7 +57,7 @@ def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
     return total
 
 
-def has_half_turn_symmetry(effects: Iterable[Effect]) -> bool:
+def has_half_turn_symmetry(effects: Iterable["Effect"]) -> bool:
     """Return True if phi -> phi + pi, q -> -q leaves the equations with these `effects` unchanged.
 
     In a jam the vibration then has odd harmonics only, and the deviation of the load angle even ones. Some friction laws keep
@@ -121,7 +119,7 @@ class Effect(Part):
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` if the effect cannot act on this `machine` or these `loads`."""
 
-    def prepare(self, loads: Loads, mount: Mount) -> Effect:
+    def prepare(self, loads: Loads, mount: Mount) -> "Effect":
         """Return the effect with the quantities that depend on the parameters of the `loads` and on their `mount`, but not on
         time."""
         return self

@@ -1,7 +1,5 @@
 """Nonlinear supports: cubic springs and stops."""
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 import equinox as eqx

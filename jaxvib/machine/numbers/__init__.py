@@ -136,7 +136,7 @@ class Part(eqx.Module):
     def __repr__(self) -> str:
         specs = number_specs(type(self))
         names = [field.name for field in dataclasses.fields(self) if field.name != "kind"]
-        values = {name: getattr(self, name) for name in names if not isinstance(getattr(type(self), name, None), property)}
+        values = {name: getattr(self, name) for name in names}
         present = {name: value for name, value in values.items() if value is not None and np.shape(value) != (0,)}
         shown = [f"{name}={_shown(value, specs.get(name, PLAIN))}" for name, value in present.items()]
         name = getattr(self, "kind", type(self).__name__)
