@@ -81,7 +81,8 @@ def part_of(build: Callable[..., object]) -> type:
     if isinstance(build, type):
         return build
     function = inspect.unwrap(build)
-    return function.__globals__[function.__annotations__["return"]]
+    returned = function.__annotations__["return"]
+    return returned if isinstance(returned, type) else function.__globals__[returned]
 
 
 def _choices(build: Callable[..., object], parameter: inspect.Parameter) -> tuple[str, ...]:
