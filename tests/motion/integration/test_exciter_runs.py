@@ -1,5 +1,6 @@
 """Runs of several exciters against equations written by hand and integrated by SciPy."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -71,6 +72,42 @@ def test_ensembles_of_two_motors_obey_the_equations_by_hand():
         end = jax.tree.map(lambda leaf, k=k: leaf[k], many.state)
         np.testing.assert_allclose(flat(end), by_hand((float(stall), STALL[1])), rtol=1e-6, atol=1e-6)
     assert many.load_speed.shape == (3, 2) and not bool(jnp.any(many.detached))
+
+
+SPRINGS = [jv.support(at=(x, -0.2), stiffness=(4e5, 7e5), damping=(2e3, 3e3)) for x in (-1.0, 1.1)]
+SCREEN = jv.plane_body(mass=2000.0, inertia=600.0, supports=SPRINGS)
+PLANAR = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+ROLLS = {"rolling": (jv.RollingFriction(3e-5),), "sliding": (jv.RollingFriction(3e-5), jv.FreeSpin(), jv.Sliding(0.2))}
+
+
+def eight(kind):
+    """Eight motors of both directions on a body in a plane, or eight pairs of balls in a torus under ideal drives."""
+    if kind == "motors":
+        drives = [jv.DCMotor(100.0 + k, stall_torque=60.0 + k, inertia=0.2) for k in range(8)]
+        parts = [jv.Exciter(drive=d, unbalance=0.3, at=(0.2 * k, 0.1), direction=(1, -1)[k % 2]) for k, d in enumerate(drives)]
+        return jv.Scene(SCREEN, exciters=parts, effects=jv.Gravity())
+    balls = [jv.torus_balls(count=2, mass=0.1 + 0.01 * k, radius=0.2, tube=0.015, ball_radius=0.0145) for k in range(8)]
+    parts = [jv.Exciter(each, jv.ConstantSpeed(60.0 + k), effects=ROLLS[kind]) for k, each in enumerate(balls)]
+    return jv.Scene(PLANAR, exciters=parts, effects=jv.Gravity(along="axis"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["motors", *ROLLS])
+def test_reverse_derivatives_of_eight_exciters_equal_differences(kind):
+    scene = eight(kind)
+    where = (lambda s: s.machine.mass) if kind == "motors" else (lambda s: s.machine.damping)
+
+    def outcome(factor):
+        changed = eqx.tree_at(where, scene, factor * where(scene))
+        run = jv.simulate(changed, 0.05, stepsize_controller=jv.EqualSteps(100), save="window")
+        return jnp.sum(run.window.state.velocity**2)
+
+    value, slope = jax.jit(jax.value_and_grad(outcome))(1.0)
+    step, program = 1e-4, jax.jit(outcome)
+    around = [float(program(1.0 + k * step)) for k in (-2, -1, 1, 2)]
+    difference = np.dot([1.0, -8.0, 8.0, -1.0], around) / (12.0 * step)
+    assert abs(slope) > 1e-6 * value
+    np.testing.assert_allclose(slope, difference, rtol=1e-7)
 
 
 def test_share_that_synchronises_jumps_at_the_closed_form():
