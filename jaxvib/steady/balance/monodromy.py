@@ -67,7 +67,7 @@ def monodromy(scene: Scene, angles: Array, steps: int | Array) -> Array:
     field = vector_field(scene)
     speed = scene.drive.speed
     radius = jnp.mean(turning_loads(scene).radius)
-    nd, n = field.stiffness.shape[0], angles.shape[0]
+    nd, n = field.stiffness_per_mass.shape[0], angles.shape[0]
     sizes = jnp.concatenate([jnp.full((nd,), 1.0) * radius, jnp.ones(n)])
 
     def acceleration(turn: Array, x: Array) -> Array:
