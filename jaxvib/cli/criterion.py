@@ -122,6 +122,7 @@ def balance(
         "rotor_speed": loaded.drive.speed,
         "status": states.message,
         "share": states.share,
+        "capacity": states.capacity,
         "neutral_directions": states.names,
         "arrangements": [
             {"angles": angles, **fields_of(end, "stable", "is_decided", "growth", "error")}
@@ -142,6 +143,8 @@ def _balance_text(states: jv.BalancedStates, stabilities: list[BalancedStability
     names = [status_name(stability.status) for stability in stabilities]
     answer = next((name for name in ("stable", "undecided", "unstable") if name in names), "impossible")
     lines = [f"balanced motion at {speed_text(states.scene.drive.speed)}: {answer}", textwrap.fill(states.message, 80)]
+    if not len(states.angles):
+        lines += states.summary().splitlines()[1:]
     for k, share in enumerate(states.share):
         plane = f" in plane {k + 1}" if len(states.share) > 1 else ""
         lines.append(f"imbalance{plane}: {100.0 * share:.4g} % of the unbalance of all loads{' there' if plane else ''}")

@@ -28,6 +28,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import failure
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.balance.arrangements import arrangements
 from jaxvib.steady.balance.monodromy import (
     BATCH,
     at_constant_speed,
@@ -48,6 +49,10 @@ class BalanceStatus(eqx.Enumeration):
     outweighed = (
         "one load's m R, or the rotor's imbalance in the plane of the loads, is larger than all others together and cannot be "
         "cancelled"
+    )
+    no_room = (
+        "the loads overlap in every arrangement in which they would cancel the rotor's imbalance: more, heavier or smaller "
+        "loads are needed"
     )
 
 
@@ -119,6 +124,14 @@ class BalancedStates(Result):
         sides = _sides(turning_loads(self.scene))
         return np.array([abs(plane.imbalance) / np.sum(sides[plane.loads]) for plane in _planes(self.scene)])
 
+    @property
+    def capacity(self) -> np.ndarray:
+        """Largest imbalance of the rotor that the loads in each plane cancel, (planes,) kg m: that of loads at one angle, or of
+        balls and rollers with a `ball_radius` that touch each other. It holds for loads none of which outweighs the others."""
+        sides, touching = _sides(turning_loads(self.scene)), _touching_angle(self.scene)
+        chains = [sides[plane.loads] * np.exp(1j * touching * np.arange(plane.loads.size)) for plane in _planes(self.scene)]
+        return np.array([abs(np.sum(chain)) for chain in chains])
+
     def _angles_of(self, arrangement: int) -> np.ndarray:
         """Return the angles of an arrangement. **Raises** `ComputationError` if there is no arrangement."""
         if not len(self.angles):
@@ -130,6 +143,14 @@ class BalancedStates(Result):
     def summary(self) -> str:
         """Return the arrangements and their neutral directions as text."""
         rows = ["  " + ", ".join(f"{np.degrees(a):.4g}" for a in row) + " deg" for row in self.angles]
+        if not rows:
+            pairs = [(abs(plane.imbalance), most) for plane, most in zip(_planes(self.scene), self.capacity, strict=True)]
+            amounts = [
+                f"  imbalance {1e3 * imbalance:.4g} g m; the loads cancel at most {1e3 * most:.4g} g m"
+                for imbalance, most in pairs
+                if imbalance > 0.0
+            ]
+            return "\n".join([self.message, *amounts])
         directions = f"neutral directions: {', '.join(self.names) or 'none'}"
         return "\n".join([self.message, *rows, directions])
 
@@ -152,6 +173,8 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
     U is the `StaticImbalance` and W the `MomentImbalance` of the rotor, s_j the distance of a load along the axis from the
     rotor's centre of mass. For loads in one plane the first equation is sufficient.
+
+    Balls and rollers with a `ball_radius` must have room beside each other, also without the effect `LoadContact`.
 
     - Two loads cancel if they are equal and opposite each other
     - Three loads cancel in one triangle and its mirror image
@@ -196,7 +219,8 @@ def balanced_states(scene: Scene) -> BalancedStates:
     scene = validate_scene(scene)
     sides, planes = _sides(turning_loads(scene)), _planes(scene)
     ordered = has_term(scene.all_effects, LoadInteraction)
-    found = [_arrangements(sides[plane.loads], plane.imbalance, ordered=ordered) for plane in planes]
+    touching = _touching_angle(scene)
+    found = [arrangements(sides[plane.loads], plane.imbalance, touching, ordered=ordered) for plane in planes]
     n, failed = sides.size, [each.status for each in found if not len(each.angles)]
     if failed:
         return BalancedStates(_status(failed), np.zeros((0, n)), 0, [], (), scene)
@@ -218,44 +242,14 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
 def _status(names: list[str]) -> BalanceStatus:
     """Return the status of loads in several planes: of the statuses of the planes, the first one in `order` below."""
-    order = ("alone", "outweighed", "family", "unique")
+    order = ("alone", "outweighed", "no_room", "family", "unique")
     return getattr(BalanceStatus, min(names, key=order.index))
 
 
-class _Arrangements(NamedTuple):
-    """Arrangements of the loads of one plane: the name of their `BalanceStatus`, and fields as in `BalancedStates`."""
-
-    status: str
-    angles: np.ndarray
-    dimension: int
-    neutral: list[np.ndarray]
-    names: tuple[str, ...]
-
-
-def _arrangements(loads: np.ndarray, imbalance: complex, *, ordered: bool) -> _Arrangements:
-    """Return the arrangements of loads (N,) kg m that cancel each other and an imbalance, kg m, in their plane; if the loads
-    cannot pass each other (`ordered`), only those in which their angles ascend within a turn."""
-    n, free = loads.size, imbalance == 0.0
-    sides = loads if free else np.append(loads, abs(imbalance))
-    largest = sides.max()
-    rest = sides.sum() - largest
-    rounding = 8.0 * n * np.finfo(sides.dtype).eps * largest
-    if largest > rest + rounding:
-        return _Arrangements("alone" if sides.size == 1 else "outweighed", np.zeros((0, n)), 0, [], ())
-    if largest > rest - rounding:
-        # All loads are on one line, the largest opposite all others.
-        directions = np.where(np.arange(sides.size) == np.argmax(sides), 0.0, np.pi)[None, :]
-    else:
-        directions = _inscribed_polygon(sides) * np.array([[1.0], [-1.0]])
-    fixed, at = (0, 0.0) if free else (n, np.angle(imbalance))
-    angles = np.mod(directions - directions[:, fixed, None] + at, 2.0 * np.pi)[:, :n]
-    if ordered:
-        angles = angles[:, :1] + np.cumsum(np.mod(np.diff(angles, axis=1, prepend=angles[:, :1]), 2.0 * np.pi), axis=1)
-        angles = angles[angles[:, -1] - angles[:, 0] < 2.0 * np.pi]
-    neutral = [_neutral(loads, row, turns=free) for row in angles]
-    turn = ("turn of all loads",) if free else ()
-    names = (*turn, *(f"shape {k + 1}" for k in range(neutral[0].shape[1] - len(turn))))
-    return _Arrangements("unique" if sides.size <= 3 else "family", angles, max(n - 2, 1 if free else 0), neutral, names)
+def _touching_angle(scene: Scene) -> float:
+    """Return the angle between two loads that touch each other, rad; 0 for loads without a size."""
+    loads = turning_loads(scene)
+    return 0.0 if loads.ball_radius is None else float(np.max(2.0 * np.arcsin(loads.ball_radius / loads.radius)))
 
 
 def _sides(loads: CircularLoads) -> np.ndarray:
@@ -307,53 +301,6 @@ def _planes(scene: Scene) -> list[_Plane]:
         is_zero = abs(imbalance) <= _rounding() * (abs(static) + abs(moment) / abs(here - other))
         planes.append(_Plane(np.flatnonzero(distances == here), 0j if is_zero else imbalance))
     return planes
-
-
-def _inscribed_polygon(sides: np.ndarray) -> np.ndarray:
-    """Return directions of the sides of the polygon inscribed in a circle, in the order of the loads, the first at 0."""
-    largest = int(np.argmax(sides))
-    low, high = 0.0, 1.0
-
-    def centre_angles(x: float) -> np.ndarray:
-        return 2.0 * np.arcsin(np.minimum(sides / sides[largest] * x, 1.0))
-
-    # x = largest side / diameter. The centre is inside the polygon if the angles of the sides at x = 1 add up to a full turn or
-    # more. Otherwise the centre is beyond the largest side, whose angle is then the sum of the others, in the opposite
-    # direction.
-    inside = centre_angles(1.0).sum() >= 2.0 * np.pi
-    others = np.arange(sides.size) != largest
-
-    def excess(x: float) -> float:
-        turns = centre_angles(x)
-        return turns.sum() - 2.0 * np.pi if inside else turns[largest] - turns[others].sum()
-
-    if not inside:
-        low = 1e-9  # both sides of the equation are 0 at 0
-    for _ in range(200):
-        middle = (low + high) / 2.0
-        if excess(middle) > 0.0:
-            high = middle
-        else:
-            low = middle
-    turns = centre_angles(high)
-    if not inside:
-        turns[largest] = 2.0 * np.pi - turns[largest]
-    direction = np.cumsum(turns) - turns / 2.0
-    return direction - direction[0]
-
-
-def _neutral(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np.ndarray:
-    """Return orthonormal changes of the angles (N, d) that keep the sum to first order; the common rotation is the first one,
-    if it is free."""
-    n = sides.size
-    change = np.stack([-sides * np.sin(angles), sides * np.cos(angles)]) / sides.max()
-    _, values, right = np.linalg.svd(change)
-    others = right[int(np.sum(values > 1e-6)) :].T
-    if not turns:
-        return others
-    common = np.full((n, 1), 1.0 / np.sqrt(n))
-    basis, size, _ = np.linalg.svd(others - common @ (common.T @ others), full_matrices=False)
-    return np.concatenate([common, basis[:, size > 0.5]], axis=1)
 
 
 def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int | None = None) -> BalancedStability:

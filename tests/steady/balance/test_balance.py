@@ -83,6 +83,22 @@ def test_arrangements_cancel_a_rotors_imbalance(count, dimension, directions):
     assert jv.balanced_states(too_large).status == BalanceStatus.outweighed
 
 
+@pytest.mark.parametrize(("share", "status"), [(0.999, "family"), (1.001, "no_room")])
+def test_balls_need_room_beside_each_other(share, status):
+    """Twelve balls of 25 mm whose centres are on a circle of 187.5 mm: touching ones cancel m R sin 12a / sin a."""
+    half = np.arcsin(12.5 / 187.5)
+    most = 0.0642 * 0.1875 * np.sin(12 * half) / np.sin(half)
+    drum = jv.balls(count=12, mass=0.0642, radius=0.1875, ball_radius=0.0125, drag=0.1)
+    machine = jv.planar_rotor(mass=28.0, stiffness=9500.0, damping=40.0)
+    states = jv.balanced_states(jv.Scene(machine, drum, jv.ConstantSpeed(115.0), (jv.StaticImbalance(share * most),)))
+    assert states.status_name == status and states.capacity == pytest.approx([most], rel=1e-12)
+    if status == "no_room":
+        assert f"imbalance {1e3 * share * most:.4g} g m; the loads cancel at most {1e3 * most:.4g} g m" in states.summary()
+    else:
+        gaps = np.diff(np.sort(states.angles[0]))
+        assert np.min(gaps) >= 2.0 * half
+
+
 @pytest.mark.parametrize(
     ("mass", "status", "sentence"),
     [([0.3], "alone", "single load"), ([0.3, 0.2], "outweighed", "larger"), ([0.1, 0.1, 0.1, 0.4], "outweighed", "larger")],

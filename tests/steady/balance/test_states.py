@@ -6,7 +6,8 @@ from scenes import machines
 
 import jaxvib as jv
 from jaxvib.steady.balance import states
-from jaxvib.steady.balance.states import _growth_rate, _inscribed_polygon, _neutral, stability_changes
+from jaxvib.steady.balance.arrangements import inscribed_polygon, neutral_directions
+from jaxvib.steady.balance.states import _growth_rate, stability_changes
 
 
 @pytest.mark.parametrize("sides", [[1.0, 1.0, 1.0], [3.0, 4.0, 5.0], [1.0, 1.2, 2.1], [1.0, 2.0, 3.0, 5.5], [0.2, 7.0, 6.9]])
@@ -14,7 +15,7 @@ from jaxvib.steady.balance.states import _growth_rate, _inscribed_polygon, _neut
 def test_sides_in_these_directions_close_a_polygon_in_a_circle(sides, size):
     """Corners are as far from one centre: that of the triangle of the first three."""
     sides = size * np.asarray(sides)
-    steps = sides * np.exp(1j * _inscribed_polygon(sides))
+    steps = sides * np.exp(1j * inscribed_polygon(sides))
     corners = np.cumsum(steps)
     assert abs(corners[-1]) < 1e-12 * size and steps[0] == sides[0]
     a, b = corners[0], corners[1]  # the third of them is the origin
@@ -38,9 +39,9 @@ def test_arrangements_do_not_depend_on_the_size_of_the_loads(size):
 
 def test_neutral_directions_keep_the_sum():
     sides = np.array([1.0, 1.0, 1.0, 1.0, 2.0])
-    angles = _inscribed_polygon(sides)
+    angles = inscribed_polygon(sides)
     for turns in (True, False):
-        found = _neutral(sides, angles, turns=turns)
+        found = neutral_directions(sides, angles, turns=turns)
         assert found.shape == (5, 3)  # of five angles two conditions leave three, a common turn among them
         change = np.stack([-sides * np.sin(angles), sides * np.cos(angles)]) @ found
         np.testing.assert_allclose(change, 0.0, atol=1e-11)
