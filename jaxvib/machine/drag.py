@@ -54,6 +54,9 @@ def drag_of(
     depend on the speed. In all other cases the drag holds for the given speeds: compute it again for the load speed of a jam.
     Rolling and bearing friction can also be simulated as they are, by `RollingFriction` and `DryFriction`.
 
+    The balls of a balancer need two values: whether they jam at a critical speed follows from the drag at `load_speed` =
+    critical speed and `rotor_speed` = working speed; the balanced motion and its stability from that at nearly equal speeds.
+
     **Arguments** (SI, or strings with a unit)
 
     - `cause`: "oil" for a ball in an oil bath, "rolling" for a roller or a ball on a dry track, "bearing" for a pendulum
@@ -113,7 +116,10 @@ def drag_of(
             value[name] = read(each, needed[name], name)
     speeds = {"load_speed": load_speed, "rotor_speed": rotor_speed}
     arm, (slow, fast) = read(radius, "m", "radius"), (read(speed, "rad/s", name) for name, speed in speeds.items())
-    problem = "is {:.6g} rad/s; it must be less than the rotor_speed of {:.6g} rad/s"
+    problem = (
+        "is {:.6g} rad/s; it must be less than the rotor_speed of {:.6g} rad/s (a ball that turns with the rotor: give a speed "
+        "slightly below it)"
+    )
     require_if_known(lambda slow, fast: slow < fast, slow, fast, field="load_speed", problem=problem)
     relative_speed, acceleration = arm * (fast - slow), arm * slow**2
     if cause == "oil":

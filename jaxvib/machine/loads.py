@@ -373,7 +373,8 @@ def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radi
 
     - `count` N: number of balls, at least 1; typical: 1 to 4
     - `mass` m of a ball, kg, positive, one number for all or N of them; typical: 0.05 to 1
-    - `radius` R of the circle of the balls' centres, m, positive, one number for all or N of them; typical: 0.05 to 0.3
+    - `radius` R of the circle of the balls' centres (radius of an outer track minus `ball_radius`), m, positive, one number for
+      all or N of them; typical: 0.05 to 0.3
     - `drag` b_W: viscous resistance of a ball against the rotor, N s/m, one number for all or N of them, 0 is allowed; typical:
       0.5 to 5 for balls of 0.1 to 1 kg in oil
     - `ball_radius` r of a ball, m, one number; typical: 0.01 to 0.03. Without it balls can all be at one point
