@@ -318,7 +318,7 @@ def test_exchanges_need_equal_numbers_of_masses():
         scene = jv.Scene(body_without_height(), exciters=exciters)
         scene = eqx.tree_at(lambda s: [get(s.exciters[1]) for get in GETTERS.values()], scene, [
             jnp.asarray(changes.get(name, float(get(exciters[1])))) for name, get in GETTERS.items()])  # fmt: skip
-        return sorted(tuple(map(int, e.order)) for e in search.exchanges_in(assemble_torque_balance(scene)))
+        return sorted(tuple(map(int, e.permutation)) for e in search.exchanges_in(assemble_torque_balance(scene)))
 
     assert orders() == [(0, 1), (1, 0)]
     for change in ({"unbalance": 0.41}, {"inertia": 0.051}, {"torque": 61.0}, {"speed": 100.1}):
@@ -343,7 +343,7 @@ def test_regimes_that_differ_by_an_exchange_are_one():
     cycle = symmetry.Exchange(np.array([1, 2, 0]), np.array([0.3, -0.2, 0.5]))
     base = np.array([0.0, 1.0, 2.5])
     turned = np.zeros(3)
-    turned[cycle.order] = base + cycle.shift
+    turned[cycle.permutation] = base + cycle.shift
     phases = np.stack([base, base + 0.7, turned - 0.4, np.array([0.0, 1.0, 2.4]), base, -base])
     speed = np.array([90.0, 90.0, 90.0 * (1.0 + 1e-9), 90.0, 80.0, 90.0 * (1.0 - 1e-9)])
     tolerance = 1e-6, 1e-4
