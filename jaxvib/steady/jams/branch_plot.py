@@ -89,9 +89,8 @@ def plot_branch(
         resonances = np.asarray(estimated_frequencies(branch.scene))
     if modes is None:
         omega, solved = np.asarray(branch.omega), np.isfinite(rotor_speed)
-        _, found = sampled_modes(omega[solved], rotor_speed[solved], resonances)
-        ends = omega[solved][1:-1]  # a point that could not be solved is given the number of its interval
-        modes = found[np.searchsorted(ends, omega)]
+        _, ends, numbers = sampled_modes(omega[solved], rotor_speed[solved], resonances)
+        modes = numbers[np.searchsorted(np.append(omega[solved], np.inf)[ends], omega)]
     return branch_diagram(
         np.where(rotor_speed <= top, rotor_speed, np.nan),
         np.asarray(branch.omega),

@@ -261,9 +261,11 @@ def piece_modes(cuts: Array, exists: Array, resonances: Array) -> Array:
     return jnp.append(jnp.stack([rising, falling], axis=1).ravel(), last)
 
 
-def sampled_modes(omega: np.ndarray, speeds: np.ndarray, resonances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of the folds of a branch n(Omega) with the samples `omega` and `speeds` (P,), and the mode number of
-    each of its P - 1 intervals.
+def sampled_modes(omega: np.ndarray, speeds: np.ndarray, resonances: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pieces of a branch n(Omega) with the samples `omega` and `speeds` (P,).
+
+    **Returns** the indices of all its folds; those of the folds between pieces, ascending, P for folds that do not exist; and
+    the mode number of each piece.
     """
     nd, rising = resonances.shape[0], np.diff(speeds) > 0.0
     folds = 1 + np.flatnonzero(rising[1:] != rising[:-1])[: 4 * nd]
@@ -274,8 +276,7 @@ def sampled_modes(omega: np.ndarray, speeds: np.ndarray, resonances: np.ndarray)
     exists = main < folds.size
     cuts = np.where(exists, omega[padded[main]], np.inf)
     modes = np.asarray(piece_modes(jnp.asarray(cuts), jnp.asarray(exists), jnp.asarray(resonances)))
-    ends = np.where(exists, padded[main], omega.size)
-    return folds, modes[np.searchsorted(ends, np.arange(omega.size - 1), side="right")]
+    return folds, np.where(exists, padded[main], omega.size), modes
 
 
 def without_ripples(speeds: Array, count: Array, count_left: int) -> Array:

@@ -42,7 +42,7 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
     known = np.isfinite(speed)
     omega, speed = _interpolated(omega[known], speed[known], slope[known])
-    turn, modes = sampled_modes(omega, speed, resonances)
+    turn, ends, modes = sampled_modes(omega, speed, resonances)
     crossed = (speed[1:] - target) * (speed[:-1] - target) <= 0.0
     near = turn[np.abs(speed[turn] - target) < _NEAR_FOLD_DISTANCE * target]
     close = []
@@ -56,11 +56,11 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     found: dict[int, float] = {}
     for k in np.flatnonzero(crossed):
         part = (target - speed[k]) / (speed[k + 1] - speed[k])
-        found.setdefault(int(modes[k]), float(omega[k] + part * (omega[k + 1] - omega[k])))
+        found.setdefault(int(modes[np.searchsorted(ends, k)]), float(omega[k] + part * (omega[k + 1] - omega[k])))
     # If a fold lies between two points, the two modes that meet at the fold are near these points.
     for k in close:
-        for mode, side in ((modes[k - 1], k - 1), (modes[k], k + 1)):
-            found.setdefault(int(mode), float(omega[side]))
+        for side in (k - 1, k + 1):
+            found.setdefault(int(modes[np.searchsorted(ends, side)]), float(omega[side]))
     return found
 
 
