@@ -172,7 +172,7 @@ jv.prepare_cpu(3)
 jv.use_cache({str(tmp_path)!r})
 import jax, jax.numpy as jnp
 from jaxvib import code_changes
-from jaxvib.runtime import parallel, programs
+from jaxvib.runtime import cache, parallel, programs
 assert parallel.shared_devices() == [None]  # processors are one, however they are divided
 parallel.shared_devices = jax.local_devices
 code_changes._code.differences = list  # as `unwatched`
@@ -184,7 +184,7 @@ function = programs.cached(doubled)
 doubled.__module__ = "jaxvib.doubled"
 for k, found in parallel.in_parallel(lambda k: function(jnp.full(2, float(k))), range(7)):
     assert found.devices() == {{jax.devices()[k % 3]}} and found.tolist() == [2.0 * k] * 2, (k, found.devices())
-assert None not in function.stored.ready.values() and len(list(programs.program_folder().glob("*.program"))) == 1
+assert None not in function.stored.ready.values() and len(list(cache.program_folder().glob("*.program"))) == 1
 """
     subprocess.run([sys.executable, "-c", code], check=True)
 
