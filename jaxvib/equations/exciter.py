@@ -34,7 +34,7 @@ from jaxvib.equations.state import ExciterState, Spin
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import scaled
 from jaxvib.machine.drives.drive import Drive
-from jaxvib.machine.effects.base import Effect, has_term, terms_of, total_gravity
+from jaxvib.machine.effects.base import Effect, has_term, static_imbalances, terms_of, total_gravity
 from jaxvib.machine.effects.terms import (
     ContactFriction,
     DrillingSpinRelease,
@@ -279,11 +279,11 @@ class RotorDynamics(eqx.Module):
     def weight_torque(self, t: Array, state: ExciterState) -> Array | None:
         """Return g dh/dtheta, the torque of gravity against the rotor's rotation.
 
-        h = S sin(theta) + sum M e sin(theta + angle) is the height of the unbalance and of the imbalances of the effects, kg m.
-        None for a rotor without unbalance and imbalances, or without gravity in the rotor's plane.
+        h = S sin(theta) + sum M e sin(theta + angle) is the upward component of the first moment of the unbalance and of the
+        imbalances of the effects, kg m. None for a rotor without unbalance and imbalances, or without gravity in the rotor's
+        plane.
         """
-        g = total_gravity(self.effects)
-        imbalances = [term for term in terms_of(self.effects, RotorImbalance) if not term.about_tilts]
+        g, imbalances = total_gravity(self.effects), static_imbalances(self.effects)
         if 1 not in g or (self.unbalance is None and not imbalances):
             return None
         angle = self.drive.rotor_angle(t, state.rotor)

@@ -25,7 +25,7 @@ from jaxvib.equations.sliding import contact_force, dot, kinematics
 from jaxvib.equations.state import ExciterState, State
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Mount
-from jaxvib.machine.effects.base import Effect, terms_of, total_gravity
+from jaxvib.machine.effects.base import Effect, static_imbalances, terms_of, total_gravity
 from jaxvib.machine.effects.terms import (
     ContactFriction,
     LoadInteraction,
@@ -159,7 +159,7 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
         weight = total_gravity(effects).get(1)
         if weight is not None:
             parts += [] if exciter.unbalance is None else [exciter.unbalance * weight * jnp.sin(turn)]
-            parts += [weight * term.at(turn).static[1] for term in terms_of(effects, RotorImbalance) if not term.about_tilts]
+            parts += [weight * term.at(turn).static[1] for term in static_imbalances(effects)]
         motor = drive.torque_and_inertia(t, rate, (part.rotor or ())[2:])
         if motor is not None:
             parts.append(0.5 * motor[1] * rate**2)

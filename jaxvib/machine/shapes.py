@@ -79,7 +79,8 @@ def require_machine(machine: Machine, place: Place) -> None:
         _require_shape("machine.mount", "gyroscopic: ", mount.gyroscopic, square)
     if mount.turn is not None:
         _require_shape("machine.mount", "turn: ", mount.turn, (size,))
-    when_known(functools.partial(require_definite, name="machine.carrier().mass", positive=True), machine.carrier().mass)
+    name = "machine.carrier().mass"
+    when_known(lambda _: require_definite(np.asarray(machine.carrier().mass), name, positive=True), machine)
 
 
 @_once_for_each_structure

@@ -18,8 +18,7 @@ from jaxvib.boundary import call_user
 from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.effects.base import terms_of, total_gravity
-from jaxvib.machine.effects.terms import RotorImbalance
+from jaxvib.machine.effects.base import static_imbalances, total_gravity
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import Exciter, Scene, read_unbalance, require_comparable
 from jaxvib.runtime.compat import evaluating, value_of
@@ -204,7 +203,7 @@ def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
 
 def first_moment(exciter: Exciter) -> Array | None:
     """Return |S + sum M e exp(i angle)| of the unbalance and the static imbalances, kg m; None without them."""
-    terms = [term for term in terms_of(exciter.effects, RotorImbalance) if not term.about_tilts]
+    terms = static_imbalances(exciter.effects)
     if not terms:
         return exciter.unbalance
     own = jnp.zeros_like(exciter.drive.speed) if exciter.unbalance is None else exciter.unbalance

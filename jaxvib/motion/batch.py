@@ -179,7 +179,7 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
             return moved, moved
 
         last, later = jax.lax.scan(single_step, packed, jnp.arange(number, dtype=dtype))
-        states = motion.unpack(prepend(packed, later))
+        states = motion.unpack(_prepended(packed, later))
         return last, locate_peaks(model, field, begin + length / number * jnp.arange(number + 1, dtype=dtype), states)
 
     def part_with_peaks(
@@ -195,11 +195,11 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     packed, begins, lengths = divide_run(motion, first, *sizes, PARTS_OF_RUN, implicit=plan.implicit)
     packed, (parts, part_peaks) = jax.lax.scan(part_with_peaks if plan.blocks else part, packed, (begins, lengths))
     _, later = jax.lax.scan(sample, packed, jnp.arange(plan.samples - 1, dtype=dtype))
-    packed_history = prepend(first, parts)
+    packed_history = _prepended(first, parts)
     azimuth, _ = turning_angles(
         scene, lambda: length * jnp.arange(PARTS_OF_RUN + 1, dtype=dtype), motion.unpack(packed_history)
     )
-    states = motion.unpack(prepend(packed, later))
+    states = motion.unpack(_prepended(packed, later))
     times = begin + spacing * jnp.arange(plan.samples, dtype=dtype)
     window = trajectory(model, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length
@@ -213,6 +213,6 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     return BatchRun(scene, window, measured, kind, speed, jnp.asarray(length, dtype), is_finite(states), peaks)
 
 
-def prepend(first: IntegratorState, later: IntegratorState) -> IntegratorState:
+def _prepended(first: IntegratorState, later: IntegratorState) -> IntegratorState:
     """Return a state of the integrator and later ones as one history along a leading axis."""
     return jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, later)

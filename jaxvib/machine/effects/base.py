@@ -48,6 +48,11 @@ def has_term(effects: Iterable["Effect"], *kinds: type[Term]) -> bool:
     return bool(terms_of(effects, *kinds))
 
 
+def static_imbalances(effects: Iterable["Effect"]) -> list[RotorImbalance]:
+    """Return the imbalances that the effects add, kg m, without moment imbalances."""
+    return [term for term in terms_of(effects, RotorImbalance) if not term.about_tilts]
+
+
 def total_gravity(effects: Iterable["Effect"]) -> dict[int, Array]:
     """Return the acceleration of gravity of a scene with these `effects`, m/s^2, by axis. Gravity points in the negative
     direction of the axis."""

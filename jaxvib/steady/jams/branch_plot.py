@@ -51,6 +51,17 @@ MARKS = {
 """Meanings of special points, for a legend."""
 
 
+def modes_of(omega: np.ndarray, rotor_speed: np.ndarray, resonances: np.ndarray) -> np.ndarray:
+    """Return the number of the jam mode of each point of a branch, from the folds between its points.
+
+    **Arguments**: load speed `omega`, ascending, and `rotor_speed` of the points, rad/s; the latter is NaN where no orbit
+    converged. `resonances`, rad/s.
+    """
+    solved = np.isfinite(rotor_speed)
+    _, ends, numbers = sampled_modes(omega[solved], rotor_speed[solved], resonances)
+    return numbers[np.searchsorted(np.append(omega[solved], np.inf)[ends], omega, side="right")]
+
+
 def plot_branch(
     branch: _Branch,
     marks: Sequence[tuple[str, float, float]],
@@ -88,9 +99,7 @@ def plot_branch(
     if resonances is None:
         resonances = np.asarray(estimated_frequencies(branch.scene))
     if modes is None:
-        omega, solved = np.asarray(branch.omega), np.isfinite(rotor_speed)
-        _, ends, numbers = sampled_modes(omega[solved], rotor_speed[solved], resonances)
-        modes = numbers[np.searchsorted(np.append(omega[solved], np.inf)[ends], omega)]
+        modes = modes_of(np.asarray(branch.omega), rotor_speed, resonances)
     return branch_diagram(
         np.where(rotor_speed <= top, rotor_speed, np.nan),
         np.asarray(branch.omega),

@@ -11,6 +11,7 @@ from scenes import published
 import jaxvib as jv
 from jaxvib.equations.linear import linear_model
 from jaxvib.steady.jams import folds
+from jaxvib.steady.jams.branch_plot import modes_of
 from jaxvib.steady.jams.folds import jam_rotor_speed, piece_modes, sampled_modes, without_ripples
 
 rotor_speeds = eqx.filter_jit(eqx.filter_vmap(jam_rotor_speed, in_axes=(None, 0)))
@@ -179,6 +180,10 @@ def test_samples_of_a_branch_have_the_numbers_of_its_pieces(begin):
     assert set(modes) == ({1, 2, 3, 4, 5} if begin == 0 else {2, 3, 4, 5})
     same = modes[1:] == modes[:-1]  # other intervals contain a fold
     np.testing.assert_array_equal(found[same], modes[:-1][same])
+
+    failed = np.where(np.arange(omega.size) % 10 == 3, np.nan, speeds)  # points of which no orbit converged
+    away = np.concatenate([[True], same]) & np.concatenate([same, [True]])
+    np.testing.assert_array_equal(modes_of(omega, failed, np.asarray(branch.resonances))[away], modes[away])
 
 
 def test_the_ripples_that_span_least_are_left_out():
