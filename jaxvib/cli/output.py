@@ -38,6 +38,9 @@ def csv_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return click.option("--csv", type=path, help="Write the curves into this CSV file.")(comma(command))
 
 
+SECONDS_BETWEEN_LINES = 10.0
+"""Time between lines of progress, s, if the output is not a terminal."""
+
 _COMMA = "jaxvib.decimal_comma"
 """Name of the option in the context of click."""
 
@@ -50,6 +53,18 @@ def fields_of(result: object, *names: str) -> dict[str, object]:
 def note(text: str) -> None:
     """Print a line on stderr, in place of the line of the elapsed time on a terminal."""
     click.echo(("\r\x1b[K" if sys.stderr.isatty() else "") + text, err=True)
+
+
+class LinesAtIntervals:
+    """Progress as lines on stderr, for output that is not a terminal: a call prints its text if the last line is old enough."""
+
+    def __init__(self) -> None:
+        self.last = time.monotonic()
+
+    def __call__(self, text: str) -> None:
+        if time.monotonic() - self.last > SECONDS_BETWEEN_LINES:
+            self.last = time.monotonic()
+            click.echo(text, err=True)
 
 
 def _wrapped(text: str) -> str:
@@ -116,13 +131,18 @@ class Output:
 
     @contextlib.contextmanager
     def progress(self) -> Iterator[Callable[[str, float], None]]:
-        """Show a bar on a terminal; the yielded function takes the name of a step and the finished share (0 to 1)."""
+        """Show a bar on a terminal, or lines at intervals elsewhere; the yielded function takes the name of a step and the
+        finished share (0 to 1)."""
         from rich.console import Console  # slow imports, which --help does not need
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
         self.end_waiting()
+        if not sys.stderr.isatty():
+            lines = LinesAtIntervals()
+            yield lambda what, share: lines(f"{what}: {share:.0%}")
+            return
         columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-        with Progress(*columns, console=Console(stderr=True, quiet=not sys.stderr.isatty()), transient=True) as bar:
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task("", total=1.0)
             yield lambda what, share: bar.update(task, description=what, completed=share)
 

@@ -278,7 +278,8 @@ def scene_from_tables(tables: Tables) -> Scene:
     parts = {}
     for name in ("machine",) if several else SECTIONS:
         if name not in tables:
-            raise InputError(name, f"is missing; a scene file needs the table [{name}]")
+            instead = ", or [[exciters]] with an unbalance if it has no loads" if name == "loads" else ""
+            raise InputError(name, f"is missing; a scene file needs the table [{name}]{instead}")
         parts[name] = _build_kind(tables[name], name, SECTIONS[name])
     for name in ("loads", "drive") if several else ():
         if name in tables:

@@ -7,6 +7,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
+from jaxvib.cli import output
 from jaxvib.cli.study import sweep as command
 
 STUDY = """
@@ -54,7 +55,7 @@ def test_a_study_is_run_resumed_and_shown(typed, tmp_path):
 
 
 def test_progress_is_lines_where_there_is_no_terminal(typed, monkeypatch):
-    monkeypatch.setattr(command, "_SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr(output, "SECONDS_BETWEEN_LINES", 0.0)
     _, _, err = typed("sweep", "study.toml")
     lines = err.splitlines()
     # Chunks of 4, 4 and 2 cases are computed in threads; any of them can end first.

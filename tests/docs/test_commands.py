@@ -76,10 +76,27 @@ def folder(tmp_path_factory):
     for name, text in re.findall(r"```toml\n# (\w+\.toml)\n(.*?)```", page, flags=re.S):
         (folder / name).write_text(text)
     shutil.copytree(ROOT / "examples", folder / "examples")
-    designs = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "screens.md").read_text(encoding="utf-8"), flags=re.S)
+    designs = re.findall(r"```toml\n(scene = .*?)```", (ROOT / "docs" / "screens.md").read_text(encoding="utf-8"), flags=re.S)
     for name, text in zip(("screen-design", "feeder-design"), designs, strict=True):
         (folder / f"{name}.toml").write_text(text)
     return folder
+
+
+def test_the_failed_motor_of_the_page_is_a_scene_file():
+    page = (ROOT / "docs" / "screens.md").read_text(encoding="utf-8")
+    (drive,) = re.findall(r"```toml\n(\[exciters.drive\].*?)```", page, flags=re.S)
+    screen = template("linear-screen")
+    motor = jv.scene_from_toml(screen[: screen.rindex("[exciters.drive]")] + drive).exciters[1].drive
+    assert isinstance(motor, jv.SwitchedOff) and float(motor.at) == 12.0 and float(motor.motor.speed) > 100.0
+
+
+def test_the_rotor_without_balls_of_the_page_is_a_scene_file():
+    (exciter,) = re.findall(r"```toml\n(\[\[exciters\]\].*?)```", (ROOT / "docs" / "rotor.md").read_text("utf-8"), flags=re.S)
+    balancer = template("ball-balancer")
+    scene = jv.scene_from_toml(balancer[: balancer.index("[loads]")] + exciter)
+    with_balls = jv.scene_from_toml(balancer)
+    assert float(scene.exciters[0].unbalance) == float(with_balls.all_effects[0].moment) and scene.exciters[0].loads is None
+    assert scene.exciters[0].drive == with_balls.drive
 
 
 def template(name):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import textwrap
 from pathlib import Path
 
@@ -48,7 +49,9 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
     ranges = ranges_within(loaded, None, tolerances)
     output.picture("regimes.png", result.plot)
     output.csv(csv, result, "regime")
+    frequencies = sorted(map(float, jv.natural_frequencies(loaded)))
     document = {
+        "natural_frequencies": frequencies,
         "judged": "by the growth of small disturbances of the averaged motion",
         "search": status_name(result.search),
         "regimes": [
@@ -75,17 +78,29 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
         stable = [(regime, figures) for regime, figures in zip(selected, measures, strict=True) if figures is not None]
         directions = ("anticlockwise" if exciter.direction == 1 else "clockwise" for exciter in loaded.exciters)
         notes = [
+            f"natural frequencies: {speed_text(frequencies)}",
             f"rotation: {', '.join(f'exciter {k} {direction}' for k, direction in enumerate(directions))}",
             "margin: factor by which the differences of the motors' torques can grow; inf for",
             "equal motors",
             *([] if status_name(result.search) == "done" else [jv.RegimeSearchStatus[result.search]]),
             *(textwrap.fill(note, 80) for note in start_notes(loaded)),
         ]
-        blocks = (indented(f"at {speed_text(regime.speed)}, stable:", figures) for regime, figures in stable)
+        blocks = (
+            indented(f"at {speed_text(regime.speed)}, stable, {_place_among(float(regime.speed), frequencies)}:", figures)
+            for regime, figures in stable
+        )
         within = [tolerance_table(ranges, tolerances)] if tolerances else []
         return "\n".join([drawing, *notes, *blocks, *within])
 
     output.done(document, text, "regimes", result)
+
+
+def _place_among(speed: float, frequencies: list[float]) -> str:
+    """Return the place of a speed among the ascending natural frequencies, in words."""
+    below = bisect.bisect(frequencies, speed)
+    if below in (0, len(frequencies)):
+        return f"{'below' if below == 0 else 'above'} all natural frequencies"
+    return f"between the natural frequencies {below} and {below + 1}"
 
 
 def _row(regime: jv.SynchronousRegime, scale: float) -> list[str]:

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.output import LinesAtIntervals
 from jaxvib.errors import InputError, optional_module, quoted
 
 if TYPE_CHECKING:
     from jaxvib.sweeps.sweep import Progress, Sweep
-
-_SECONDS_BETWEEN_LINES = 10.0
-"""Time between lines of progress, s, if the output is not a terminal."""
 
 
 @app.command("sweep")
@@ -94,7 +91,7 @@ class _ProgressLines:
     """Display of the progress on the last line of a terminal; if the output is not a terminal, as new lines at intervals."""
 
     def __init__(self) -> None:
-        self.last = time.monotonic()
+        self.lines = LinesAtIntervals()
         self.open = False
 
     def __call__(self, now: Progress) -> None:
@@ -103,9 +100,8 @@ class _ProgressLines:
         if sys.stderr.isatty():
             click.echo(f"\r\x1b[K{text}", nl=False, err=True)
             self.open = True
-        elif time.monotonic() - self.last > _SECONDS_BETWEEN_LINES:
-            self.last = time.monotonic()
-            click.echo(text, err=True)
+        else:
+            self.lines(text)
 
     def end(self) -> None:
         """End the line of progress."""

@@ -91,13 +91,15 @@ class MotorRunUp(Result):
     def summary(self) -> str:
         """Return the outcome as text: a line for each exciter, the peaks and the weakest motors."""
         lines = [self.message, *(f"  {note}" for note in start_notes(self.scene))]
+        if self.status_name == "not_turning":
+            lines.append("without gravity (exciters that are turning already):")
         for k, (speed, caught) in enumerate(zip(np.asarray(self.speed), np.asarray(self.caught_at).tolist(), strict=True)):
             at = f", caught by resonance {caught} at {speed_text(self.resonances[caught - 1])}" if caught else ""
             lines.append(f"  exciter {k}: {speed_text(speed)}{at}")
         structure = self.scene.machine.structure()
         named = zip(structure.coordinates, self.peak_amplitude, structure.units, strict=True)
         peaks = ", ".join(f"{name} {quantity_text(a, unit, 4)}" for name, a, unit in named)
-        of = " (largest over the initial angles of the exciters)" if _turned_motors(self.scene) else ""
+        of = " (largest of several initial angles; the figure shows one run)" if _turned_motors(self.scene) else ""
         lines += [f"  peaks on the way{of}:", f"    {peaks}; foundation force {quantity_text(self.peak_force, 'N', 4)}"]
         if np.isfinite(self.least_torque):
             lines.append(f"  all pass with torques of at least {float(self.least_torque):.3g} times those of the motors")
