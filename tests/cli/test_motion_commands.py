@@ -341,13 +341,17 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     screen = jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
     jv.save_scene(jv.Scene(screen, exciters=exciters), tmp_path / "screen.toml")
     code, out, _ = typed("regimes", "screen.toml", "--json", "--out", "o")
-    regimes = json.loads(out)["regimes"]
+    document = json.loads(out)
+    regimes = document["regimes"]
+    # Springs of 6 N/mm below the centre of mass of 300 kg and 75 kg m^2, 0.6 m from it.
+    np.testing.assert_allclose(document["natural_frequencies"], np.sqrt([20.0, 20.0, 28.8]), rtol=1e-9)
     assert code == 0 and [regime["stable"] for regime in regimes] == [True, False]
     np.testing.assert_allclose(np.abs([regime["phases"][1] for regime in regimes]), [np.pi, 0.0], atol=1e-9)
     assert (tmp_path / "o" / "regimes.png").stat().st_size > 10_000
     out = typed("regimes", "screen.toml", "--deck", "0.4, 0.1", "--slope", "-5 deg")[1]
     assert "954.887" in out and "point (0.4, 0.1) m: stroke" in out and max(map(len, out.splitlines())) <= 80
     assert "rotation: exciter 0 anticlockwise, exciter 1 clockwise" in out and "margin: factor" in out
+    assert "natural frequencies: 42.706, 42.706, 51.247 rpm" in out and "stable, above all natural frequencies:" in out
     shown = float(out.split("throw number ")[1].split(",")[0])
     scene = jv.load_scene(tmp_path / "screen.toml")
     np.testing.assert_allclose(shown, jv.working_regime(scene).ellipse((0.4, 0.1), slope="-5 deg").throw_number, rtol=5e-3)
