@@ -60,6 +60,8 @@ class MachineFit(Result):
     - `notes`: sentences with further advice for the reader
     - `scene` with the fitted numbers
     - `names` (k,), `units` (k,) and `estimates` (k,) of the numbers; the interval of an undetermined number is unbounded
+    - `scale` (k,), in `units`: change of each number that counts as the relative change 1, see `covariance` and `information`:
+      the value of a positive number, otherwise the absolute first value
     - `covariance` (k, k) of the relative errors of the numbers in the determined directions
     - `information` (k + g + 1, k + g + 1): Fisher information about relative changes of the numbers and of the gains, and about
       the angle of the first unbalance
@@ -83,6 +85,7 @@ class MachineFit(Result):
     names: tuple[str, ...]
     units: tuple[str, ...]
     estimates: tuple[Estimate, ...] = eqx.field(metadata=in_unit("", "number"))
+    scale: np.ndarray = eqx.field(metadata=in_unit("", "number"))
     covariance: np.ndarray = eqx.field(metadata=in_unit("", "number", "number_2"))
     information: np.ndarray = eqx.field(metadata=in_unit("", "unknown", "unknown_2"))
     undetermined: tuple[Direction, ...]
@@ -119,7 +122,7 @@ class MachineFit(Result):
         def values(scene: Scene) -> np.ndarray:
             return np.asarray(quantity(scene), float).reshape(1)
 
-        return propagate(self.scene, self.names, self.covariance, axes, errors, values)[0]
+        return propagate(self.scene, self.names, self.scale, self.covariance, axes, errors, values)[0]
 
     def summary(self) -> str:
         """Return the numbers with their intervals, and the sentences about them, as text."""
@@ -276,6 +279,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
     modes = propagate(
         fit_scene,
         known.names,
+        known.scale,
         known.covariance,
         known.undetermined,
         known.errors,
@@ -306,6 +310,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         names=known.names,
         units=tuple(find_number(scene, name, "unknown").unit for name in known.names),
         estimates=tuple(estimates),
+        scale=known.scale,
         covariance=known.covariance,
         information=combined_information(fitted),
         undetermined=undetermined,
@@ -370,6 +375,7 @@ def _gains(fitted: Fitted) -> tuple[Estimate, ...]:
 def propagate(
     scene: Scene,
     names: Sequence[str],
+    scale: np.ndarray,
     covariance: np.ndarray,
     axes: np.ndarray,
     errors: np.ndarray,
@@ -377,14 +383,14 @@ def propagate(
 ) -> list[Estimate]:
     """Return the values (m,) of a function of the scene with their intervals, by central differences.
 
-    **Arguments**: `names` (k,) of the uncertain numbers; the `covariance` (k, k) of their relative errors; undetermined
-    directions `axes` (k, u) and their `errors` (u,); the `function`, which returns values (m,) other than 0.
+    **Arguments**: `names` (k,) of the uncertain numbers; `scale` (k,), SI: change of each number that counts as the relative
+    change 1; the `covariance` (k, k) of their relative errors; undetermined directions `axes` (k, u) and their `errors` (u,);
+    the `function`, which returns values (m,) other than 0.
     """
     values, slopes = function(scene), []
-    for name in names:
+    for name, step in zip(names, _STEP * scale, strict=True):
         number = find_number(scene, name, "unknown")
         now = np.asarray(number.read(scene))
-        step = _STEP * np.where(now != 0.0, now, number.spec.typical or 1.0)
         high, low = (function(put_numbers(scene, (number,), now + sign * step)) for sign in (1.0, -1.0))
         slopes.append((high - low) / (2.0 * _STEP) if high.shape == low.shape == values.shape else np.full_like(values, np.nan))
     slopes = np.stack(slopes, axis=1)

@@ -44,13 +44,27 @@ def test_errors_of_a_function_of_the_numbers():
         return np.array([float(np.log(k) + 2.0 * np.log(m)), -float(k * m)])
 
     covariance = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
-    found = propagate(scene_of(), names, covariance, np.zeros((2, 0)), np.zeros(0), function)
+    found = propagate(scene_of(), names, np.array([4e4, 90.0]), covariance, np.zeros((2, 0)), np.zeros(0), function)
     value = np.log(4e4) + 2.0 * np.log(90.0)
     error = np.sqrt(4e-4 + 4.0 * 1e-4 + 4.0 * 9e-4)
     ends = value * np.exp(np.array([-Z, Z]) * error / value)
     np.testing.assert_allclose(found[0], (value, error, *ends), rtol=1e-6)
     second = 3.6e6 * np.sqrt(4e-4 + 2.0 * 1e-4 + 9e-4)
     np.testing.assert_allclose(found[1], (-3.6e6, second, -3.6e6 - Z * second, -3.6e6 + Z * second), rtol=1e-6)
+
+
+def test_errors_refer_to_the_scale_of_each_number():
+    """Entries of a matrix may have either sign; their scales are their first values, not the fitted ones."""
+    machine = jv.from_matrices(np.eye(2), 0.1 * np.eye(2), [[3.0, -1.0], [-1.0, 2.0]], places=[[0]])
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(1.0), unbalance=0.05)])
+    names, covariance = ("machine.stiffness[0]", "machine.stiffness[1]"), np.array([[4e-4, 3e-4], [3e-4, 9e-4]])
+
+    def function(scene):
+        return np.array([float(scene.machine.stiffness[0, 0] + 2.0 * scene.machine.stiffness[0, 1])])
+
+    found = propagate(scene, names, np.array([2.0, 4.0]), covariance, np.zeros((2, 0)), np.zeros(0), function)
+    slopes = np.array([1.0 * 2.0, 2.0 * 4.0])
+    assert found[0].error == pytest.approx(np.sqrt(slopes @ covariance @ slopes), rel=1e-6)
 
 
 @pytest.mark.parametrize(("error", "is_sure"), [(0.09, True), (0.11, False), (1e9, False)])
@@ -62,7 +76,8 @@ def test_function_along_an_undetermined_direction(error, is_sure):
         k, m = float(scene.machine.stiffness[0]), float(scene.machine.mass[1])
         return np.array([k / m, np.sqrt(k * m)])
 
-    found = propagate(scene_of(), names, np.diag([1e-4, 1e-4]), axis, np.array([error * np.sqrt(2.0)]), function)
+    scale, errors = np.array([4e4, 90.0]), np.array([error * np.sqrt(2.0)])
+    found = propagate(scene_of(), names, scale, np.diag([1e-4, 1e-4]), axis, errors, function)
     assert found[0].error == pytest.approx(4e4 / 90.0 * np.sqrt(2e-4), rel=1e-6)
     assert np.isfinite(found[1].error) == (error * np.sqrt(2.0) * np.sqrt(0.5) < 0.1) == is_sure
 
@@ -73,7 +88,7 @@ def test_number_of_modes_may_change():
     def function(scene):
         return np.array([1.0, 2.0]) if float(scene.machine.damping[0]) <= 60.0 else np.array([1.0])
 
-    found = propagate(scene_of(), ("machine.damping[0]",), np.eye(1), np.zeros((1, 0)), np.zeros(0), function)
+    found = propagate(scene_of(), ("machine.damping[0]",), np.full(1, 60.0), np.eye(1), np.zeros((1, 0)), np.zeros(0), function)
     assert all(np.isnan(each.error) or np.isinf(each.error) for each in found)
 
 

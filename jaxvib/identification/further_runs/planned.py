@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.boundary import validated
@@ -19,6 +21,7 @@ from jaxvib.identification.problem import MOTIONS, Problem, build_problem, with_
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive
+from jaxvib.machine.scene import Scene
 from jaxvib.numerics.noise import Noise
 from jaxvib.results.readable import Readable
 from jaxvib.units import Number, number
@@ -125,7 +128,7 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     if count > 1:
         raise InputError("fit.scene", f"has {count} exciters; plan_runs needs a scene with one exciter")
     scene = eqx.tree_at(lambda s: s.exciters[0], fit.scene, exciter.with_parts(exciter.loads, planned.drive))
-    problem = build_problem(scene, [run], vibrating(fit), {})
+    problem = problem_of_run(fit, scene, run)
     root = math.sqrt(float(problem.runs[0].step))
     problem = with_noise(problem, [[Noise(np.ones(1), float(deviations[c.name]) / root) for c in vibration_channels]])
     problem = problem._replace(precisions=own_precisions(fit, problem))
@@ -144,9 +147,17 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     return Expected(fitted, *shared_places(fit, problem, has_mark))
 
 
-def vibrating(fit: MachineFit) -> list[str]:
-    """Return the names of the numbers of a fit without numbers of the motor, which the vibrations do not determine."""
-    return [name for name in fit.names if "drive." not in name]
+def problem_of_run(fit: MachineFit, scene: Scene, run: MeasuredRun) -> Problem:
+    """Return the problem of a run with the numbers of a fit as unknowns, in the units of `fit.scale`. Numbers of the motor are
+    left out, because the vibrations do not determine them.
+
+    **Arguments**: `scene`: the fitted scene with the drive of the run.
+    """
+    problem = build_problem(scene, [run], [name for name in fit.names if "drive." not in name], {})
+    unknowns = problem.unknowns
+    scale = jnp.asarray([fit.scale[fit.names.index(number.name)] for number in unknowns.numbers])
+    linear = dataclasses.replace(unknowns, scale=scale, positive=jnp.zeros(scale.shape, bool))
+    return problem._replace(unknowns=linear)
 
 
 def own_precisions(fit: MachineFit, problem: Problem) -> np.ndarray:

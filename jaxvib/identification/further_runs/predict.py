@@ -13,10 +13,10 @@ from jaxvib.display import Drawn, Onto
 from jaxvib.identification.checks import CHANCE, Disagreement, disagreement, pseudoinverse, residual_chance
 from jaxvib.identification.directions import eliminate, elimination, polar_unbalances
 from jaxvib.identification.fit import differences_of, linear_at, minimize, run_equations
-from jaxvib.identification.further_runs.planned import own_precisions, shared_places, vibrating
+from jaxvib.identification.further_runs.planned import own_precisions, problem_of_run, shared_places
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.jammed.start import with_first_motion
-from jaxvib.identification.problem import EXACT, Known, Problem, build_problem, with_noise
+from jaxvib.identification.problem import EXACT, Known, Problem, with_noise
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.numerics.noise import Noise, noise_of
 from jaxvib.results.fields import in_unit
@@ -167,7 +167,7 @@ class _Predicted(NamedTuple):
 
 
 def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
-    problem = build_problem(fit.scene, [run], vibrating(fit), {})
+    problem = problem_of_run(fit, fit.scene, run)
     unbalances = [1.0 if exciter.unbalance is None else exciter.unbalance for exciter in fit.scene.exciters]
     sizes = np.array([float(np.asarray(each, float)) for each in unbalances])
     problem = problem._replace(unbalances=tuple(Known(size, EXACT * size) for size in sizes))

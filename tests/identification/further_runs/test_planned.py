@@ -35,7 +35,7 @@ def fit():
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
     return SimpleNamespace(
         scene=jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=0.05)]),
-        names=NAMES, gain_names=("deck", "frame"), phase=np.array([0.4]),
+        names=NAMES, scale=np.array([4e4, 0.05, 300.0]), gain_names=("deck", "frame"), phase=np.array([0.4]),
         channels=(("frame",), ("deck", "frame")), noise=(np.array([1e-3]), np.array([5e-3, 7e-3])),
         time=(0.01 * np.arange(3), 0.0025 * np.arange(3)), information=np.diag([4e4, 100.0, 900.0, 1e4, 1e4, 400.0]),
     )  # fmt: skip
@@ -71,6 +71,14 @@ def test_noise_of_another_rate_and_of_new_channels(noise, deviation):
     ]  # no gain, but the mark of the angle
     with pytest.raises(jv.InputError, match="candidates: ramp: channel 'new' is new; give its noise, noise="):
         expected_run(fit(), ramp(channels=(jv.Channel("new", "velocity", at=1),)))
+
+
+def test_information_of_a_run_is_in_the_units_of_the_fit():
+    """If the scale of the damping is halved, a relative change of 1 changes the readings half as much."""
+    other = SimpleNamespace(**vars(fit()) | {"scale": np.array([4e4, 0.05, 150.0])})
+    first, second = (expected_information(each, expected_run(each, ramp())) for each in (fit(), other))
+    factors = np.array([1.0, 1.0, 0.5, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(second, first * np.outer(factors, factors), rtol=1e-9, atol=1e-9 * np.max(first))
 
 
 def test_new_gains_keep_their_known_errors():
