@@ -24,7 +24,7 @@ CASES = {
     "coloured noise, correlation 0.9": {"color": 0.9},
     "2 % outliers, 20 times the noise": {"outliers": 0.02},
     "random gains, standard deviation 1 %": {"gain_error": 0.01},
-    "motor that dips at the resonances": {"motor": True},
+    "motor whose speed falls at the resonances": {"motor": True},
     "one pulse per turn, times rounded to 1 ms": {"pulses": 1, "resolution": 1e-3},
     "readings clipped at 60 % of the largest": {"full_scale": 0.6},
     "two jammed balls and an unbalance": {"balls": True},
