@@ -290,7 +290,12 @@ FORMS = (
         of(light_rotors),
         (2e-14, 2e-14, 0.0),
     ),
-    ClosedForm(f"4: {LINE}, above the resonances", "the middle one opposes", of(middle_opposes), (0.01, 0.01, 0.01)),
+    ClosedForm(
+        f"4: {LINE}, above the resonances",
+        "outer ones in phase, middle one in antiphase",
+        of(middle_opposes),
+        (0.01, 0.01, 0.01),
+    ),
     ClosedForm(
         f"4: {LINE}, below all resonances",
         "in phase",
@@ -305,19 +310,19 @@ FORMS = (
     ),
     ClosedForm(
         "6: two auto-balancers below the resonance of translation",
-        "in step, b R^2 (n - Omega) = 2 c S^2 Omega^5 / |D|^2",
+        "in phase, b R^2 (n - Omega) = 2 c S^2 Omega^5 / |D|^2",
         of(lambda: balancers(0.0)),
         (2e-14, 2e-14, 1e-10),
     ),
     ClosedForm(
         "6: two auto-balancers below the resonance of rotation",
-        "opposed, b R^2 (n - Omega) = c l^2 S^2 Omega^5 / |D|^2",
+        "in antiphase, b R^2 (n - Omega) = c l^2 S^2 Omega^5 / |D|^2",
         of(lambda: balancers(np.pi)),
         (2e-14, 4e-4, 4e-4),
     ),
 )
-"""Closed forms 1 to 6. The middle one of three on a line opposes to the extent that damping permits.
+"""Closed forms 1 to 6. The middle one of three on a line is in antiphase, except for the effect of the damping.
 
-The phase of the balancers in step returns at 0.05 1/s only. It therefore contains the rounding errors of its last 2000 steps,
-at angles of 1e4 rad: about 5e-11 rad, for any tolerance of the integration.
+A deviation of the balancers from the motion in phase decays at a rate of only 0.05 1/s. The phase therefore contains the
+rounding errors of the last 2000 steps, at angles of 1e4 rad: about 5e-11 rad, for any tolerance of the integration.
 """

@@ -140,7 +140,7 @@ CASES = (
     ),
     run_case(
         "one load",
-        hard="none: it stands beside `1000 loads`, which has the same total mass",
+        hard="none; the total mass is that of the case `1000 loads`",
         scene=lambda: published(eps=0.05),
         answer=_RUN,
         reference=_RUN_AGAIN,

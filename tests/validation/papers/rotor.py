@@ -105,7 +105,7 @@ def _second_in_the_middle() -> float:
 
 
 _HALF_WINDOW = 0.0123
-"""Half of the range of lengths of a pendulum with which the printed window of friction holds 169.6 rad/s, m."""
+"""Half of the range of lengths of a pendulum with which the printed range of friction holds 169.6 rad/s, m."""
 
 
 def _length() -> float:
@@ -193,7 +193,7 @@ NUMBERS = (
         7.5e-4,
         lambda: _holding(_first_jams(), _FIRST, 169.6),
         within=2.5e-4,
-        note="value and bound are the middle and the half-width of the printed window, 0.5e-3 to 1.0e-3; c2 = 0",
+        note="value and bound are the middle and the half-width of the printed range, 0.5e-3 to 1.0e-3; c2 = 0",
     ),
     _friction_number(
         "friction above which the first jam does not exist",
@@ -210,7 +210,7 @@ NUMBERS = (
         _length,
         within=_HALF_WINDOW,
         unit="m",
-        note="the bound is half of the range of lengths with a jam at 169.6 rad/s in the printed window of friction",
+        note="the bound is half of the range of lengths with a jam at 169.6 rad/s in the printed range of friction",
         misprint=Misprint("0.8 m", "0.08 m", "friction at which the printed jam exists", 0.08),
     ),
     _friction_number(
@@ -219,10 +219,10 @@ NUMBERS = (
         lambda: _holding(_second_jams(), _SECOND, 271.1),
         within=2.5e-3,
         differs=1.0224e-2,
-        reason="the printed window is 1.5e-2 to 2.0e-2; data as printed",
+        reason="the printed range is 1.5e-2 to 2.0e-2; data as printed",
     ),
     _speed_number(
-        quantity="second jam at the middle of the printed friction window",
+        quantity="second jam at the middle of the printed friction range",
         printed=271.1,
         computed=_second_in_the_middle,
         differs=276.88,
@@ -232,7 +232,7 @@ NUMBERS = (
         quantity="first jam",
         printed=169.6,
         computed=lambda: _speed(_FIRST),
-        note=f"mu = {_FIRST:g} N m s, inside the printed window; {_READING}",
+        note=f"mu = {_FIRST:g} N m s, inside the printed range; {_READING}",
     ),
     _speed_number(
         quantity="ripple of the first jam", printed=3.1, computed=lambda: _ripple(_FIRST), note=f"{_READING}; {_ECCENTRICITY}"
@@ -241,7 +241,7 @@ NUMBERS = (
         quantity="second jam",
         printed=271.1,
         computed=lambda: _speed(_SECOND),
-        note=f"mu = {_SECOND:g} N m s, chosen to give this speed, outside the printed window; {_READING}",
+        note=f"mu = {_SECOND:g} N m s, chosen to give this speed, outside the printed range; {_READING}",
     ),
     _speed_number(
         quantity="ripple of the second jam",
