@@ -164,7 +164,7 @@ class _Writer:
         return [_RULES[name].format(*values)]
 
     def _select_larger(self, x: str, y: str, than: str, real: bool) -> str:
-        """Return the C text of the larger or smaller of two numbers, which is NaN if one of them is NaN."""
+        """Return the larger or the smaller of two numbers as C text; the result is NaN if one of them is NaN."""
         test = f"{x} {than} {y} || {x} != {x}"
         return f"{self._branch(test, x, y) if real else f'({test})'} ? {x} : {y}"
 

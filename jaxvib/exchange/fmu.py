@@ -81,7 +81,8 @@ def export_fmu(
     """Write a scene as a functional mock-up unit (FMU), for model exchange and co-simulation.
 
     The file contains the equations as C source and, if a C compiler is found (`CC`, cc, gcc, clang), a binary for this
-    platform. Tools that use the file need neither Python nor jaxvib. The same scene gives a file with the same bytes.
+    platform. Tools that use the file need neither Python nor jaxvib. If the same scene is written twice, the files are
+    identical.
 
     - Parameters are all parameters of the scene with their names (`machine.stiffness[0]`), units and bounds; they may change
       during a simulation. `co_simulation.step`, s, is the longest step of co-simulation, which uses the classical Runge-Kutta
@@ -91,8 +92,8 @@ def export_fmu(
     - Inputs are `force.y1` on each coordinate (N, for angles N m) and, with a motor, `rotor.torque` (N m, anticlockwise), which
       is added to the torque of the motor
     - In a scene with several exciters, the names of their signals begin with the exciter, such as `exciters[1].rotor.torque`
-    - Event indicators belong to comparisons in nonsmooth forces (stops, contacts, dry friction) and in a drive whose
-      acceleration jumps; a solver ends a step at the time at which an indicator changes its sign
+    - Event indicators are the differences that are compared in nonsmooth forces (stops, contacts, dry friction) and in a drive
+      whose acceleration jumps; a solver ends a step at the time at which an indicator changes its sign
     - Directional derivatives of rates and outputs with respect to states, inputs, parameters and time are exact
 
     **Arguments**
@@ -102,8 +103,8 @@ def export_fmu(
     - `fmi`: version of the standard, "2.0" (the default) or "3.0"
     - `start`: "rest" (the default) or another name of `simulate` except "spin_up", or a `State`
     - `mode`: number of the jam mode for `start="jam"`; typical: 1, 3, 5
-    - `drive`: "scene" (the default), or "input" for inputs in place of the drive: `rotor.speed` and its derivative
-      `rotor.acceleration` for an ideal drive (prescribed motion), only `rotor.torque` for a motor
+    - `drive`: "scene" (the default), or "input" for inputs in place of the drive. The inputs are `rotor.speed` and its
+      derivative `rotor.acceleration` if the drive is ideal (prescribed motion), and `rotor.torque` if it is a motor
     - `binary`: True to compile a binary
 
     **Returns** `Fmu`.

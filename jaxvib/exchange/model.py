@@ -113,7 +113,7 @@ class _TorqueInput(MotorWrapper):
 
 
 class RotorInputs(NamedTuple):
-    """Inputs of one rotor, anticlockwise.
+    """Inputs of one rotor, positive anticlockwise.
 
     **Attributes**: `torque` on the rotor of a motor, N m; `speed` and `acceleration` of a rotor whose motion is an input, rad/s
     and rad/s^2. An input that the rotor does not have is None.

@@ -117,8 +117,8 @@ def export_uff(
     - `source`: a `Scene` or a `Run`
     - `path` of the file, which is overwritten
     - `quantity` of responses and histories: "displacement" (the default), "velocity" or "acceleration"
-    - `frequencies`, Hz, evenly spaced; typical: 1000 to 4000 lines up to 50 Hz; default: 2048 lines up to 1.5 times the highest
-      natural frequency
+    - `frequencies`, Hz, evenly spaced; typical: 1000 to 4000 frequencies up to 50 Hz; default: 2048 frequencies up to 1.5 times
+      the highest natural frequency
     - `rotor_speed`, rad/s, as in `state_space`; typical: 0 to 500
 
     **Returns** the path. **Raises** `InputError` for frequencies that are not evenly spaced or not positive, for accelerations

@@ -183,7 +183,7 @@ def text(head="time (s),frame (g)\n", rows=40):
         (text().replace("0.3,", "0.3,7,"), "line 5 has 3 columns; the lines above have 2"),
         (text("time (s),frame (g),base (g)\n"), "line 2 has 2 columns; the lines above have 3"),
         (text().replace("0.3,-0.10", "0.3,oops"), "line 5 has 'oops' where the frame should be; a finite number is needed"),
-        (text("clock (s),frame (g)\n"), "has no column of times; its columns are clock (s), frame (g): name one 'time (s)'"),
+        (text("clock (s),frame (g)\n"), "has no column of times; its columns are clock (s), frame (g): rename the column"),
         (text("time (kg),frame (g)\n"), "unit of time is 'kg', which is not a unit of time; write s, ms, us or min"),
         (text("time (s),frame (mm)\n"), "channel 'frame' is in 'mm' in the file, which is not a unit of acceleration; correct"),
         (text("time (s),base (g)\n"), "channel 'frame' is not in the file; its channels are 'base'"),

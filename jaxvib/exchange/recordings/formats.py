@@ -23,7 +23,7 @@ from jaxvib.units.columns import split_head, unit_factor
 
 _MAX_BYTES = 2**32
 _UNKNOWN_SIZE = 2**32 - 1
-"""Size in the header of a WAV file whose length was unknown when the header was written."""
+"""Size in the header of a WAV file if the length was unknown when the header was written."""
 
 _TIME_NAMES = ("time", "t", "times", "timestamp", "x_value", "zeit", "время")
 """Names of a channel of times, in lower case."""
@@ -101,8 +101,8 @@ def _read_text(path: Path, rate: float | None) -> Iterator[Recorded]:
             names = ", ".join(heads)
             raise InputError(
                 str(path),
-                f"has no column of times; its columns are {names}: name one 'time (s)', write a line '# rate: 2000 Hz', or "
-                "give the sampling rate, `rate`",
+                f"has no column of times; its columns are {names}: rename the column of times to 'time (s)', write a line "
+                "'# rate: 2000 Hz', or give the sampling rate, `rate`",
             )
     places = [k for k in range(table.width) if k not in clocks]
     if not places:

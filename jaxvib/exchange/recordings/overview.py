@@ -45,7 +45,7 @@ class ChannelOverview(NamedTuple):
 
 
 def overview_of(recorded: Recorded) -> ChannelOverview:
-    """Return the overview of a channel; its notes contain problems for which a fit would refuse the channel.
+    """Return the overview of a channel; its notes contain the reasons for which a fit would refuse the channel.
 
     >>> t = np.arange(0.0, 2.0, 0.01)
     >>> found = overview_of(Recorded("frame", "g", t, np.clip(np.sin(9.0 * t), -1.0, 0.8)))
@@ -82,7 +82,7 @@ def overview_of(recorded: Recorded) -> ChannelOverview:
 
 
 def speed_of(recorded: Sequence[Recorded], pulses: str | None, speed: str | None, per_turn: int) -> MeasuredRun | None:
-    """Return the run with the pulses of a tachometer, or with a channel of speed.
+    """Return a run that contains only the channel of the rotor: the pulses of a tachometer, or a speed.
 
     **Arguments**: `pulses` or `speed`: name of the channel, None for the first channel in rpm or rad/s; `per_turn`: pulses per
     revolution.

@@ -32,8 +32,8 @@ def read_run(
       (`'.[mat]'`), WAV (`'.[mat]'`), MF4 (`'.[mf4]'`)
 
     Readings are converted to SI units from the unit of the channel or, if it has none, from the unit in the file. They are
-    checked and repaired; sentences about repairs are in `notes` of the result. Values of WAV files are fractions of the full
-    scale; a unit such as "50 g" states the full scale.
+    checked and repaired; `notes` of the result describe the repairs. Values of WAV files are fractions of the full scale; a
+    unit such as "50 g" states the full scale.
 
     **Arguments**
 
