@@ -1,8 +1,8 @@
-"""Angle of a rotor over time, from the pulses of a tachometer, an angle, a speed, or the schedule of the drive.
+"""Angle of a rotor over time, from the pulses of a tachometer, an angle, a speed, or a prescribed drive.
 
-Pulses and samples are fitted by a spline of degree 5 with evenly spaced knots, whose number has the smallest Bayesian
-information criterion. The second derivative of the spline, which enters the force of an unbalance, is smooth. If a wheel has
-several marks, each mark has an unknown offset from its place, because marks are unevenly spaced. All pulses may be early or
+Pulses and samples are fitted by a spline of degree 5 with evenly spaced knots. Their number minimizes the Bayesian information
+criterion. The second derivative of the spline, on which the force of an unbalance depends, is smooth. If a wheel
+has several marks, each mark has an unknown offset from its place, because marks are unevenly spaced. All pulses may be early or
 late by a common time with the standard error of one pulse, because recorders round times up, down, or to the nearest sample.
 The functions e_m(t) follow from the covariance of the coefficients:
 
@@ -42,7 +42,7 @@ _MAX_SPEED_CHANGE = 0.1
 """Relative change of the speed between two pulses above which the angle between them is uncertain."""
 
 _MIN_SPEED = 0.02
-"""Speed relative to the largest one below which the error of a pulse's angle does not decrease further."""
+"""Speed relative to the largest one below which the error of a pulse's angle is not assumed to decrease further."""
 
 MAX_ERRORS = 64
 """Largest number of errors z_m of an angle."""
@@ -228,12 +228,14 @@ def recorded_drive(time: np.ndarray, columns: Sequence[np.ndarray]) -> RecordedD
     times and with their first and second derivatives.
     """
     count, intervals, width = min(1 + MAX_ERRORS, columns[0].shape[1]), time.size - 1, (time[-1] - time[0]) / (time.size - 1)
-    value, slope, bend = (each[:, :count] * width**order for order, each in enumerate(columns))
+    value, slope, curvature = (each[:, :count] * width**order for order, each in enumerate(columns))
     table = np.zeros(
         (2 ** math.ceil(math.log2(intervals)), _DEGREE + 1, 1 - (1 - count) // _ERRORS_TOGETHER * _ERRORS_TOGETHER)
     )
-    low = np.stack([value[:-1], slope[:-1], 0.5 * bend[:-1]], axis=1)
-    ends = np.stack([value[1:] - low.sum(axis=1), slope[1:] - low[:, 1] - 2.0 * low[:, 2], bend[1:] - 2.0 * low[:, 2]], axis=1)
+    low = np.stack([value[:-1], slope[:-1], 0.5 * curvature[:-1]], axis=1)
+    ends = np.stack(
+        [value[1:] - low.sum(axis=1), slope[1:] - low[:, 1] - 2.0 * low[:, 2], curvature[1:] - 2.0 * low[:, 2]], axis=1
+    )
     table[:intervals, :3, :count] = low
     table[:intervals, 3:, :count] = np.array([[10.0, -4.0, 0.5], [-15.0, 7.0, -1.0], [6.0, -3.0, 0.5]]) @ ends
     speed = np.max(np.abs(columns[1][:, 0]))
@@ -286,9 +288,9 @@ class _KnotsFit(NamedTuple):
     """Fit of a spline with given `knots`.
 
     **Attributes**: `coefficients` (k,) of the spline; Bayesian information `criterion`; `variance` of the values; `band`:
-    diagonals of the normal equations N of the coefficients; `answers` (k, o): N^-1 B, where B (k, o) couples the coefficients
-    with the o offsets; `schur` (o, o): inverse of the Schur complement of N, which is the covariance of the offsets divided by
-    the variance.
+    diagonals of the normal equations N of the coefficients; `offset_changes` (k, o): N^-1 B, where B (k, o) couples the
+    coefficients with the o offsets; `offset_covariance` (o, o): inverse of the Schur complement of N, which is the covariance
+    of the offsets divided by the variance.
     """
 
     knots: np.ndarray
@@ -296,15 +298,15 @@ class _KnotsFit(NamedTuple):
     criterion: float
     variance: float
     band: np.ndarray
-    answers: np.ndarray
-    schur: np.ndarray
+    offset_changes: np.ndarray
+    offset_covariance: np.ndarray
 
     def covariance(self) -> np.ndarray:
         """Return the covariance (k, k) of the coefficients."""
         from scipy.linalg import solveh_banded  # slow to import
 
         inverse_band = solveh_banded(self.band, np.eye(len(self.coefficients)), lower=True)
-        return self.variance * (inverse_band + self.answers @ self.schur @ self.answers.T)
+        return self.variance * (inverse_band + self.offset_changes @ self.offset_covariance @ self.offset_changes.T)
 
 
 def _derivative(spline_fit: _KnotsFit) -> np.ndarray:
@@ -330,14 +332,14 @@ def _fit_knots(time: np.ndarray, value: np.ndarray, weights: np.ndarray, offsets
     size, count = gram.shape[0], gram.shape[0] + offsets.shape[1]
     band = np.stack([np.pad(gram.diagonal(k), (0, k)) for k in range(_DEGREE + 1)])
     band[0] += 1e-12 * np.mean(band[0])  # otherwise the matrix is singular for intervals without a value
-    answers = solveh_banded(band, basis.T @ offsets, lower=True) if offsets.size else np.zeros((size, 0))
-    schur = np.linalg.inv(offsets.T @ offsets - (basis.T @ offsets).T @ answers)
+    offset_changes = solveh_banded(band, basis.T @ offsets, lower=True) if offsets.size else np.zeros((size, 0))
+    offset_covariance = np.linalg.inv(offsets.T @ offsets - (basis.T @ offsets).T @ offset_changes)
     coefficients, offset_values, residuals = np.zeros(size), np.zeros(offsets.shape[1]), value
     for _ in range(2):  # the second solution corrects rounding errors of the first
         without_offsets = solveh_banded(band, basis.T @ residuals, lower=True)
-        step = schur @ (offsets.T @ (residuals - basis @ without_offsets))
-        coefficients, offset_values = coefficients + without_offsets - answers @ step, offset_values + step
+        step = offset_covariance @ (offsets.T @ (residuals - basis @ without_offsets))
+        coefficients, offset_values = coefficients + without_offsets - offset_changes @ step, offset_values + step
         residuals = value - basis @ coefficients - offsets @ offset_values
     square_sum = float(residuals @ residuals)
     criterion = n * math.log(max(square_sum / n, 1e-26)) + count * math.log(n)
-    return _KnotsFit(knots, coefficients, criterion, square_sum / max(n - count, 1), band, answers, schur)
+    return _KnotsFit(knots, coefficients, criterion, square_sum / max(n - count, 1), band, offset_changes, offset_covariance)

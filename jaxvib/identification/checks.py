@@ -15,9 +15,10 @@ from jaxvib.identification.records.orders import foreign_vibration
 from jaxvib.identification.torque import MISFIT
 
 CHANCE = 1e-5
-"""Share of records with pure noise about the fit that get the status `patterned`."""
+"""Chance below which residuals are not noise, and below which a run deviates from other runs. Residuals of pure noise get the
+status `patterned` with this probability for each channel."""
 
-_TURNING = ("the rotor's angle", "the angle of the jammed loads")
+_ANGLE_NAMES = ("the rotor's angle", "the angle of the jammed loads")
 
 _WINDOWS, _ORDERS = 16, 3
 """Number of stretches of a record, and number of orders of the rotor's speed, at which residuals are compared with noise."""
@@ -39,7 +40,7 @@ _UNEXPLAINED = 0.5
 """Standard deviation of a channel's residuals, relative to that of its readings, above which the model does not resemble the
 channel."""
 
-_MOSTLY = 0.5
+_MIN_POWER_SHARE = 0.5
 """Smallest share of the power of a signal in one vibration for which a note names this vibration."""
 
 _NOISE_LIKE = 0.01
@@ -53,8 +54,8 @@ class FitStatus(eqx.Enumeration):
     found = "the model explains the records up to noise"
     patterned = (
         "the residuals are not noise: they repeat with the rotor's angle or contain another vibration, so the model lacks a "
-        "part, the angle is inaccurate, or the minimum is a wrong one, and the intervals are too narrow; see the notes, "
-        "compare the residuals over speed, and start from better values"
+        "part, the angle is inaccurate, or the fit has ended at a wrong minimum, and the intervals are too narrow; see the "
+        "notes, plot the residuals over speed, and start from better values"
     )
     undetermined = "the records do not determine all unknowns: see `undetermined` for the directions and how to determine them"
     contradicted = (
@@ -79,7 +80,7 @@ def status_of(fitted: Fitted, information: Information) -> tuple[FitStatus, floa
         if error > _COARSE_ANGLE:
             notes.append(
                 f"the rotor's angle in run {k + 1} has the standard error {error:.2g} rad between its pulses, and a fit may "
-                "end in a wrong minimum: use more pulses per turn, or sample them faster"
+                "end at a wrong minimum: use more pulses per turn, or sample them faster"
             )
     is_inaccurate, has_fit = fitted.is_absorbed, resembles(fitted)
     if fitted.is_absorbed:
@@ -113,7 +114,7 @@ def status_of(fitted: Fitted, information: Information) -> tuple[FitStatus, floa
                     "which have little influence"
                 )
             angles = fitted.problem.angles[k].T
-            for angle, whose in zip(angles if fitted.problem.has_loads else angles[:1], _TURNING, strict=False):
+            for angle, whose in zip(angles if fitted.problem.has_loads else angles[:1], _ANGLE_NAMES, strict=False):
                 one = residual_chance(residuals[:, c], np.asarray(samples.taps)[:, c], angle, unknowns)
                 if one < CHANCE:
                     notes.append(f"the residuals of channel {channel.name!r} in run {k + 1} repeat with {whose}")
@@ -152,23 +153,23 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
             readings = np.where(mask[:, c], raw[:, c], np.nan)
             values = residuals[:, c] if has_fit else readings
             vibration = foreign_vibration(values, problem.angles[k][:, 0], float(samples.step))
-            if vibration is None or vibration.share < _MOSTLY:
+            if vibration is None or vibration.share < _MIN_POWER_SHARE:
                 continue
             if has_fit and vibration.order is None and np.nanvar(values) < _NOISE_LIKE * np.nanvar(readings):
                 continue
             what = "residuals" if has_fit else "readings"
             yield (
                 f"{vibration.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is "
-                f"{vibration.place}, but an unbalance turns with the rotor: use the tachometer of the vibrating shaft, or "
-                "leave out the part of the record in which loads are jammed or another machine runs"
+                f"{vibration.place}, but an unbalance turns with the rotor: use the tachometer of the shaft that causes the "
+                "vibration, or leave out the part of the record in which loads are jammed or another machine runs"
                 if not problem.has_loads
                 else f"{vibration.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is "
-                f"{vibration.place}: the motion of the loads is not that of the scene, or the minimum is a wrong one"
+                f"{vibration.place}: the motion of the loads is not that of the scene, or the fit has ended at a wrong minimum"
             )
 
 
 def residual_chance(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray, fitted_count: int) -> float:
-    """Return the probability that noise has vibrations at orders of the rotor's speed as strong as those of the residuals.
+    """Return the probability that pure noise has vibrations at orders of the rotor's speed as strong as those of the residuals.
 
     The residuals are filtered to white noise and compared with vibrations at the first orders of the rotor's speed in each
     stretch of the record, by an F test.
@@ -206,7 +207,7 @@ def residual_chance(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray, 
 
 
 def coverage_notes(fitted: Fitted, frequency: np.ndarray, damping_ratio: np.ndarray) -> Iterator[str]:
-    """Yield sentences about runs that pass no resonance, and about runs that are too short.
+    """Yield sentences about runs that do not pass through a resonance, and about runs that are too short.
 
     **Arguments**: natural frequencies, rad/s, and damping ratios (m,) of the fitted machine.
     """
@@ -217,8 +218,8 @@ def coverage_notes(fitted: Fitted, frequency: np.ndarray, damping_ratio: np.ndar
     if frequency.size and not any(low < w < high for low, high in spans for w in frequency):
         low, high, modes = min(spans)[0], max(each for _, each in spans), ", ".join(f"{w:.4g}" for w in frequency)
         yield (
-            f"no run passes a resonance: the rotors turn at {low:.3g} to {high:.3g} rad/s, and the natural frequencies are "
-            f"{modes} rad/s; record a run through a resonance"
+            f"no run passes through a resonance: the rotors turn at {low:.3g} to {high:.3g} rad/s, and the natural frequencies "
+            f"are {modes} rad/s; record a run through a resonance"
         )
     decay = 1.0 / np.maximum(damping_ratio * frequency, 1e-300)
     for k, time in enumerate(problem.times):
@@ -226,7 +227,7 @@ def coverage_notes(fitted: Fitted, frequency: np.ndarray, damping_ratio: np.ndar
         if lasts < _DECAY_TIMES * longest:
             yield (
                 f"run {k + 1} lasts {lasts:.3g} s, less than two decay times of the slowest mode ({longest:.3g} s each): its "
-                "response is not distinguished from the motion at its start; record a longer run"
+                "response cannot be distinguished from the free vibration at its start; record a longer run"
             )
 
 

@@ -1,8 +1,8 @@
 """Information of the records about the numbers of a scene: covariance, and directions that the records do not determine.
 
-The numbers are compared on a logarithmic scale (numbers of either sign: relative to their size). A direction is a combination
-of relative changes; its standard error is 1/sqrt(eigenvalue) of the information matrix of the scene's numbers, after all
-other unknowns (gains, errors of the angle and others) are eliminated.
+The numbers are compared on a logarithmic scale (numbers of either sign: relative to their first values). A direction is a
+combination of relative changes; its standard error is 1/sqrt(eigenvalue) of the information matrix of the scene's numbers,
+after all other unknowns (gains, errors of the angle and others) are eliminated.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxvib.identification.problem import Problem
 UNDETERMINED = 1.0
 """Relative standard error of a direction above which it counts as undetermined: a factor of e."""
 
-_UNSEEN = 1e3
+_UNBOUNDED_ERROR = 1e3
 """Standard error of the logarithm of a number above which the records do not bound the number, not even from above."""
 
 _SINGLE = 0.99
@@ -99,7 +99,7 @@ def information_of(fitted: Fitted) -> Information:
     single = np.abs(axes) > _SINGLE
     error = np.sum(single * errors, axis=1)
     # Unbalances are left out: if the size of an unbalance tends to 0, its angle is unknown, too.
-    vanished = logarithmic & (error > UNDETERMINED) & (error < _UNSEEN) & (np.arange(kept.size) < number_count)
+    vanished = logarithmic & (error > UNDETERMINED) & (error < _UNBOUNDED_ERROR) & (np.arange(kept.size) < number_count)
     # A vanished number is measured in units of ten times its standard error instead of its value, so that it counts as
     # determined.
     factors = np.where(vanished, 10.0 * error, 1.0)
@@ -171,8 +171,8 @@ def in_polar_unbalances(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def polar_unbalances(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives (p + L, p + L) of all unknowns by the same unknowns with (logarithm of the size, angle) instead of
-    (a, b) for each unbalance, and the sizes (E,) of the unbalances."""
+    """Return the derivatives (p + L, p + L) of all unknowns with respect to the polar unknowns, and the sizes (E,) of the
+    unbalances. The polar unknowns have (logarithm of the size, angle) instead of (a, b) for each unbalance."""
     p, exciters = problem.unknowns.count, len(problem.unbalances)
     jacobian, sizes = np.eye(p + linear.size), np.zeros(exciters)
     for k in range(exciters):

@@ -1,9 +1,9 @@
 """Least-squares fit of a machine to recorded runs by the method of Levenberg and Marquardt with projected linear unknowns.
 
 At every trial the linear unknowns (first states, unbalances, offsets) are those of least squares. Only the other unknowns are
-damped. The noise of each channel follows from its residuals, and the fit is repeated with residuals filtered to white noise. If
-the residuals have outliers, these have little influence; a clipped reading is a bound. If the error of a rotor's angle is not
-small compared with the noise, the angle is fitted together with the machine.
+damped. The noise of each channel follows from its residuals, and the fit is repeated with residuals filtered to white noise.
+Outliers among the residuals have little influence; a clipped reading is a bound of the true value. If the error of a rotor's
+angle is not small compared with the noise, the angle is fitted together with the machine.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def unbalance_prior(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, n
 
 
 def project(problem: Problem, x: np.ndarray) -> _Trial:
-    """Return the best linear unknowns at `x`, and their cost; of a motion with loads the linear unknowns of the problem."""
+    """Return the best linear unknowns at `x` and their cost; for a motion with loads, those of the problem and their cost."""
     if problem.linear is not None:
         return _with_loads(problem, x, problem.linear)
     total = _linear_equations(problem, x)
@@ -315,7 +315,7 @@ def descend(
     With `bend`, each damped step is corrected for the second derivative of the model along it. In a curved valley of the cost,
     such steps are much longer than those of the linearized model.
 
-    A number that runs to 0 stays at a value that the data do not distinguish from 0. With its logarithm as the unknown, the
+    A number that tends to 0 stays at a value that the data do not distinguish from 0. With its logarithm as the unknown, the
     expected reduction of the cost would remain the same at every smaller value, and the descent would never end.
 
     **Arguments**: the first trial `best`, with its `cost`; `equations`: returns the equations of a trial; `stepped`: returns
@@ -444,7 +444,7 @@ def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
     if any(matters):
         problem, is_final = with_angle_errors(fitted.problem, matters), False
         fitted = fitted._replace(x=np.concatenate([fitted.x, np.zeros(problem.unknowns.errors)]), problem=problem)
-    for _ in range(_MAX_PASSES):  # goes on after a pass that has not converged, since its weights were not final
+    for _ in range(_MAX_PASSES):  # a pass that has not converged does not end the loop, because its weights are not final
         new = [[noise_of(each[:, k]) for k in range(each.shape[1])] for each in fitted.residuals]
         if is_final and _largest_change(noise, new) < _STEADY_NOISE:
             break

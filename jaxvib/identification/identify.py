@@ -42,8 +42,8 @@ from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum
 from jaxvib.units import Number
 
-_RETURNS = 2
-"""Number of times that undetermined combinations of numbers are moved back to their first values."""
+_REFITS_NEAR_FIRST_VALUES = 2
+"""Number of fits in which undetermined combinations of numbers are moved back towards their first values."""
 
 _STEP = 1e-4
 """Relative change of a number in a difference quotient."""
@@ -57,7 +57,7 @@ class MachineFit(Result):
     **Attributes** (k numbers of the scene, m damped modes, g gains)
 
     - `status`: a `FitStatus`
-    - `notes`: sentences with further advice for the reader
+    - `notes`: sentences with repairs, doubts and advice
     - `scene` with the fitted numbers
     - `names` (k,), `units` (k,) and `estimates` (k,) of the numbers; the interval of an undetermined number is unbounded
     - `scale` (k,), in `units`: change of each number that counts as the relative change 1, see `covariance` and `information`:
@@ -66,17 +66,18 @@ class MachineFit(Result):
     - `information` (k + g + 1, k + g + 1): Fisher information about relative changes of the numbers and of the gains, and about
       the angle of the first unbalance
     - `undetermined`: a `Direction` for each combination of numbers that the records do not determine
-    - `by_gain`: a `Direction` for each combination that is known from the gains of the sensors only
+    - `by_gain`: a `Direction` for each combination that only the known gains of the sensors determine
     - `frequency` (m,), rad/s, and `damping_ratio` (m,): natural frequencies and damping ratios of the damped modes
     - `gain_names` (g,) and `gains` (g,) of the channels
-    - `phase`, rad: angle of the unbalance of each exciter ahead of the zero of the rotor's angle
+    - `phase`, rad: direction of the unbalance of each exciter at the rotor angle 0, anticlockwise from the horizontal
     - `first_states`, SI: of each run with loads on its rotor, the coordinates of the machine, their velocities, the angles of
       the loads, their speeds and the angle of the rotor at the first sample; empty without loads
     - `channels`: names of the compared channels of each run
     - `noise`: standard deviation of the residuals of each run's channels, SI
-    - `chance`: smallest probability, over the channels, that noise has vibrations at orders of the rotor's speed as strong as
-      those of the residuals
-    - `time`, s, `readings` and `fitted`, SI: arrays for each run, NaN for samples that do not count
+    - `chance`: probability that pure noise has vibrations at orders of the rotor's speed that are as strong as those of the
+      residuals; the smallest one of all channels
+    - `time`, s, `readings`, and `fitted` (readings of the fitted model), SI: arrays for each run, NaN for samples that do not
+      count
     """
 
     status: FitStatus
@@ -141,7 +142,7 @@ class MachineFit(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the readings of the first run with the fit, and the residuals of its channels, onto two axes `ax` if given.
+        """Plot the readings of the first run with the fit, and the residuals, onto two axes: `ax`, or those of a new figure.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -173,17 +174,18 @@ def identify(
 
         M q'' + C q' + K q = -S B^T p''(theta(t)),      readings = gain (motion of the sensors) + offset + noise
 
-    For a scene, the rotor's angle theta follows from the run (kind pulses, angle or speed) or from a drive of prescribed speed.
+    S is the unbalance, p = (cos theta, sin theta), and B q the displacement of the exciter. For a scene, the angle theta of the
+    rotor follows from the run (a channel of kind "pulses", "angle" or "speed") or from a drive of prescribed speed.
 
-    - Least squares over the whole record, transients included; the equations are integrated exactly at the samples
-    - The unknown numbers, the gains of the sensors (known to `gain_error`), the angle of the unbalance, the offsets and the
-      motion at the first sample are free
+    - The least-squares fit uses the whole record, including the transients
+    - The unknowns of the fit are the unknown numbers, the gains of the sensors (known to `gain_error`), the angle of the
+      unbalance, the offsets, and the state at the first sample
     - The noise of each channel may be coloured: residuals are filtered to white noise by an autoregressive model, and the
-      intervals are those of the Fisher information with the noise found
+      intervals follow from the Fisher information with the estimated noise
     - The supports must be linear. The loads of a scene with one exciter (balls, rollers, pendulums) must be jammed throughout
-      the runs; their motion is that of `vector_field`, and their first angles and speeds are free
+      the runs; their motion is that of `vector_field`, and their angles and speeds at the first sample are unknowns
     - Numbers of a motor, such as "drive.inertia" and "drive.stall_torque", can be unknown if a channel gives the angle or the
-      speed of its rotor: the torque balance with the torque of the vibration is fitted to it together with the readings
+      speed of its rotor. The torque balance of the rotor, with the torque of the vibration, is then a part of the fit
 
     For a `BearingPendulum`, see `jaxvib.study.bearing.identify.identify_bearing`:
 
@@ -200,7 +202,7 @@ def identify(
       value is exact. Numbers that are neither in `unknown` nor in `known` have the values of the scene exactly
     - `dry`, `air`, `torque`, `instrument`: only for a pendulum. True to identify the dry friction mu2, the drag b of the air or
       the torque M as well. `instrument`: relative uncertainty of J; typical: 0.01 to 0.03 (default 0)
-    - `throw`: raise if no fit is found
+    - `throw`: True (the default) to raise an error if there is no fit
 
     **Returns** `MachineFit`, or `Identified` for a pendulum. **Raises** `InputError` for records that cannot be fitted,
     `ComputationError` "not_converged", or "contradicted" if the records contain a vibration that is not at the rotor's speed.
@@ -251,10 +253,10 @@ def identify(
 def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted:
     """Return a fit in which undetermined combinations of numbers have nearly their first values.
 
-    The fit leaves them anywhere along a curved valley of equal residuals. Plans of further runs depend on them.
+    A fit alone leaves them at an arbitrary point of a curved valley of equal residuals. Plans of further runs depend on them.
     """
     first = [float(np.asarray(scene.exciters[k].unbalance, float)) for k in free_unbalances(problem)]
-    for _ in range(_RETURNS):
+    for _ in range(_REFITS_NEAR_FIRST_VALUES):
         known = information_of(fitted)
         axes, number_count = known.undetermined, len(problem.unknowns.numbers)
         if not axes.size or not fitted.converged:
@@ -395,9 +397,9 @@ def propagate(
         slopes.append((high - low) / (2.0 * _STEP) if high.shape == low.shape == values.shape else np.full_like(values, np.nan))
     slopes = np.stack(slopes, axis=1)
     spread = np.sqrt(np.maximum(np.einsum("mk,kl,ml->m", slopes, covariance, slopes), 0.0))
-    lost = np.abs(slopes @ axes) * np.minimum(errors, 1e3)
-    sure = np.all(lost < 0.1 * np.abs(values)[:, None], axis=1)
+    undetermined_changes = np.abs(slopes @ axes) * np.minimum(errors, 1e3)
+    determined = np.all(undetermined_changes < 0.1 * np.abs(values)[:, None], axis=1)
     return [
-        _estimate(value, abs(value), value > 0.0, each / abs(value), bool(is_sure))
-        for value, each, is_sure in zip(values, spread, sure, strict=True)
+        _estimate(value, abs(value), value > 0.0, each / abs(value), bool(is_determined))
+        for value, each, is_determined in zip(values, spread, determined, strict=True)
     ]

@@ -40,7 +40,7 @@ _VALLEY_STEPS, _SMALL_REDUCTION = 6, 0.05
 """Number of steps into a curved valley of the cost, and reduction of the cost below which they end."""
 
 _TIGHT_ERROR = 1e-3
-"""A number is fixed by a known value. Its standard error is this fraction of the standard error of the number in the fit."""
+"""Standard error of the known value by which a number is fixed, relative to the standard error of the number in the fit."""
 
 _MAX_DISTANCE = 20.0
 """Distance in standard errors beyond which an interval counts as unbounded."""
@@ -72,9 +72,9 @@ class _Profile:
         return math.log1p(distance * self.spread) if self.is_vanished else distance * self.spread
 
     def rise(self, distance: float, is_exact: bool) -> float:
-        """Return the rise of the cost at a `distance` in standard errors. If `is_exact`, all other unknowns are fitted;
-        otherwise only the linear ones are fitted, and the others follow the quadratic form; for a motion with loads, in which
-        no unknown is linear, see `_in_valley`."""
+        """Return the rise of the cost at a `distance` in standard errors. If `is_exact`, all other unknowns are fitted.
+        Otherwise only the linear ones are fitted, and the others follow from the quadratic form. A motion with loads has no
+        linear unknown; see `_in_valley`."""
         target, p = self.center + self.shift(distance), self.fitted.x.size
         problem, known_cost = self._fixed(target)
         change = distance * self.spread * self.slopes
@@ -91,7 +91,8 @@ class _Profile:
 
     def _in_valley(self, problem: Problem, x: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the unknowns of a motion with loads after a few steps of the method of Gauss and Newton with the derivatives
-        at the fit. The valley of the cost is curved, and far away the quadratic form leaves it."""
+        at the fit. The valley of the cost is curved, and the unknowns of the quadratic form are outside it at a large
+        distance."""
         assert self.columns is not None
         slopes, p, best, last = self.columns[:, :-1], x.size, (x, linear), math.inf
         for _ in range(_VALLEY_STEPS):
@@ -126,7 +127,7 @@ class _Profile:
         return max(abs(rise / _COMPARED_DISTANCE**2 - 1.0) for rise in rises) <= _MAX_DIFFERENCE
 
     def end(self, side: float) -> float:
-        """Return the distance of an end of the interval from the center, in standard errors; infinite if there is no end.
+        """Return the distance of an end of the interval from the fitted value, in standard errors; infinite if there is no end.
 
         **Arguments**: `side`: -1 for the lower end, 1 for the upper end.
 
@@ -177,7 +178,7 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
         if is_vanished:
             intervals[name] = -math.inf, profile.shift(profile.end(1.0))
             continue
-        # Without an exact fit, the cost of a motion with loads may rise by more than in its profile.
+        # The cost of a motion with loads that is not fitted completely may rise by more than in the profile.
         if profile.is_quadratic(is_exact=False) or (problem.linear is not None and profile.is_quadratic(is_exact=True)):
             continue
         intervals[name] = -profile.spread * profile.end(-1.0), profile.spread * profile.end(1.0)

@@ -55,7 +55,7 @@ _STRETCH_ANGLE, _MAX_STRETCHES = 25.0, 64
 values of the unknowns, the phase error within a stretch must be less than a radian."""
 
 _STEPS_PER_RADIAN = 1.0
-"""Number of steps of order 8 per radian of the fastest motion, with errors of about 3e-9 in a turn."""
+"""Number of steps of order 8 per radian of the fastest motion, with errors of about 2e-7 in a turn."""
 
 _DELAY_MARGIN = 2
 """Number of steps by which both readings and model are delayed, so that the interpolation has samples on both sides."""
@@ -69,7 +69,7 @@ class Known(NamedTuple):
 
     @property
     def is_exact(self) -> bool:
-        """True for a number without an error. The error of an unbalance that is known exactly is `EXACT` instead of 0."""
+        """True for a number without an error. An exactly known unbalance has the relative error `EXACT` instead of 0."""
         return self.error <= 1.001 * EXACT * abs(self.value)
 
 
@@ -122,7 +122,7 @@ class Problem(NamedTuple):
 def read_known(text: Number, number: NamedNumber, field: str) -> Known:
     """Return a known value with its standard error: "95 kg", "95 kg +- 1 %" or "95 kg +- 0.5 kg".
 
-    The number behind the sign is the standard error.
+    The number after the sign is the standard error.
     """
     parts = re.split(r"\+-|\+/-|±", text) if isinstance(text, str) else []
     if not isinstance(text, str) or len(parts) < 2:
@@ -248,9 +248,9 @@ def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs:
 
 
 def _with_reduced_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
-    """Return the run. The sampling rate of a long run is reduced to the rate that its highest frequency needs.
+    """Return the run with the sampling rate that its highest frequency needs if it is long, otherwise the same run.
 
-    The natural frequencies are increased by a margin, because they are computed from the first values of the unknowns.
+    The natural frequencies are increased by a margin, because they are computed with the first values of the unknowns.
     """
     if max(time.size for time in run.times.values()) < MIN_SAMPLES:
         return run
@@ -375,7 +375,8 @@ def _samples(
     count = math.floor((end - origin) / step + _MAX_UNEVENNESS) - first + 1
     if count < 4 * (state_count(scene, channels) + 2):
         raise InputError(
-            run.source, f"has {max(count, 0)} samples while the angle of the rotor is known; record more, or check the times"
+            run.source,
+            f"has {max(count, 0)} samples while the angle of the rotor is known; record more, or check the times",
         )
     stretch = min(STRETCH, max(BLOCK, 2 ** math.ceil(math.log2(count))))
     stretches = -(-count // stretch)
@@ -480,7 +481,7 @@ def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: 
 
 
 def channel_sizes(problem: Problem) -> list[list[float]]:
-    """Return the standard deviation of the readings of each run's channels, 1 for a channel without a change."""
+    """Return the standard deviation of the readings of each run's channels, 1 for a channel with constant readings."""
     return [
         [float(np.std(raw[mask[:, k], k])) or 1.0 if np.any(mask[:, k]) else 1.0 for k in range(raw.shape[1])]
         for raw, mask in zip(problem.raw, problem.masks, strict=True)
@@ -490,7 +491,7 @@ def channel_sizes(problem: Problem) -> list[list[float]]:
 def _delay_taps(delay: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the filters of the readings and of the model for a delay of the readings in steps: interpolation of degree 5.
 
-    Both are later by two steps, because the interpolation needs samples on both sides.
+    Both filters delay their signals by two steps, because the interpolation needs samples on both sides.
     """
     late = delay + _DELAY_MARGIN
     base = math.floor(late) - 2

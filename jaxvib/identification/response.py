@@ -11,9 +11,9 @@ the state at the samples is exact for the machine; three Gauss points per step i
 The steps are computed in blocks: first the responses from the state zero in all blocks of a stretch of the record at once, then
 the state at the start of each block from that of the block before, then the responses to these states. Readings are linear in
 the state at the first sample, the two components (a, b) of each unbalance, and the offsets: these are the linear unknowns, in
-this order. Derivatives by all other unknowns are forward derivatives of the same steps; derivatives by errors of a rotor's
-angle (`RecordedDrive`) are responses to changes of the force. The normal equations of a whole record are sums over stretches,
-which bounds the memory.
+this order. Derivatives with respect to all other unknowns are forward derivatives of the same steps; those with respect to
+errors of a rotor's angle (`RecordedDrive`) are responses to changes of the force. The normal equations of a whole record are
+sums over stretches, which bounds the memory.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ BLOCK = 64
 
 
 class Unknowns(eqx.Module):
-    """Unknowns other than linear ones, as deviations x from their first values.
+    """Unknowns except the linear ones, as deviations x from their first values.
 
         value = first exp(x) for positive numbers,      value = first + scale x otherwise
 
@@ -181,24 +181,24 @@ def _steps(scene: Scene, channels: tuple[Channel, ...], step: Array, turn: Array
     forces = []
     for mount in model.mounts:
         across, up = (mount.rotor_rows()[mount.axes.index(axis)] if axis in mount.axes else jnp.zeros(nd) for axis in (0, 1))
-        # The component b of the unbalance is a quarter of a turn ahead of a.
+        # The component b of the unbalance is a quarter of a turn anticlockwise from a.
         forces.append(jnp.stack([jnp.stack([across, up], axis=-1), jnp.stack([up, -across], axis=-1)], axis=1))
     force = jnp.stack(forces, axis=1)  # (nd, E, 2, 2)
     c, s = jnp.cos(turn), jnp.sin(turn)
     force = jnp.einsum("neaf,ab->nebf", force, jnp.asarray([[c, -s], [s, c]]))
     scale = jax.lax.stop_gradient(jnp.sqrt(jnp.max(jnp.diagonal(stiffness) / jnp.diagonal(mass))))
     solved = jnp.linalg.solve(mass, jnp.concatenate([stiffness / scale, damping, force.reshape(nd, -1)], axis=1))
-    elastic, viscous, pushed = solved[:, :nd], solved[:, nd : 2 * nd], solved[:, 2 * nd :].reshape(force.shape)
+    elastic, viscous, accelerance = solved[:, :nd], solved[:, nd : 2 * nd], solved[:, 2 * nd :].reshape(force.shape)
     zero = jnp.zeros((nd, nd))
     flow = jnp.block([[zero, scale * jnp.eye(nd)], [-elastic, -viscous]])
-    entry = jnp.concatenate([jnp.zeros_like(pushed), pushed])
+    entry = jnp.concatenate([jnp.zeros_like(accelerance), accelerance])
 
     weights = sensor_rows(scene, model.carrier, channels)
     row = jnp.concatenate([weights[:, 0] / scale, weights[:, 1]], axis=1) + weights[:, 2] @ flow[nd:]
-    direct = jnp.tensordot(weights[:, 2], pushed, axes=1)
+    direct = jnp.tensordot(weights[:, 2], accelerance, axes=1)
     corners = [2.0 * np.pi * channel.high_pass for channel in channels]
     slow = [k for k, corner in enumerate(corners) if corner > 0.0]
-    if slow:  # the state z' = corner (reading - z) of a high-pass filter is taken away from the reading
+    if slow:  # the state z of a high-pass filter, z' = corner (reading - z), is subtracted from the reading
         corner, n = np.array([corners[k] for k in slow]), len(slow)
         flow = jnp.block(
             [[flow, jnp.zeros((2 * nd, n))], [corner[:, None] * row[np.array(slow)], jnp.diag(jnp.asarray(-corner))]]
@@ -240,16 +240,16 @@ def _march(power: Array, forcing: Array, start: Array) -> tuple[Array, Array]:
 
 
 def _readings(steps: _Steps, force: Array, start: Array) -> tuple[Array, Array]:
-    """Return the derivatives (n, C, ns + 2 E) of the readings by the state at the first sample and by the components of the
-    unbalances, and the derivatives of the state at the end.
+    """Return the derivatives (n, C, ns + 2 E) of the readings with respect to the state at the first sample and the components
+    of the unbalances, and those of the state at the end.
 
     **Arguments**: `start` (ns, ns + 2 E): derivatives of the state at the start of the stretch.
     """
     ns = steps.power.shape[0]
     n, exciters = force.shape[0], steps.inputs.shape[2]
     parts = force.reshape(n, 4, exciters, 2)
-    pushed = jnp.einsum("jsebf,njef->nseb", steps.inputs, parts[:, 1:]).reshape(n, ns, 2 * exciters)
-    forcing = jnp.concatenate([jnp.zeros((n, ns, ns)), pushed], axis=2)
+    by_unbalance = jnp.einsum("jsebf,njef->nseb", steps.inputs, parts[:, 1:]).reshape(n, ns, 2 * exciters)
+    forcing = jnp.concatenate([jnp.zeros((n, ns, ns)), by_unbalance], axis=2)
     states, end = _march(steps.power, forcing, start)
     direct = jnp.einsum("cebf,nef->nceb", steps.through, parts[:, 0]).reshape(n, -1, 2 * exciters)
     readings = jnp.einsum("cs,nsm->ncm", steps.outputs, states)
@@ -287,7 +287,7 @@ def _built(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> _Ste
 
 def _forces(samples: Samples, scene: Scene, x: Array, stretch: Array) -> tuple[Array, Array]:
     """Return F (n, 4, 2 E), (horizontal, up) for each exciter, at each sample of a stretch and at the three Gauss points of the
-    step that follows, and the derivatives (m, n, 4, 2) of F by the errors of the rotor's angle."""
+    step that follows, and the derivatives (m, n, 4, 2) of F with respect to the errors of the rotor's angle."""
     first, count = samples.errors
     n = samples.readings.shape[1]
     places = (stretch * n + jnp.arange(n))[:, None] + jnp.asarray([0.0, *GAUSS_POINTS])[None]
@@ -349,7 +349,7 @@ def linear_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
 
 @cached
 def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, linear: Array) -> Array:
-    """Return Z^T Z of Z = (derivatives by x, linear unknowns of the run, readings minus model).
+    """Return Z^T Z of Z = (derivatives with respect to x and the linear unknowns of the run, readings minus model).
 
     **Arguments**: `linear`: state at the first sample, components of the unbalances, offsets.
     """
@@ -366,7 +366,7 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
 
     def stretch(carry, part):
         (linear_state, (moving, turning, before), total), (k, readings, weights) = carry, part
-        force, pushes = _forces(samples, scene, x, k)
+        force, force_changes = _forces(samples, scene, x, k)
         at = linear_state[0] @ linear[: linear_state[0].shape[1]]
         linear_state, found = columns(linear_state, force)
 
@@ -375,7 +375,9 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
 
         slopes, moving = jax.vmap(along)(changes, moving)
         if errors:
-            by_error, turning = jax.vmap(lambda push, start: _response(steps, push, start, unbalance))(pushes, turning)
+            by_error, turning = jax.vmap(lambda change, start: _response(steps, change, start, unbalance))(
+                force_changes, turning
+            )
             others = jnp.zeros((unknowns.errors, *slopes.shape[1:]))
             slopes = jnp.concatenate([slopes, others.at[place - moved : place - moved + errors].set(by_error)])
         elif unknowns.errors:

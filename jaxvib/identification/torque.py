@@ -7,10 +7,11 @@ predicted speed w and angle obey
 
 p(t), kg m, is the unbalance times the unit vector to it, a the acceleration of the rotor's axis (horizontal + i up), both at
 the recorded angle, and g gravity. The first angle and speed are unknowns, and the predicted angle is compared with the pulses
-(or with samples of an angle or a speed). No derivative of the record enters, the errors of the pulses are independent except
-for a common delay, and the steady torque of the motor keeps the prediction near the record. The numbers of the motor, those of
-the machine and the motion at the first sample are fitted together, because a dip of the speed at a resonance measures the
-torque of the vibration. The rotation of a housing that turns with the machine is neglected in T.
+(or with samples of an angle or a speed). No derivative of the record is needed, the errors of the pulses are independent except
+for a common delay, and the dependence of the torque of the motor on the speed keeps the prediction near the record. The numbers
+of the motor, those of the machine and the motion at the first sample are fitted together, because the decrease of the speed at
+a resonance is a measure of the torque of the vibration. The rotation of a housing that turns with the machine is neglected in
+T.
 """
 
 from __future__ import annotations

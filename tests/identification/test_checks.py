@@ -134,8 +134,12 @@ def runs_of(time, speeds):
     ("frequency", "until", "words"),
     [
         ([30.0, 60.0], 10.0, []),
-        ([60.0, 80.0], 10.0, ["no run passes a resonance: the rotors turn at 10 to 50 rad/s", "frequencies are 60, 80 rad/s;"]),
-        ([9.0], 40.0, ["no run passes a resonance"]),
+        (
+            [60.0, 80.0],
+            10.0,
+            ["passes through a resonance: the rotors turn at 10 to 50 rad/s", "are 60, 80 rad/s;"],
+        ),
+        ([9.0], 40.0, ["no run passes through a resonance"]),
         ([30.0], 6.5, ["run 1 lasts 6.5 s, less than two decay times of the slowest mode (3.33 s each)"]),
         ([], 10.0, []),
     ],

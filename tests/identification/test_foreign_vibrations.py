@@ -26,7 +26,7 @@ def test_tachometer_of_another_shaft_is_contradicted():
     fit = fit_to(other, unknown=SIZE)
     assert fit.status_name == "contradicted"
     (words,) = (note for note in fit.notes if "of the readings of channel 'a2' in run 1 is at 1.2" in note)
-    assert "times the rotor's speed, but an unbalance turns with the rotor: use the tachometer of the vibrating shaft" in words
+    assert "times the rotor's speed, but an unbalance turns with the rotor: use the tachometer of the shaft that" in words
     with pytest.raises(jv.ComputationError, match=r"contradicted: .* times the rotor's speed, but an unbalance turns"):
         fit_to(other, throw=True, unknown=SIZE)
 

@@ -63,7 +63,7 @@ class RunPlan(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the largest error of a number after each candidate run.
+        """Plot the largest relative error of the numbers after each candidate run.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -85,10 +85,11 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
       is assumed to be the mark of the runs so far
     - The model of the fit gives the expected readings. `change` of a candidate describes an added mass; its `channels` describe
       new sensors and sensors at other places
-    - A run with loads on the rotor begins with the first motion of the first run of the fit, and the loads must stay jammed
-    - With `limits`, the speeds of the best candidate at 9 evenly spaced times are optimized for the smallest errors, by
-      gradients and sequential quadratic programming. The result is one more candidate, of the same duration, if it is better
-      than all others
+    - A run with loads on the rotor begins with the state at the first sample of the first run of the fit, and the loads must
+      stay jammed
+    - With `limits`, the speeds of the best candidate at 9 evenly spaced times are optimized for the smallest errors, with
+      gradients, by sequential quadratic programming. If the result is better than all candidates, it is one more candidate, of
+      the same duration
 
     **Arguments**
 
@@ -105,7 +106,7 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
     >>> drive = jv.RunUp(60.0, acceleration=6.0)
     >>> scene = jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=0.05)])
     >>> t, frame = np.arange(0.0, 10.0, 0.005), jv.Channel("frame", "acceleration", at=1, gain_error=0.0)
-    >>> motion = 0.01 * np.random.default_rng(0).normal(size=t.size)    # a record that shows nothing
+    >>> motion = 0.01 * np.random.default_rng(0).normal(size=t.size)    # a record of noise only
     >>> run = jv.MeasuredRun.from_arrays([frame], t, {"frame": motion})
     >>> fit = jv.identify(scene, run, unknown=["machine.stiffness", "machine.damping"], throw=False)
     >>> plan = jv.plan_runs(fit, [jv.PlannedRun("slow", drive, "10 s", [frame], rate=200.0)])

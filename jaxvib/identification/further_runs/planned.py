@@ -33,7 +33,8 @@ class PlannedRun(Readable):
     **Arguments**
 
     - `name` for tables
-    - `drive` of prescribed speed: a ramp (`RunUp`, `SpinUp`), a dwell (`ConstantSpeed`), or a coast-down (`SpeedProfile`)
+    - `drive` of prescribed speed: a run-up (`RunUp`, `SpinUp`), a constant speed (`ConstantSpeed`), or any other speed over
+      time, such as a coast-down (`SpeedProfile`)
     - `duration`, s; typical: 10 to 60
     - `channels` of the run; their places may differ from those of the runs so far. A sensor that is moved to another place
       keeps its name: the name identifies its gain
@@ -106,7 +107,7 @@ class Expected(NamedTuple):
 def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     """Return a planned run, evaluated with the numbers of a fit.
 
-    A run with loads on the rotor begins with the motion of the first sample of the first run of the fit.
+    A run with loads on the rotor begins with the state at the first sample of the first run of the fit.
 
     **Raises** `InputError` for a channel whose noise is unknown, for a scene with several exciters, and for loads that do not
     stay jammed.

@@ -87,7 +87,7 @@ class RunPrediction(Result):
 
 @validated
 def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
-    """Return the prediction of a run that the fit did not use, and compare it with the readings.
+    """Return the prediction of a run that the fit did not use, and its comparison with the readings.
 
     - The numbers and the gains are those of the fit. The motion at the first sample and the offsets are fitted to the run. The
       zero of the rotor's angle is also fitted, unless the fit and the run both have the mark of a tachometer and no loads move

@@ -119,7 +119,7 @@ def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
 
 def _stiffnesses_of_jam(problem: Problem, jams: Sequence[_Jam]) -> np.ndarray | None:
     """Return x with the unknown stiffnesses multiplied by one number, such that the natural frequency nearest the speed of the
-    jam is slightly above it, as in a jam; None if no stiffness is unknown, or if the number is nearly 1."""
+    loads is slightly above this speed, as in a jam; None if no stiffness is unknown, or if the number is nearly 1."""
     speed, frequency = float(np.median(np.abs(jams[0].speed))), natural(problem.scene)[0]
     names = [number.name for number in problem.unknowns.numbers]
     own = [k for k in positive_places(problem) if "stiffness" in names[k] and problem.precisions[k] == 0.0]
@@ -132,7 +132,7 @@ def _stiffnesses_of_jam(problem: Problem, jams: Sequence[_Jam]) -> np.ndarray | 
 
 
 def _first_fit(problem: Problem, jams: Sequence[_Jam], x: np.ndarray) -> tuple[_Trial, np.ndarray]:
-    """Return the motion of all runs that is found from the values x, and the information of `load_spread_of`."""
+    """Return the motion of all runs that results from the first values x, and the information of `load_spread_of`."""
     x, linear = x.copy(), np.zeros(unknown_count(problem) - problem.unknowns.count)
     starts, pairs = [], []
     for r, (jam, place) in enumerate(zip(jams, linear_places(problem), strict=True)):

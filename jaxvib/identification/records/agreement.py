@@ -23,7 +23,7 @@ _DERIVATIVES = {"displacement": 0, "velocity": 1, "acceleration": 2}
 """Number of derivatives of the displacement in a kind of motion."""
 
 ROTOR_KINDS = ("pulses", "angle", "speed")
-"""Kinds of channels that measure the rotor's rotation, the most exact first."""
+"""Kinds of channels that measure the rotor's rotation, the most accurate one first."""
 
 _OTHER_UNITS = {
     "displacement": ("m", "mm", "um", "mil"),
@@ -109,7 +109,7 @@ def _compare_speeds(reference_signal: _Signal, other: _Signal, source: str) -> l
     where, name = f"{source}: channel {quoted(other.channel.name)}", quoted(reference_signal.channel.name)
     if abs(abs(ratio) - 1.0) <= _SPEED_ERROR:
         if ratio < 0.0 and other.channel.kind != "speed":
-            raise InputError(where, f"turns against {name}; reverse the sign of one of them")
+            raise InputError(where, f"turns in the opposite direction to {name}; reverse the sign of one of them")
         pair = f"{name} and {quoted(other.channel.name)}"
         return _drift(time, reference, np.sign(ratio) * speed, f"{source}: the clocks of {pair}")
     if other.channel.kind == "speed":

@@ -2,7 +2,7 @@
 
 Above the frequencies of the machine, a record contains only noise and other vibrations. The filter removes this part from
 records whose sampling rate is much higher than the frequencies of the machine. The filter is symmetric in time. Its gain is 1
-up to 0.3 times the new rate and 0 from 0.7 times the new rate, both to 1e-5. Aliases lie above 0.3 times the new rate, and
+up to 0.3 times the new rate and 0 from 0.7 times the new rate, both to 2e-5. Aliases lie above 0.3 times the new rate, and
 white noise remains nearly white.
 
 Outliers and missing readings are replaced by values of the filtered signal, and the readings are filtered again. The remaining
@@ -80,7 +80,7 @@ def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
         times=run.times | dict.fromkeys(names, time),
         values=values,
         clipped=run.clipped | dict.fromkeys(names, np.zeros(time.size, bool)),
-        notes=(*run.notes, f"{note}; {replaced} readings far from the filtered ones were left out" if replaced else note),
+        notes=(*run.notes, f"{note}; {replaced} readings far from the filtered ones were replaced" if replaced else note),
     )
 
 

@@ -46,7 +46,9 @@ def recorded_from_sep005(timeseries: Sequence[Mapping[str, Any]], source: str) -
             else:
                 raise ValueError(rate)
         except (TypeError, ValueError) as error:
-            raise InputError(where, "has data, fs or time that are not numbers; fs must be greater than 0") from error
+            raise InputError(
+                where, "has values of data, fs or time that are not numbers, or an fs that is not greater than 0; correct them"
+            ) from error
         channels.append(Recorded(str(entry["name"]), str(entry["unit_str"]), time, values))
     return channels
 

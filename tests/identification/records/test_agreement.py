@@ -96,7 +96,7 @@ def test_speeds_of_different_rotors_are_refused():
 
 
 def test_angle_that_turns_against_pulses_is_refused():
-    with pytest.raises(jv.InputError, match=r"turns against 'phi'|turns against 'tacho'"):
+    with pytest.raises(jv.InputError, match=r"turns in the opposite direction to '(phi|tacho)'"):
         run(TACHO, (jv.Channel("phi", "angle"), -ANGLE))
 
 

@@ -32,7 +32,7 @@ def test_times_of_dictionaries():
         ({"name": None, "fs": None}, r"run: timeseries\[1\] has no entry 'name'"),
         ({"unit_str": None}, r"has no entry 'unit_str'"),
         ({"fs": None}, r"has no entry 'fs'"),
-        ({"fs": 0.0}, r"run: timeseries\[1\] has data, fs or time that are not numbers; fs must be greater than 0"),
+        ({"fs": 0.0}, r"run: timeseries\[1\] has values of data, fs or time that are not numbers, or an fs that is not"),
         ({"data": ["a"]}, r"has data, fs or time that are not numbers"),
         ({"time": ["a"]}, r"has data, fs or time that are not numbers"),
     ],
