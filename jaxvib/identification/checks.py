@@ -251,7 +251,7 @@ class Disagreement(NamedTuple):
     """Deviation of a run from other runs.
 
     **Attributes**: `chance` of a deviation as large as this one if the machine is the same; `name` of the number whose change
-    explains most of the deviation, this relative `change` and its standard `error`.
+    explains most of the deviation; `change` of this number, relative (of an angle: in rad), and its standard `error`.
     """
 
     chance: float
@@ -261,8 +261,9 @@ class Disagreement(NamedTuple):
 
     def sentence(self, run: str) -> str:
         """Return the deviation of a run as a sentence."""
+        kind = "change" if "(rad)" in self.name else "relative change"
         return (
-            f"{run} deviates from the others by more than their errors (chance {self.chance:.1g}); a change of {self.name} by "
+            f"{run} deviates from the others by more than their errors (chance {self.chance:.1g}); a {kind} of {self.name} by "
             f"{self.change:+.3g} +- {1.96 * self.error:.1g} explains most of it"
         )
 

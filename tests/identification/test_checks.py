@@ -72,7 +72,9 @@ def test_disagreement_is_a_ratio_of_likelihoods():
     shared = np.diagonal(a @ np.linalg.inv(a + b) @ b)
     assert found.name == "mass"
     assert found.change == pytest.approx(gradient[0] / shared[0]) and found.error == pytest.approx(shared[0] ** -0.5)
-    text = f"run 2 deviates from the others by more than their errors (chance {found.chance:.1g}); a change of mass by "
+    text = (
+        f"run 2 deviates from the others by more than their errors (chance {found.chance:.1g}); a relative change of mass by "
+    )
     assert found.sentence("run 2") == text + f"{found.change:+.3g} +- {1.96 * found.error:.1g} explains most of it"
 
 

@@ -160,7 +160,7 @@ def test_further_run_of_the_same_machine_is_predicted():
 def test_run_of_another_machine_contradicts_the_fit():
     found = jv.predict_run(fitted(), run_of(5, **{"machine__stiffness[0]": 5.1e4}))
     assert found.status_name == "contradicted"
-    assert any("a change of machine.stiffness[0] by +0.0" in note for note in found.notes), found.notes
+    assert any("a relative change of machine.stiffness[0] by +0.0" in note for note in found.notes), found.notes
     assert "contradicts the fit" in found.summary() and len(found.plot().axes) == 2
 
 

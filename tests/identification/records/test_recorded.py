@@ -33,8 +33,8 @@ def test_times_of_dictionaries():
         ({"unit_str": None}, r"has no entry 'unit_str'"),
         ({"fs": None}, r"has no entry 'fs'"),
         ({"fs": 0.0}, r"run: timeseries\[1\] has values of data, fs or time that are not numbers, or an fs that is not"),
-        ({"data": ["a"]}, r"has data, fs or time that are not numbers"),
-        ({"time": ["a"]}, r"has data, fs or time that are not numbers"),
+        ({"data": ["a"]}, r"has values of data, fs or time that are not numbers"),
+        ({"time": ["a"]}, r"has values of data, fs or time that are not numbers"),
     ],
 )
 def test_wrong_dictionaries_are_refused(change, says):
