@@ -102,15 +102,15 @@ def test_groups_have_the_rates_of_single_exciters(name, monkeypatch):
     close(found, jax.jit(lambda y: rate(scene, y))(state))
 
 
-def test_fences_reduce_the_sines_of_a_group():
-    """Compiled operations of the equations of eight motors; without fences XLA repeats the sines for each use."""
-    scene = jv.Scene(BODY, exciters=motors(8))
+def test_fences_reduce_the_operations_of_a_group():
+    """Without fences XLA computes sines (jax 0.10) or other values (jax 0.12) again for each use."""
+    scene = jv.Scene(BODY, exciters=motors(32))
     state, field = state_of(scene), jv.vector_field(scene)
 
-    def sines(field):
-        return jax.jit(lambda y: field(jnp.asarray(0.3), y)).lower(state).compile().as_text().count(" sine(")
+    def operations(field):
+        return jax.jit(lambda y: field(jnp.asarray(0.3), y)).lower(state).compile().cost_analysis()["flops"]
 
-    assert field.has_fences and sines(field) < sines(dataclasses.replace(field, has_fences=False))
+    assert field.has_fences and operations(field) < 0.7 * operations(dataclasses.replace(field, has_fences=False))
 
 
 @pytest.mark.parametrize("derivative", [False, True])
