@@ -93,7 +93,7 @@ def _(controls, current, pictures, scene, scene_at):
 @app.cell
 def _(machine, mode, pictures, scene):
     # All pictures are computed before any is sent, because a browser that draws one would slow down the next computation.
-    chart = pictures.image(lambda: pictures.diagram(machine.value, 4.0 / 3.0 * float(scene.drive.speed)), machine)
+    chart = pictures.image(lambda: pictures.diagram(machine.value, 4.0 / 3.0 * float(scene.top_speed)), machine)
     numbers = pictures.text(lambda: pictures.readings(machine.value), machine)
     film = pictures.image(lambda: pictures.machine(machine.value, mode.value), machine)
     return chart, film, numbers
@@ -134,7 +134,7 @@ def _(film, mo):
 
 @app.cell
 def _(mo, pictures, scene):
-    mo.md(pictures.heading(scene) + "\n\n" + pictures.ABOUT)
+    mo.md(pictures.about(scene))
     return
 
 

@@ -35,10 +35,11 @@ _GRID = {"color": "#e2e2e2", "lw": 0.6, "zorder": 0.5}
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """Chart over the rotor speed.
+    """Chart over a speed.
 
     **Attributes**: `left`: position of its left end, in units of the drawing; `title` above it; `x` and `y`: limits of its
-    axes; `log`: True for a logarithmic vertical axis; `wide`: its width, in units of the drawing.
+    axes; `log`: True for a logarithmic vertical axis; `wide`: its width, in units of the drawing; `below`: title of the
+    horizontal axis.
     """
 
     left: float
@@ -47,6 +48,7 @@ class Panel:
     y: tuple[float, float]
     log: bool = False
     wide: float = WIDE
+    below: str = "rotor speed, rpm"
 
     def place(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the positions of points in the drawing."""
@@ -79,7 +81,7 @@ class Panel:
         small = {"fontsize": "small"}
         across = [Text(self.at(x, self.y[0])[0], -0.18, text, {**small, "ha": "center"}) for x, text in self._x_ticks()]
         up = [Text(self.left - 0.08, self.at(self.x[0], y)[1], text, {**small, "ha": "right"}) for y, text in self._y_ticks()]
-        below = Text(self.left + 0.5 * self.wide, -0.46, "rotor speed, rpm", {**small, "ha": "center"})
+        below = Text(self.left + 0.5 * self.wide, -0.46, self.below, {**small, "ha": "center"})
         return [*across, *up, below, Text(self.left - FIRST + 0.05, TALL + 0.22, self.title, small)]
 
     def _x_ticks(self) -> list[tuple[float, str]]:

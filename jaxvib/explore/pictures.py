@@ -22,14 +22,17 @@ from jaxvib.steady.branches import branches
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.whirl import critical_speeds, whirl
 
-ABOUT = """The sliders of masses, springs, dampers, radii and drags range from a tenth to ten times the value in the file. The
-arrow keys move a slider by one step; the field above the sliders sets one to a number. Each number of loads needs its own
-compiled program. The programs for the seven numbers next to the number in the file are compiled while the page is open; any
-other takes one or two seconds the first time and is then stored.
+_ABOUT_SLIDERS = """The sliders of masses, springs, dampers, radii, drags, unbalances and torques range from a tenth to ten
+times the value in the file. The arrow keys move a slider by one step; the field above the sliders sets one to a number."""
+
+_ABOUT_LOADS = """Each number of loads needs its own compiled program. The programs for the seven numbers next to the number
+in the file are compiled while the page is open; any other takes one or two seconds the first time and is then stored.
 
 Amplitudes and forces are zero to peak. The page shows the theory of light loads. For exact results, save the machine and run
 `jaxvib simulate` or `jaxvib modes --exact`."""
-"""Text below the sliders, as Markdown."""
+
+_ABOUT_UNBALANCES = """Amplitudes and forces are zero to peak. The page shows motions averaged over a turn. For exact results,
+save the machine and run `jaxvib simulate`; `jaxvib run-up` computes the motion from rest."""
 
 _CAMPBELL_SPEEDS = 81
 """Number of rotor speeds of a Campbell diagram."""
@@ -112,7 +115,7 @@ def prepare_counts(scene: Scene) -> None:
 
 
 def _draw_all(scene: Scene) -> None:
-    max_speed = 4.0 / 3.0 * float(scene.drive.speed)
+    max_speed = 4.0 / 3.0 * float(scene.top_speed)
     drawn = SceneOrProblem(scene, "")
     image(lambda: diagram(scene, max_speed), drawn)
     text(lambda: readings(scene), drawn)
@@ -120,13 +123,26 @@ def _draw_all(scene: Scene) -> None:
 
 
 def has_branches(scene: Scene) -> bool:
-    """Return True if the jams of the scene form branches over the rotor speed, that is, if the machine moves only up and
-    down."""
-    return scene.mounting.axes == (1,)
+    """Return True if the jams of the scene form branches over the rotor speed, that is, if it has one exciter with loads on a
+    machine that moves only up and down."""
+    return scene.is_plain and scene.mounting.axes == (1,)
+
+
+def about(scene: Scene) -> str:
+    """Return the text below the pictures, as Markdown."""
+    theory = _ABOUT_LOADS if scene.is_plain else _ABOUT_UNBALANCES
+    return f"{heading(scene)}\n\n{_ABOUT_SLIDERS} {theory}"
 
 
 def heading(scene: Scene) -> str:
-    """Return the heading of `diagram` for this scene, with a reference to other results."""
+    """Return the description of `diagram` for this scene, with a reference to other results."""
+    if not scene.is_plain:
+        return (
+            "Working regime: the stable synchronous regime at the speed of the motors. Its rotor speed and amplitudes, and the "
+            "phases of the exciters (of one exciter the foundation force), over the speed of the motors without load, which "
+            "all change by one factor. A line has a gap where no synchronous regime is stable. The sketch shows the first "
+            "regime of the list; ellipses are the paths of points of the body."
+        )
     if has_branches(scene):
         return (
             "Jams of light loads: load speed, amplitudes and foundation force over the rotor speed. Solid lines: stable by "
@@ -141,8 +157,8 @@ def heading(scene: Scene) -> str:
 
 
 def diagram(scene: Scene, max_speed: float) -> str:
-    """Draw the branch diagram, with amplitudes and force, of a machine that moves up and down, or the Campbell diagram of a
-    rotor.
+    """Draw the branch diagram, with amplitudes and force, of a machine that moves up and down, the Campbell diagram of a rotor,
+    or the working regime of exciters with unbalances over the speed of their motors.
 
     **Arguments**: `max_speed`: the highest rotor speed in the diagram, rad/s; the diagram always reaches at least 1.15 times
     the rotor speed of the scene.
@@ -157,17 +173,24 @@ def diagram(scene: Scene, max_speed: float) -> str:
     """
     from jaxvib.explore.campbell import campbell  # slow import
     from jaxvib.explore.chart import chart
+    from jaxvib.explore.regimes import regime_chart
 
-    speed = float(scene.drive.speed)
+    speed = float(scene.top_speed)
     max_speed = max(max_speed, 1.15 * speed)
+    if not scene.is_plain:
+        return regime_chart(scene, max_speed)
     if has_branches(scene):
         return chart(jax.device_get(branches(scene, most=max_speed)), max_speed)
     return campbell(jax.device_get(whirl(scene, np.linspace(0.0, max_speed, _CAMPBELL_SPEEDS))), speed)
 
 
 def readings(scene: Scene) -> str:
-    """Return the jams at the rotor speed, or the critical speeds of a rotor, as text. **Raises** `InputError` like
-    `diagram`."""
+    """Return the jams at the rotor speed, the critical speeds of a rotor, or the regimes of exciters with unbalances, as text.
+    **Raises** `InputError` like `diagram`."""
+    from jaxvib.explore.regimes import regime_readings  # slow import
+
+    if not scene.is_plain:
+        return regime_readings(scene)
     return jax.device_get(jam_modes(scene) if has_branches(scene) else critical_speeds(scene)).summary()
 
 
@@ -189,7 +212,11 @@ def modes_of(scene: Scene) -> list[int]:
 
 
 def machine(scene: Scene, mode: int | None) -> str:
-    """Return the machine as an SVG picture, moving in the jam mode with that number, or at rest if `mode` is None."""
-    from jaxvib.show.moving import moving_svg, sketch_svg  # slow import
+    """Return the machine as an SVG picture: moving in the jam mode with that number; if `mode` is None, moving in the first
+    regime of its exciters with unbalances, or at rest if there is none."""
+    from jaxvib.explore.regimes import deck_points, regimes_of
+    from jaxvib.show.moving import moving_svg, regime_svg, sketch_svg  # slow import
 
+    if not scene.is_plain and (regimes := regimes_of(scene)):
+        return regime_svg(scene, regimes[0], deck_points(scene))
     return sketch_svg(scene) if mode is None else moving_svg(scene, jax.device_get(jam_modes(scene)).select(mode))

@@ -13,7 +13,7 @@ import numpy as np
 from jaxvib.display import shown_unit
 from jaxvib.errors import InputError
 from jaxvib.machine.files import rebuild_part
-from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers
+from jaxvib.machine.numbers.named import NamedNumber, numbers_of, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.units.reading import to_float
 
@@ -24,24 +24,34 @@ _LOAD_NUMBERS = ("loads.mass", "loads.radius", "loads.drag")
 _MACHINE_NUMBERS = ("machine.mass", "machine.stiffness", "machine.link_stiffness", "machine.damping", "machine.link_damping")
 """Numbers of loads and of a machine that have sliders."""
 
+_MACHINE_FIELDS = ("stiffness", "link_stiffness", "angle", "mass", "inertia", "damping", "link_damping")
+"""Fields of a machine, or of its supports and bodies, that have sliders if its exciters have unbalances."""
+
+_HALF_TURN = 180
+"""Half the range of the slider of an angle, in degrees, which are also its steps."""
+
 _MAX_SINGLE_SLIDERS = 15
 """Maximum number of sliders for single parameters of a machine. A machine with more parameters has one slider for all of a
 field, such as all stiffnesses."""
 
 _VALUE_FACTORS = tuple(np.geomspace(0.1, 10.0, 81).tolist())
 _SPEED_FACTORS = tuple((np.arange(1, 301) / 100.0).tolist())
+_SHIFT_STEPS = 80
+"""Number of steps of a position to each side."""
 
 
 class Slider(NamedTuple):
     """Slider for a parameter of a scene.
 
-    The parameter is multiplied by value / `start`; at `start` it therefore keeps exactly its value.
+    The parameter is multiplied by value / `start`. A position or an angle is shifted by value - `start` instead. At `start` it
+    therefore keeps exactly its value.
 
     **Attributes**
 
     - `name` in the scene; `label`, the name shown to the user; `unit` on the slider
     - `steps`: ascending values of the slider; `start`: the value in the scene, which is one of the `steps`
     - `number`: the parameter; None for the number of loads
+    - `shift`: shift of the parameter, SI, for a change of the slider by 1; None for a parameter that is multiplied
     """
 
     name: str
@@ -50,6 +60,7 @@ class Slider(NamedTuple):
     steps: tuple[float, ...]
     start: float
     number: NamedNumber | None
+    shift: float | None = None
 
     @property
     def title(self) -> str:
@@ -58,15 +69,18 @@ class Slider(NamedTuple):
 
 
 def sliders_of(scene: Scene) -> list[Slider]:
-    """Return the sliders of a scene; the sliders of the drive and the loads come first.
+    """Return the sliders of a scene; the sliders of the drives and the loads come first.
 
-    - masses, springs and dampers of the machine, masses, radii and drags of the loads: a tenth to ten times the scene's values
-    - rotor speed: a hundredth to three times the scene's value
+    - masses, springs and dampers of the machine, masses, radii and drags of the loads, unbalances of exciters and torques of
+      their motors: a tenth to ten times the scene's values
+    - speeds of drives: a hundredth to three times the scene's value
+    - positions of exciters with an unbalance, and angles of supports, in a range around the scene's value
     - number of loads, if all loads have equal parameters
 
     A parameter that is 0 has no slider, because a factor does not change it.
 
-    **Raises** `InputError` for a scene with several exciters, with an unbalance, or with a clockwise rotor.
+    **Raises** `InputError` for a scene with several exciters or a clockwise rotor if an exciter has loads, and for an exciter
+    with both loads and an unbalance.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),
@@ -76,21 +90,50 @@ def sliders_of(scene: Scene) -> list[Slider]:
     >>> sliders_of(scene)[-2].title, sliders_of(scene)[-2].start
     ('stiffness of the support, N/mm', 40.0)
     """
-    if not scene.is_plain:
-        raise InputError(
-            "scene",
-            "has several exciters, an unbalance or a clockwise rotor; the explorer shows machines with one anticlockwise "
-            "exciter that has loads (balls, rollers or pendulums); for others use jaxvib regimes, response, run-up or simulate",
-        )
-    sliders = [_slider(scene, find_number(scene, "drive.speed", "slider"), _SPEED_FACTORS)]
-    if _has_equal_loads(scene):
-        counts = tuple(range(1, min(256, max(8, 2 * scene.loads.count)) + 1))
-        sliders.append(Slider(COUNT, "number of loads", "", counts, scene.loads.count, None))
-    numbers = [find_number(scene, name, "slider") for name in _LOAD_NUMBERS if _is_adjustable(scene, name)]
-    arrays = [find_number(scene, name, "slider") for name in _MACHINE_NUMBERS if _is_adjustable(scene, name)]
-    single = [entry for array in arrays for entry in array.single(scene) if np.any(entry.read(scene))]
+    named = numbers_of(scene)
+    if scene.is_plain:
+        sliders = [_slider(scene, named["drive.speed"], _SPEED_FACTORS)]
+        if _has_equal_loads(scene):
+            counts = tuple(range(1, min(256, max(8, 2 * scene.loads.count)) + 1))
+            sliders.append(Slider(COUNT, "number of loads", "", counts, scene.loads.count, None))
+        numbers = [named[name] for name in _LOAD_NUMBERS if _is_adjustable(scene, name)]
+        arrays = [named[name] for name in _MACHINE_NUMBERS if _is_adjustable(scene, name)]
+    else:
+        _require_unbalances(scene)
+        sliders, numbers = _exciter_sliders(scene, named), []
+        in_machine = [each for each in named.values() if each.path[0] == "machine"]
+        arrays = [each for field in _MACHINE_FIELDS for each in in_machine if field in each.path]
+        arrays = [each for each in arrays if _is_shifted(each) or np.any(each.read(scene))]
+    single = [entry for array in arrays for entry in array.single(scene) if _is_shifted(entry) or np.any(entry.read(scene))]
     numbers += single if len(single) <= _MAX_SINGLE_SLIDERS else arrays
     return sliders + [_slider(scene, number, _VALUE_FACTORS) for number in numbers]
+
+
+def _require_unbalances(scene: Scene) -> None:
+    """**Raises** `InputError` for a scene whose exciters have loads but which is not plain."""
+    for k, exciter in enumerate(scene.exciters):
+        if exciter.loads is not None:
+            problem = (
+                "are given in a scene with several exciters, with an unbalance on the same rotor, or with a clockwise rotor"
+            )
+            advice = "the explorer shows one anticlockwise exciter with loads, or exciters with unbalances alone"
+            raise InputError(f"{scene.prefix_of(k)}loads", f"{problem}; {advice}; use jaxvib regimes or jaxvib simulate")
+
+
+def _exciter_sliders(scene: Scene, named: Mapping[str, NamedNumber]) -> list[Slider]:
+    """Return the sliders of exciters with unbalances: speeds of the drives, unbalances, positions, torques of the motors."""
+    reach = max([0.1, *(float(np.max(np.abs(e.position))) for e in scene.exciters if e.position is not None)])
+    sliders = []
+    for k in range(len(scene.exciters)):
+        of_exciter = [each for each in named.values() if each.path[:2] == ("exciters", k)]
+        speed = [each for each in of_exciter if each.path[2:] == ("drive", "speed")]
+        others = [each for each in of_exciter if each.path[2:] in (("unbalance",), ("position",))]
+        torques = [each for each in of_exciter if each.path[2] == "drive" and each.spec.unit == "N m"]
+        sliders += [_slider(scene, each, _SPEED_FACTORS) for each in speed]
+        for entry in (entry for each in (*others, *torques) for entry in each.single(scene)):
+            if _is_shifted(entry) or np.any(entry.read(scene)):
+                sliders.append(_slider(scene, entry, _VALUE_FACTORS, reach))
+    return sliders
 
 
 def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
@@ -106,7 +149,7 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
     (80000.0, 3)
     """
     sliders = {slider.name: slider for slider in sliders_of(scene)}
-    loads = scene.loads
+    count = None
     for name, value in values.items():
         if name not in sliders:
             raise InputError(name, f"is not a slider of this scene; the sliders are: {', '.join(sliders)}")
@@ -114,13 +157,14 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
         if value == slider.start:
             continue
         if slider.number is None:
-            loads = dataclasses.replace(loads, count=int(value))
+            count = int(value)
         else:
-            scene = put_numbers(scene, (slider.number,), slider.number.read(scene) * (value / slider.start))
-    if loads.count == scene.loads.count:
+            old = slider.number.read(scene)
+            new = old * (value / slider.start) if slider.shift is None else old + slider.shift * (value - slider.start)
+            scene = put_numbers(scene, (slider.number,), new)
+    if count is None:
         return scene
-    changed = dataclasses.replace(scene.loads, count=loads.count)
-    return scene.replace(loads=rebuild_part(changed, "loads"))
+    return scene.replace(loads=rebuild_part(dataclasses.replace(scene.loads, count=count), "loads"))
 
 
 def typed_value(scene: Scene, slider: Slider, text: str) -> float:
@@ -142,7 +186,8 @@ def typed_value(scene: Scene, slider: Slider, text: str) -> float:
         unit = slider.number.unit if slider.number is not None and slider.unit else ""
         value = float(np.asarray(to_float(text, unit, slider.label)))
         if unit and slider.number is not None:
-            value = float(f"{value * slider.start / float(slider.number.read(scene)[0]):.12g}")
+            scale = slider.start / float(slider.number.read(scene)[0]) if slider.shift is None else 1.0 / slider.shift
+            value = float(f"{value * scale:.12g}")
     low, high = slider.steps[0], slider.steps[-1]
     if not low <= value <= high:
         unit = f" {slider.unit}" if slider.unit else ""
@@ -166,15 +211,28 @@ def _has_equal_loads(scene: Scene) -> bool:
     return scene.mounting.at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
 
 
-def _slider(scene: Scene, number: NamedNumber, factors: tuple[float, ...]) -> Slider:
+def _is_shifted(number: NamedNumber) -> bool:
+    """Return True for a single parameter that may be negative: a position or an angle."""
+    return number.size == 1 and number.unit in ("m", "rad") and number.spec.bounds.low < 0.0
+
+
+def _slider(scene: Scene, number: NamedNumber, factors: tuple[float, ...], reach: float = 0.0) -> Slider:
+    """Return the slider of a parameter: its value times the `factors`, or from -`reach` to +`reach` around the value."""
     values = np.asarray(number.read(scene))
     if number.size > 1:
         part, _, field = number.name.partition(".")
         steps = tuple(float(f"{f:.3g}") for f in factors)
         return Slider(number.name, f"{field.replace('_', ' ')} of the {part}, common factor", "", steps, 1.0, number)
-    unit, scale = shown_unit(number.unit, float(values[0]))
-    start = float(f"{scale * values[0]:.6g}")
-    return Slider(number.name, number.words(scene)[0], unit, _steps(start, factors), start, number)
+    label = number.words(scene)[0]
+    if not _is_shifted(number):
+        unit, scale = shown_unit(number.unit, float(values[0]))
+        start = float(f"{scale * values[0]:.6g}")
+        return Slider(number.name, label, unit, _steps(start, factors), start, number)
+    unit, scale = shown_unit(number.unit, 1e-3)
+    start, count = float(f"{scale * values[0]:.6g}"), _HALF_TURN if number.unit == "rad" else _SHIFT_STEPS
+    step = float(f"{scale * (np.pi if number.unit == 'rad' else reach) / count:.2g}")
+    steps = tuple(float(f"{start + step * k:.6g}") for k in range(-count, count + 1))
+    return Slider(number.name, label, unit, steps, start, number, 1.0 / scale)
 
 
 @functools.lru_cache(maxsize=256)

@@ -1,23 +1,37 @@
-"""SVG pictures of a machine: at rest, or moving in a jam of light loads."""
+"""SVG pictures of a machine: at rest, or moving in a jam of light loads or in a synchronous regime."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from jaxvib.display import speed_text
+from jaxvib.draw.machine.deck import ellipses as draw_ellipses
+from jaxvib.draw.machine.parts import Part, circle
 from jaxvib.draw.machine.svg import svg
+from jaxvib.draw.style import COLORS, Look
 from jaxvib.errors import ComputationError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.sketch import drawable_scene
-from jaxvib.show.view import ARROWS_NOTE
+from jaxvib.show.view import ARROWS_NOTE, View
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose, RotorPose, at_rest, caption, places_of
 from jaxvib.steady.jams.jam import Jam
+from jaxvib.steady.regimes.synchronous import SynchronousRegime
 
 _FRAMES_PER_PERIOD = 20
 """Number of frames in a period. Browsers interpolate linearly between them; circular paths are accurate to about 1 %."""
 
 _PERIOD_SECONDS = 1.6
 """Duration of a period of the vibration in the picture, s."""
+
+_THETA = 2.0 * np.pi * np.arange(_FRAMES_PER_PERIOD) / _FRAMES_PER_PERIOD
+"""Phase of each frame, rad."""
+
+_PATH: Look = {"color": COLORS[1], "lw": 1.4, "zorder": 4.0}
+_POINT: Look = {"fc": COLORS[1], "ec": "none", "zorder": 4.1}
+"""Styles of the path of a point, and of the point."""
 
 
 def moving_svg(scene: Scene, jam: Jam) -> str:
@@ -38,35 +52,82 @@ def moving_svg(scene: Scene, jam: Jam) -> str:
     True
     """
     view = view_of(drawable_scene(scene))
-    omega, amplitude = float(jam.omega), np.asarray(jam.displacement)
-    if not np.isfinite(omega) or not np.isfinite(amplitude).all():
+    if not np.isfinite(jam.omega) or not np.isfinite(jam.displacement).all():
         raise ComputationError("absent", f"jam mode {int(jam.mode)} cannot be shown:  {jam.message}")
-    theta = 2.0 * np.pi * np.arange(_FRAMES_PER_PERIOD) / _FRAMES_PER_PERIOD
     first, *others = (np.asarray(u, float) for u in scene.loads.rest())
-    wave = np.exp(1j * theta)[:, None] * amplitude
-    displacement, velocity = np.real(wave), np.real(1j * omega * wave)
-    angles = theta[:, None] + np.zeros_like(first)
+    angles = _THETA[:, None] + np.zeros_like(first)
     load_positions = places_of(scene.loads, (angles, *others))  # one call for all poses
-    poses = [
-        Pose(q, v, (RotorPose((angle, *others), 0.0, [x[k] if x.ndim > 1 else x for x in load_positions]),))
-        for k, (q, v, angle) in enumerate(zip(displacement, velocity, angles, strict=True))
+    rotors = [
+        (RotorPose((angle, *others), 0.0, [x[k] if x.ndim > 1 else x for x in load_positions]),)
+        for k, angle in enumerate(angles)
     ]
+    words = f"jam mode {int(jam.mode)}, {jam.judgement}"
+    return _moving(view, words, float(jam.omega), np.asarray(jam.displacement), rotors, float(jam.rotor_speed / jam.omega))
+
+
+def regime_svg(scene: Scene, regime: SynchronousRegime, points: Sequence[tuple[float, float]] = ()) -> str:
+    """Return the sketch of a scene that moves in a synchronous regime of its unbalances, with the forces on the foundation as
+    arrows, and with the ellipses on which points of the body move.
+
+    **Arguments**: `scene`, whose exciters have unbalances and no loads; a `regime` of it; `points` (x, y) of a body in a plane,
+    m.
+
+    **Returns** the text of an SVG file, which repeats one period endlessly. **Raises** `InputError` for a machine that cannot
+    be drawn.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> from jaxvib.machine.files import SCREENS
+    >>> scene = jv.scene_from_toml(SCREENS["circular_screen"])
+    >>> regime_svg(scene, jv.working_regime(scene), [(0.0, 0.0)]).count("<animate") > 10
+    True
+    """
+    view = view_of(drawable_scene(scene))
+    turns = [exciter.direction * float(phase) for exciter, phase in zip(scene.exciters, regime.phases, strict=True)]
+    rotors = [tuple(RotorPose((), turn) for turn in turns)] * _FRAMES_PER_PERIOD
+    words = f"{'stable' if bool(regime.stable) else 'unstable'} regime, {speed_text(regime.speed)}"
+    decks = [regime.deck(points)] if points else []
+    ellipses = [(np.asarray(deck.points), np.asarray(deck.amplitude)) for deck in decks]
+    return _moving(view, words, float(regime.speed), np.asarray(regime.displacement), rotors, 1.0, ellipses)
+
+
+def _moving(
+    view: View,
+    words: str,
+    omega: float,
+    amplitude: np.ndarray,
+    rotors: Sequence[tuple[RotorPose, ...]],
+    turns: float,
+    ellipses: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+) -> str:
+    """Return the drawing of one period of the motion Re(amplitude exp(i omega t)).
+
+    **Arguments**: `words`: description of the motion; `rotors`: the rotors in each frame; `turns` of the rotors in a period;
+    `ellipses`: points (n, 2), m, with their complex amplitudes (n, 2), m, whose paths are drawn.
+    """
+    wave = np.exp(1j * _THETA)[:, None] * amplitude
+    displacement, velocity = np.real(wave), np.real(1j * omega * wave)
+    poses = [Pose(*each) for each in zip(displacement, velocity, rotors, strict=True)]
+    totals = displacement @ view.foundation_stiffness.T + velocity @ view.foundation_damping.T
     forces = [view.support_forces(pose) for pose in poses]
-    totals = [np.array([force[:, 1].sum()]) for force in forces]
     largest_force = max(float(np.max(np.abs(np.concatenate([np.ravel(x) for x in (*forces, *totals)])))), 1e-300)
     magnified = view.magnified(displacement)
     reach = magnified * view.scale
     frames = [
-        [*view.parts(p, reach), *view.arrows(p, total, 0.7 / largest_force)] for p, total in zip(poses, totals, strict=True)
+        [*view.parts(pose, reach), *view.arrows(pose, total, 0.7 / largest_force)]
+        for pose, total in zip(poses, totals, strict=True)
     ]
+    for points, amplitudes in ellipses:
+        paths = [Part(view.scale * path, _PATH) for path in draw_ellipses(points, amplitudes, magnified)]
+        for frame, turn in zip(frames, np.exp(1j * _THETA), strict=True):
+            places = view.scale * points + reach * np.real(turn * amplitudes)
+            frame += [*paths, *(Part(circle(tuple(at.tolist()), 0.06, 13), _POINT, True) for at in places)]
     slower = _PERIOD_SECONDS * omega / (2.0 * np.pi)
     head = (
-        f"{caption(scene)}\njam mode {int(jam.mode)}, {jam.judgement}: slowed down {slower:.3g} x, displacements drawn "
-        f"{magnified:.3g} x as large\n{ARROWS_NOTE}, longest {largest_force:.4g} N"
+        f"{caption(view.scene)}\n{words}: slowed down {slower:.3g} x, displacements drawn {magnified:.3g} x as large\n"
+        f"{ARROWS_NOTE}, longest {largest_force:.4g} N"
     )
-    return svg(
-        view.limits, frames, [view.texts(pose, reach) for pose in poses], head, _PERIOD_SECONDS, float(jam.rotor_speed) / omega
-    )
+    return svg(view.limits, frames, [view.texts(pose, reach) for pose in poses], head, _PERIOD_SECONDS, turns)
 
 
 def sketch_svg(scene: Scene) -> str:

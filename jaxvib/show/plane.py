@@ -68,10 +68,13 @@ class PlaneView(View):
         )
         outline = _hull(np.concatenate([circle(tuple(at), r, 41) for at, r in zip(self.scale * points, radii, strict=True)]))
         points_of_body = [*(outline / self.scale), *self._supports, *self._axes, np.zeros(2)]
-        # Displacement of each point for each coordinate of the body (points, 2, 3).
-        self._point_rows = np.stack([np.asarray(machine.rows_at(jnp.asarray(at))) for at in points_of_body])
         self._rest_points, self._corner_count = np.asarray(points_of_body), len(outline)
-        self._mass_text_at = 0.5 * float(np.min(outline[:, 0]) + np.max(outline[:, 0])), float(np.min(outline[:, 1])) - 0.12
+        # Displacement of each point for each coordinate of the body (points, 2, 3), a linear function of the point. A call for
+        # each point would take most of the time of a drawing.
+        centre, *ends = (np.asarray(machine.rows_at(jnp.asarray(at))) for at in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+        self._point_rows = centre + np.tensordot(self._rest_points, np.stack(ends) - centre, axes=1)
+        low, high = np.min(outline, axis=0), np.max(outline, axis=0)
+        self._mass_text_at = np.array([0.5 * (low[0] + high[0]), low[1] - 0.12])
         self.limits = self._limits(outline)
 
     def _struts(self, k: int, points: np.ndarray) -> list[_Strut]:
@@ -124,7 +127,8 @@ class PlaneView(View):
         mass, inertia = float(self.mass[0, 0]), float(self.mass[2, 2])
         words = f"M = {value_text(mass, 'kg')}, J = {value_text(inertia, 'kg m²')}"
         bottom = self.limits[2]
-        texts = [Text(*self._mass_text_at, words, {**small, "ha": "center", "va": "top"})]
+        x, y = self._mass_text_at + reach * self._point_rows[-1] @ pose.displacement  # the text moves with the centre of mass
+        texts = [Text(float(x), float(y), words, {**small, "ha": "center", "va": "top"})]
         struts_of_support: dict[int, list[_Strut]] = {}
         for strut in self.struts:
             struts_of_support.setdefault(strut.support, []).append(strut)

@@ -168,14 +168,14 @@ class Wheel:
         for turn in (pose.turn, pose.turn + 0.5 * np.pi):
             e = np.array([np.cos(turn), np.sin(turn)])
             look = {"color": "#9a9a9a", "lw": 1.0, "zorder": 3.2}
-            parts.append(Part(np.array([centre - self.rim * e, centre + self.rim * e]), look, axis=centre))
+            spoke = np.array([centre - self.rim * e, centre + self.rim * e])
+            parts.append(Part(spoke, look, axis=centre, direction=self.direction))
         if self.unbalanced:
-            parts.append(
-                Part(sector(centre, 0.85 * self.rim, pose.turn), {"fc": "#555555", "ec": "black", "zorder": 3.3}, True, centre)
-            )
+            outline, look = sector(centre, 0.85 * self.rim, pose.turn), {"fc": "#555555", "ec": "black", "zorder": 3.3}
+            parts.append(Part(outline, look, True, centre, self.direction))
         else:
             mark = circle(tuple(centre + 0.82 * self.rim * np.array([np.cos(pose.turn), np.sin(pose.turn)])), 0.05)
-            parts.append(Part(mark, {"fc": "#9a9a9a", "ec": "none", "zorder": 3.2}, True, centre))
+            parts.append(Part(mark, {"fc": "#9a9a9a", "ec": "none", "zorder": 3.2}, True, centre, self.direction))
         parts += self._load_parts(centre, pose)
         parts.append(Part(circle(centre, 0.04, 13), {"fc": "black", "ec": "none", "zorder": 3.6}, True))
         return parts

@@ -25,12 +25,14 @@ class Part(NamedTuple):
     - `look`: options of matplotlib
     - `filled`: True for a filled outline
     - `axis`: position of the rotor's axis, for a part that turns with the rotor
+    - `direction` in which it turns: 1 anticlockwise, -1 clockwise
     """
 
     points: np.ndarray
     look: Look
     filled: bool = False
     axis: Point | None = None
+    direction: int = 1
 
 
 class Text(NamedTuple):

@@ -84,7 +84,7 @@ def _part(frames: Sequence[Part], place: Callable[[np.ndarray], np.ndarray], sec
         return f"{draw}/>"
     if first.axis is not None:
         x, y = place(np.asarray(first.axis))
-        angles = f'from="0 {x:.1f} {y:.1f}" to="-360 {x:.1f} {y:.1f}"'
+        angles = f'from="0 {x:.1f} {y:.1f}" to="{-360 * first.direction} {x:.1f} {y:.1f}"'
         turning = f'<animateTransform attributeName="transform" type="rotate" {angles} {_repeat_attributes(seconds / turns)}'
         draw = f"{draw}>{turning}</path>"
         moved = place(np.array([frame.axis for frame in frames])) - (x, y)

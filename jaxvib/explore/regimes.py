@@ -1,0 +1,194 @@
+"""Synchronous regimes of exciters with unbalances: chart over the speed of the motors, and results as text."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.display import quantity_text, speed_unit
+from jaxvib.draw.charts import log_limits, scaled_amplitudes
+from jaxvib.draw.machine.svg import svg
+from jaxvib.draw.style import COLORS, GUIDE
+from jaxvib.equations.linear import natural_frequencies
+from jaxvib.errors import InputError
+from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, legend
+from jaxvib.machine.scene import Scene
+from jaxvib.runtime.programs import cached
+from jaxvib.steady.regimes.synchronous import SynchronousRegime, synchronous_regimes
+from jaxvib.steady.regimes.working import working_regime
+
+_SPEEDS = {1: 61, 2: 61, 3: 25}
+"""Number of speeds of the chart for each number of exciters; the time for one speed grows steeply with the number."""
+
+_MAX_LISTED = 2
+"""Number of exciters up to which all regimes are listed. The search takes too long for more."""
+
+_LINE = {"lw": 1.5}
+_RESONANCE = {"color": GUIDE, "lw": 0.8, "ls": ":"}
+_LEGEND = {
+    "regime": {**_LINE, "color": "black"},
+    "resonance": _RESONANCE,
+    "rotor speed = motor speed": ROTOR,
+    "operating speed": OPERATING,
+}
+"""Styles of the lines in the legend, by their names."""
+
+
+class _Curves(NamedTuple):
+    """Working regime at several speeds of the motors: rotor speed (n,), phases (n, mass), amplitudes (n, nd), force (n,)."""
+
+    speed: Array
+    phases: Array
+    amplitude: Array
+    force: Array
+
+
+def regime_chart(scene: Scene, max_speed: float) -> str:
+    """Draw the working regime over the speed of the motors: rotor speed, amplitudes, and phases or foundation force.
+
+    The speeds of all drives are multiplied by one factor. The horizontal axis shows the highest of these speeds, without load.
+    A line has a gap if there is no stable regime. The third panel shows the phases of the exciters relative to the first one,
+    or the foundation force if there is one exciter.
+
+    **Arguments**: `max_speed`: the highest motor speed in the diagram, rad/s.
+
+    **Returns** the text of an SVG file. **Raises** `InputError` for more than three exciters, and for a scene without averaged
+    regimes; the message names the part of the scene that prevents them.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> from jaxvib.machine.files import SCREENS
+    >>> "phase, deg" in regime_chart(jv.scene_from_toml(SCREENS["linear_screen"]), max_speed=140.0)
+    True
+    """
+    count = len(scene.exciters)
+    if count not in _SPEEDS:
+        problem = f"are {count}; the chart over the motor speed is drawn for at most {max(_SPEEDS)}, because it takes too long"
+        raise InputError("exciters", f"{problem} for more; use jaxvib sweep")
+    for k, exciter in enumerate(scene.exciters):
+        if "speed" not in exciter.drive.__dataclass_fields__:
+            problem = (
+                f"is {exciter.drive.kind!r}, whose speed follows from other numbers; the chart needs a drive with speed=..."
+            )
+            raise InputError(f"{scene.prefix_of(k)}drive", f"{problem}, such as InductionMotor")
+    scale, at = speed_unit("rpm")[1], float(scene.top_speed)
+    motor_speed = max_speed * np.arange(1, _SPEEDS[count] + 1) / _SPEEDS[count]
+    curves = jax.device_get(_working_regimes(scene, jnp.asarray(motor_speed / at)))
+    resonances = np.asarray(natural_frequencies(scene))
+    high = scale * max_speed
+    parts, texts = [], []
+    panels = _panels(scene, curves, motor_speed, resonances, high)
+    for panel, drawn in panels:
+        parts += [*panel.frame(), panel.line([scale * at] * 2, panel.y, OPERATING)]
+        texts += panel.texts()
+        parts += [
+            panel.line(scale * motor_speed, values, {**_LINE, "color": color})
+            for values, color in zip(drawn.values(), COLORS, strict=False)
+        ]
+    speeds = panels[0][0]
+    parts += [speeds.line([0.0, high], [scale * w] * 2, _RESONANCE) for w in resonances.tolist() if w <= max_speed]
+    parts.append(speeds.line([0.0, high], [0.0, high], ROTOR))
+    names = {
+        name: {**_LINE, "color": color} for _, drawn in panels[1:] for name, color in zip(drawn, COLORS, strict=False) if name
+    }
+    keys, words = legend([_LEGEND, names])
+    width = FIRST + 3.0 * WIDE + 2.0 * APART + LAST
+    return svg((0.0, width, -0.95, TALL + 1.1), [[*parts, *keys]], [[*texts, *words]], "", 1.0, 0.0)
+
+
+def _panels(
+    scene: Scene, curves: _Curves, motor_speed: np.ndarray, resonances: np.ndarray, high: float
+) -> list[tuple[Panel, dict[str, np.ndarray]]]:
+    """Return the three panels with their curves by name; `high` is the end of the horizontal axis, rpm."""
+    structure = scene.machine.structure()
+    rotor_speed, amplitude, foundation_force = map(np.asarray, (curves.speed, curves.amplitude, curves.force))
+    units, amplitudes = scaled_amplitudes(amplitude, structure.coordinates, structure.units)
+    moving = dict(amplitudes)
+    if len(moving) > len(COLORS):
+        moving = {f"largest of {len(moving)}": np.max([*moving.values()], axis=0)}
+    force = {"": foundation_force}
+    titles = f"amplitude, {', '.join(dict.fromkeys(units))}, zero to peak", "foundation force, N, zero to peak"
+
+    def logarithmic(k: int, title: str, drawn: dict[str, np.ndarray]) -> tuple[Panel, dict[str, np.ndarray]]:
+        limits = log_limits([*drawn.values()], motor_speed, rotor_speed, resonances)
+        return _panel(k, title, high, limits, log=True), drawn
+
+    speed = speed_unit("rpm")[1] * rotor_speed
+    found = [(_panel(0, "rotor speed, rpm", high, (0.0, 1.06 * high)), {"": speed}), logarithmic(1, titles[0], moving)]
+    if len(scene.exciters) == 1:
+        return [*found, logarithmic(2, titles[1], force)]
+    phases = {f"exciter {k}": _with_gaps(np.rad2deg(np.asarray(curves.phases)[:, k])) for k in range(1, len(scene.exciters))}
+    return [*found, (_panel(2, "phase, deg, relative to exciter 0", high, (-185.0, 185.0)), phases)]
+
+
+def _panel(k: int, title: str, high: float, limits: tuple[float, float], log: bool = False) -> Panel:
+    below = "speed of the motors without load, rpm"
+    return Panel(FIRST + k * (WIDE + APART), title, (0.0, high), limits, log=log, below=below)
+
+
+def _with_gaps(phase: np.ndarray) -> np.ndarray:
+    """Return phases, deg, with a gap (NaN) at the first point after a jump from 180 to -180 degrees or back."""
+    return np.where(np.abs(np.diff(phase, prepend=phase[0])) > 180.0, np.nan, phase)
+
+
+@cached
+def _working_regimes(scene: Scene, factors: Array) -> _Curves:
+    def at(factor: Array) -> _Curves:
+        speeds = [factor * exciter.drive.speed for exciter in scene.exciters]
+        changed = eqx.tree_at(lambda each: [exciter.drive.speed for exciter in each.exciters], scene, speeds)
+        regime = working_regime(changed, throw=False)
+        return _Curves(regime.speed, regime.phases, regime.amplitude, regime.foundation_force)
+
+    return jax.vmap(at)(factors)
+
+
+def regimes_of(scene: Scene) -> list[SynchronousRegime]:
+    """Return the regimes that the page lists, the stable ones first: all for one or two exciters, otherwise the working
+    regime. The list is empty if there is no regime."""
+    if len(scene.exciters) > _MAX_LISTED:
+        regime = jax.device_get(working_regime(scene, throw=False))
+        return [regime] if np.isfinite(regime.speed) else []
+    found = jax.device_get(synchronous_regimes(scene))
+    return [found.select(k) for k in range(found.speed.shape[0])]
+
+
+def deck_points(scene: Scene) -> list[tuple[float, float]]:
+    """Return three points of the first body in a plane at the height of its centre of mass: at both ends and at the centre.
+
+    The ends are those of the range of its supports and exciters. The list is empty for other machines.
+    """
+    if scene.machine.places != "plane":
+        return []
+    supports = [float(each.at[0]) for each in getattr(scene.machine, "supports") if each.body == 0]  # noqa: B009
+    axes = [float(each.position[0]) for each in scene.exciters if each.position is not None and each.body == 0]
+    ends = min([*supports, *axes, 0.0]), max([*supports, *axes, 0.0])
+    return [(x, 0.0) for x in sorted({*ends, 0.0})]
+
+
+def regime_readings(scene: Scene) -> str:
+    """Return the regimes as text: speed, stability, margin, phases; of the first one also force, power and motion of the
+    points of `deck_points`.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> from jaxvib.machine.files import SCREENS
+    >>> print(regime_readings(jv.scene_from_toml(SCREENS["circular_screen"])).splitlines()[0][:32])
+    Omega 860.484 rpm, stable (-2.1
+    """
+    regimes = regimes_of(scene)
+    if not regimes:
+        advice = "the exciters turn at different speeds, or a resonance catches them; jaxvib run-up shows the motion from rest"
+        return f"no stable synchronous regime: {advice}" if len(scene.exciters) > _MAX_LISTED else f"no regime: {advice}"
+    first, points = regimes[0], deck_points(scene)
+    lines = [each.summary() for each in regimes]
+    if len(scene.exciters) > _MAX_LISTED:
+        lines.append("jaxvib regimes lists all regimes")
+    lines.append("motion in the first regime:" if len(regimes) > 1 else "motion in this regime:")
+    force = f"foundation force {quantity_text(first.foundation_force, 'N', 4)}"
+    lines.append(f"{force}, power of the drives {quantity_text(first.power, 'W', 4)}")
+    return "\n".join([*lines, *([first.deck(points).summary()] if points else [])])

@@ -1,0 +1,182 @@
+"""Explorer of machines whose exciters have unbalances: sliders, chart of the working regime, readings, moving sketch."""
+
+import base64
+import re
+from xml.etree import ElementTree
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+import svg_charts
+
+import jaxvib as jv
+from jaxvib.draw.style import COLORS
+from jaxvib.explore import pictures
+from jaxvib.explore.pictures import SceneOrProblem
+from jaxvib.explore.regimes import deck_points, regime_chart, regimes_of
+from jaxvib.explore.sliders import scene_at, sliders_of, typed_value
+from jaxvib.machine.files import SCREENS
+from jaxvib.show.moving import regime_svg
+
+SVG = svg_charts.SVG
+RPM = 30.0 / np.pi
+
+
+@pytest.fixture(scope="module")
+def linear():
+    return jv.scene_from_toml(SCREENS["linear_screen"])
+
+
+@pytest.fixture(scope="module")
+def circular():
+    return jv.scene_from_toml(SCREENS["circular_screen"])
+
+
+def _numbers(scene):
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(scene)])
+
+
+def test_each_slider_of_a_screen_moves_one_number(linear):
+    before, moved = _numbers(linear), {}
+    for each in sliders_of(linear):
+        after = _numbers(scene_at(linear, {each.name: each.steps[-1]}))
+        (place,) = np.flatnonzero(after != before)
+        moved[each.name] = place, after[place] - before[place], after[place] / before[place] if before[place] else np.inf
+    # Per exciter: speed, unbalance, x, y, torque; per support: two springs, two dampers, an angle; mass and inertia.
+    assert len({place for place, _, _ in moved.values()}) == len(moved) == 2 * 5 + 2 * 5 + 2
+    assert moved["exciters[0].position[0]"][1] == pytest.approx(0.8, rel=1e-9)  # 80 steps of 10 mm
+    assert moved["machine.supports[1].angle"][1] == pytest.approx(np.pi, rel=1e-9)
+    assert moved["exciters[1].unbalance"][2] == pytest.approx(10.0, rel=1e-3)
+    assert moved["exciters[1].drive.speed"][2] == pytest.approx(3.0, rel=1e-3)
+
+
+def test_a_typed_position_or_angle_is_reached_exactly(linear):
+    sliders = {each.name: each for each in sliders_of(linear)}
+    x, angle = sliders["exciters[0].position[0]"], sliders["machine.supports[0].angle"]
+    assert (x.unit, typed_value(linear, x, "0.5 m"), typed_value(linear, x, "-20")) == ("mm", 500.0, -20.0)
+    assert (angle.unit, typed_value(linear, angle, "0.1 rad")) == ("deg", pytest.approx(18.0 / np.pi, rel=1e-11))
+    moved = scene_at(linear, {x.name: -20.0, angle.name: 30.0})
+    assert float(moved.exciters[0].position[0]) == pytest.approx(-0.02, rel=1e-12)
+    assert float(moved.machine.supports[0].angle) == pytest.approx(np.pi / 6.0, rel=1e-12)
+
+
+def _at_motor_speed(scene, speed):
+    factor = speed / float(scene.top_speed)
+    old = [exciter.drive.speed for exciter in scene.exciters]
+    return eqx.tree_at(lambda s: [exciter.drive.speed for exciter in s.exciters], scene, [factor * each for each in old])
+
+
+def test_the_chart_shows_the_working_regime_at_each_speed(linear):
+    """Points of the three panels, read back by the numbers at the ticks, against `working_regime` of a changed machine."""
+    drawn = ElementTree.fromstring(regime_chart(linear, 140.0))
+    spans = svg_charts.texts(drawn)
+    starts = [x for x, _, text, _ in spans if re.match(r"rotor speed, rpm|amplitude, mm|phase, deg", text or "")]
+
+    def panel(x):
+        return int(np.searchsorted(starts, x + 1.0)) - 1
+
+    compared = 0
+    for number, color, value in (
+        (0, COLORS[0], lambda regime: RPM * regime.speed),
+        (1, COLORS[1], lambda regime: 1e3 * regime.amplitude[1]),
+        (1, COLORS[2], lambda regime: 1e3 * regime.amplitude[2]),
+        (2, COLORS[0], lambda regime: np.rad2deg(regime.phases[1])),
+    ):
+        is_log = number == 1
+        across, up = svg_charts.axes([span for span in spans if panel(span[0]) == number], is_log)
+        found = [line for line, _ in svg_charts.lines(drawn, color) if panel(line[0, 0]) == number and len(line) > 2]
+        points = np.concatenate(found)
+        for x, y in points[:: len(points) // 3]:
+            motor_speed = 140.0 / 61.0 * round(np.polyval(across, x) / RPM / (140.0 / 61.0))  # a speed of the grid
+            regime = jv.working_regime(_at_motor_speed(linear, motor_speed))
+            expected = float(value(regime))
+            level = np.polyval(up, y)
+            assert level == pytest.approx(np.log(expected) if is_log else expected, abs=0.6 * abs(up[0]))
+            compared += 1
+    assert compared >= 12
+
+
+def test_the_chart_of_one_exciter_shows_the_force(circular):
+    texts = [text for *_, text, _ in svg_charts.texts(ElementTree.fromstring(regime_chart(circular, 125.0)))]
+    assert "foundation force, N, zero to peak" in texts and not any("phase" in (text or "") for text in texts)
+
+
+def test_the_readings_are_regimes_and_motion_of_the_deck(linear):
+    text = pictures.readings(linear)
+    regimes = jv.synchronous_regimes(linear)
+    first = regimes.select(0)
+    assert text.startswith(regimes.summary())
+    assert f"foundation force {float(first.foundation_force):.4g} N" in text
+    assert deck_points(linear) == [(-1.6, 0.0), (0.0, 0.0), (1.6, 0.0)]
+    assert text.endswith(first.deck([(-1.6, 0.0), (0.0, 0.0), (1.6, 0.0)]).summary())
+
+
+def _shifts(element):
+    (motion,) = [each for each in element.findall(f"{SVG}animateTransform") if each.get("type") == "translate"]
+    return np.array([[float(x) for x in pair.split()] for pair in motion.get("values", "").split(";")])[:-1]
+
+
+def test_the_sketch_moves_as_the_regime(linear):
+    """Shifts of the marked points of the deck have the amplitudes and the phases of the regime; rotors turn in their senses."""
+    regime = regimes_of(linear)[0]
+    points = deck_points(linear)
+    text = regime_svg(linear, regime, points)
+    drawn = ElementTree.fromstring(text)
+    assert f"stable regime, {RPM * float(regime.speed):.5g} rpm" in text
+    magnified = float(re.search(r"displacements drawn ([.0-9]+) x", text).group(1))
+    dots = [g for g in drawn.iter(f"{SVG}g") if (p := g.find(f"{SVG}path")) is not None and p.get("fill") == "#d55e00"]
+    shifts = [_shifts(g) for g in dots if len(re.findall("[ML]", g.find(f"{SVG}path").get("d"))) == 13]
+    assert len(shifts) == 3
+    amplitude = np.asarray(regime.deck(points).amplitude)
+    body = next(p for p in drawn.iter(f"{SVG}path") if p.get("fill") == "#c9d7e8")
+    width = np.ptp([float(x) for x in re.findall(r"[ML]([-.0-9]+) ", body.get("d"))])
+    scale = (width - 2.0 * 0.32 * 62.0) / 3.2  # the outline is 0.32 units of 62 dots beyond the supports at -1.6 and 1.6 m
+    for shift, complex_amplitude in zip(shifts, amplitude, strict=True):
+        waves = np.fft.fft(shift, axis=0)[1] / (0.5 * len(shift))  # Re(U exp(i theta)) over one period
+        right = complex_amplitude * np.array([1.0, -1.0]) * magnified * scale
+        np.testing.assert_allclose(waves, right, atol=0.02 * np.max(np.abs(right)))
+    turns = {each.get("to").split()[0] for each in drawn.iter(f"{SVG}animateTransform") if each.get("type") == "rotate"}
+    assert turns == {"-360", "360"}
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_many_exciters_show_the_working_regime_alone(linear, count):
+    motor, places = linear.exciters[0].drive, ((-0.8, 0.3), (0.0, 0.9), (0.8, 0.3), (0.3, -0.2))
+    exciters = [jv.Exciter(drive=motor, unbalance=2.0, at=at) for at in places[:count]]
+    scene = jv.Scene(linear.machine, exciters=exciters)
+    (regime,) = regimes_of(scene)
+    assert float(regime.growth) < 0.0 and "jaxvib regimes lists all" in pictures.readings(scene)
+    if count == 4:
+        shown = pictures.image(lambda: pictures.diagram(scene, 100.0), SceneOrProblem(scene, ""))
+        assert "<b>No figure:</b> exciters are 4; the chart over the motor speed is drawn for at most 3" in shown
+
+
+def test_scenes_that_the_explorer_lacks_name_a_command(linear):
+    balls, drive = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("600 rpm")
+    loaded = jv.Scene(linear.machine, exciters=[linear.exciters[0], jv.Exciter(balls, drive, at=(0.0, 0.3))])
+    with pytest.raises(jv.InputError, match=r"exciters\[1\]\.loads are given in a scene with several .* use jaxvib regimes"):
+        sliders_of(loaded)
+    clockwise = jv.Scene(linear.machine, exciters=[jv.Exciter(balls, drive, at=(0.0, 0.3), direction=-1)])
+    with pytest.raises(jv.InputError, match=r"^loads are given .* clockwise rotor"):
+        sliders_of(clockwise)
+    table = jv.TorqueTable(speeds=(0.0, 90.0, 100.0), torques=(50.0, 60.0, 0.0), inertia=0.6)
+    tabled = jv.Scene(linear.machine, exciters=[jv.Exciter(drive=table, unbalance=2.0, at=(0.0, 0.8))])
+    shown = pictures.image(lambda: pictures.diagram(tabled, 100.0), SceneOrProblem(tabled, ""))
+    assert "drive is &#x27;torque_table&#x27;, whose speed follows from other numbers" in shown
+
+
+def test_the_page_of_a_screen_follows_its_sliders(linear, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXVIB_EXPLORE", str(jv.save_scene(linear, tmp_path / "screen.toml")))
+    from jaxvib.explore.page import app
+
+    outputs, found = app.run()
+    shown = "".join(str(getattr(output, "text", "")) for output in outputs)
+    images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', shown)
+    chart, sketch = (base64.b64decode(image).decode() for image in images)
+    assert "No figure" not in shown and "spread over the deck" in shown
+    assert "phase, deg" in chart and "stable regime" in sketch
+    assert found["controls"].value == {each.name: each.start for each in sliders_of(linear)}
+    moved = scene_at(linear, {**found["controls"].value, "exciters[1].unbalance": 2.28})
+    assert float(regimes_of(moved)[0].amplitude[1]) < 0.8 * float(regimes_of(linear)[0].amplitude[1])
+    assert pictures.toml(SceneOrProblem(moved, "")) != pictures.toml(SceneOrProblem(linear, ""))
