@@ -339,6 +339,9 @@ def _require_fit(machine: Machine, exciter: Exciter) -> None:
     """**Raises** `InputError` for loads or effects that do not fit the machine."""
     loads = exciter.loads
     for effect in exciter.effects:
+        tilts = any(term.about_tilts for term in terms_of([effect], RotorImbalance))
+        if tilts and machine.mounting(exciter.place).tilt is None:
+            raise InputError(f"effects.{effect.kind}", f"needs a rotor that can tilt, not {quoted(machine.kind)}; remove it")
         if loads is not None:
             _require_effect(effect, machine, loads)
         elif not all(isinstance(term, RotorImbalance) for term in effect.terms()):

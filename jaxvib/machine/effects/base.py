@@ -277,11 +277,6 @@ class MomentImbalance(Effect):
         """Return the term of the moment (A - C) delta (cos, sin)."""
         return (RotorImbalance(self.moment, self.angle, about_tilts=True),)
 
-    def validate(self, machine: Machine, loads: Loads) -> None:
-        """**Raises** `InputError` for a machine that cannot tilt."""
-        if machine.mounting().tilt is None:
-            raise InputError("effects.moment_imbalance", f"needs a rotor that can tilt, not {quoted(machine.kind)}")
-
 
 def _moved_inertia(machine: Machine) -> tuple[Array, Array | None]:
     """Return the mass (kg) that a force on the exciter accelerates, and the inertia (kg m^2) that a moment accelerates (None
