@@ -170,3 +170,27 @@ def test_the_resultant_of_exciters_is_the_sum_of_their_forces():
     theta = np.linspace(0.0, 6.0, 25)[:, None]
     across, up = size * np.cos(theta + phases), size * turns * np.sin(theta + phases)
     np.testing.assert_allclose(np.real(np.exp(1j * theta) * found), np.stack([across.sum(1), up.sum(1)], axis=1), atol=1e-12)
+
+
+def test_a_run_of_a_group_is_that_of_single_exciters(monkeypatch):
+    """Eight equal motors that start from rest, with equal steps; the first turns of the motors are not chaotic."""
+    motor = jv.DCMotor(100.0, stall_torque=40.0, inertia=0.2)
+    at = [(-1.0 + 0.28 * k, 0.1 * (k % 3)) for k in range(8)]
+    exciters = [jv.Exciter(drive=motor, unbalance=0.3, at=at[k], direction=(1, -1)[k % 2]) for k in range(8)]
+    scene = jv.Scene(BODY, exciters=exciters, effects=jv.Gravity())
+
+    @jax.jit
+    def run(start):
+        found = jv.simulate(
+            scene, 0.5, start=start, stepsize_controller=jv.EqualSteps(400), save="window", estimate=False, throw=False
+        )
+        return found.window.state, found.foundation_force
+
+    start = jv.initial_state(scene)
+    assert len(jv.vector_field(scene).groups) == 1
+    grouped = run(start)
+    assert float(jnp.max(jnp.abs(grouped[0].exciters[0].rotor[1]))) > 10.0
+    monkeypatch.setattr(model, "_MIN_GROUP_SIZE", 1000)
+    assert len(jv.vector_field(scene).groups) == 8
+    jax.clear_caches()
+    close(grouped, run(start), 1e-10)
