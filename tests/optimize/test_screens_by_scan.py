@@ -52,7 +52,8 @@ def lever(x, y):
 
 
 class TwoMotors:
-    """Working regimes of screens (n,), from the places (n,) of the second motor and the stiffness up (n,) of the springs.
+    """Working regimes of screens (n,), from the places (n,) of the second motor, the stiffness up (n,) and across of the
+    springs, and the angles (n,) of both supports.
 
     At a given speed the phase of two rotors follows from an equation A + R cos(phase - start) = 0, whose stable root is known;
     the speed is that at which the sum of all torques is 0.
@@ -60,18 +61,23 @@ class TwoMotors:
 
     ways, synchronous, slip = np.array([1.0, -1.0]), 1000.0 * np.pi / 30.0, 0.35
 
-    def __init__(self, x, y, up=460e3):
-        x, y, up = (np.asarray(v, float) for v in np.broadcast_arrays(x, y, up))
+    def __init__(self, x, y, up=460e3, across=280e3, angles=(0.0, 0.0)):
+        x, y, up, *angles = (np.asarray(v, float) for v in np.broadcast_arrays(x, y, up, *angles))
         self.unbalance = 50e3 / (1000.0 * np.pi / 30.0) ** 2
         rows = lever(np.array([-1.6, 1.6]), np.array([-0.3, -0.3]))
-        along = np.stack([np.full_like(up, 280e3), up], -1)
-        self.stiffness = np.einsum("sia,ni,sib->nab", rows, along, rows)
-        self.damping = np.einsum("sia,i,sib->ab", rows, np.array([2000.0, 2500.0]), rows)
-        self.on_foundation = np.einsum("ni,sib->nib", along, rows)
-        self.damped_on_foundation = np.einsum("i,sib->ib", np.array([2000.0, 2500.0]), rows)
-        first = np.broadcast_to(lever(np.array(0.46), np.array(0.81)), (x.size, 2, 3))
+        angle = np.stack(angles, -1)
+        first, second = np.cos(angle), np.sin(angle)
+        turned = np.stack([np.stack([first, second], -1), np.stack([-second, first], -1)], -2)  # (n, support, spring, 2)
+        stiffness, damping = np.stack([np.full_like(up, across), up], -1), np.array([2000.0, 2500.0])
+        springs = np.einsum("nsji,nj,nsjk->nsik", turned, stiffness, turned)
+        dampers = np.einsum("nsji,j,nsjk->nsik", turned, damping, turned)
+        self.stiffness = np.einsum("sia,nsij,sjb->nab", rows, springs, rows)
+        self.damping = np.einsum("sia,nsij,sjb->nab", rows, dampers, rows)
+        self.on_foundation = np.einsum("nsij,sjb->nib", springs, rows)
+        self.damped_on_foundation = np.einsum("nsij,sjb->nib", dampers, rows)
+        fixed = np.broadcast_to(lever(np.array(0.46), np.array(0.81)), (x.size, 2, 3))
         e = np.stack([np.ones(2), -1j * self.ways], -1)
-        self.direction = np.einsum("nkia,ki->nka", np.stack([first, lever(x, y)], 1), e)
+        self.direction = np.einsum("nkia,ki->nka", np.stack([fixed, lever(x, y)], 1), e)
         self.speed, self.phase = self.regime()
 
     def influence(self, speed):
@@ -180,6 +186,53 @@ def test_working_regimes_equal_those_of_the_scan(place):
     np.testing.assert_allclose([regime.speed, regime.phases[1]], [own.speed[0], own.phase[0]], rtol=1e-10)
     np.testing.assert_allclose(regime.margin, own.margin()[0], rtol=1e-9)
     np.testing.assert_allclose(regime.foundation_force, own.force()[0], rtol=1e-10)
+
+
+ANGLES = "machine.supports[0].angle", "machine.supports[1].angle"
+STIFF = 1.5e6, 3e6
+"""Stiffness across and up of stiff springs, N/m, with which the angles of the supports matter at working speed."""
+
+
+def stiff_screen(*angles):
+    """The screen on stiff springs at these angles, rad."""
+    supports = [
+        jv.support(at=(x, -0.3), stiffness=STIFF, damping=(2000.0, 2500.0), angle=a)
+        for x, a in zip((-1.6, 1.6), angles, strict=True)
+    ]
+    return jv.Scene(jv.plane_body(mass=2600.0, inertia=3800.0, supports=supports), exciters=screen().exciters)
+
+
+def turned(angles):
+    """The independent calculation for angles (n, 2) of the supports."""
+    return TwoMotors(0.81, 0.46, STIFF[1], STIFF[0], tuple(np.moveaxis(np.asarray(angles, float), -1, 0)))
+
+
+def test_angles_of_supports_are_numbers_of_a_design():
+    """They can be freed and swept; derivatives agree with differences, values with the scan of another program."""
+    space = DesignSpace(stiff_screen(0.0, 0.0), dict.fromkeys(ANGLES, ("-60 deg", "60 deg")))
+    angles = np.array([[0.3, -0.2], [0.0, 0.9]])
+    for each, force in zip(angles, turned(angles).force(), strict=True):
+        np.testing.assert_allclose(float(foundation_force()(space.scene_of(jnp.array(each)))), force, rtol=1e-10)
+    check = jv.check_gradients(stiff_screen(0.3, -0.2), foundation_force(), free=ANGLES).require()
+    assert check.status_name == "agree" and np.all(np.abs(check.difference) > 10.0)  # N per radian
+
+
+def test_sweep_over_the_angle_of_a_support(tmp_path):
+    swept = ["-30 deg", "45 deg"]
+    found = jv.sweep(stiff_screen(0.0, 0.0), {ANGLES[0]: swept}, {"force": foundation_force()}, tmp_path / "angles.zarr")
+    expected = turned([[-np.pi / 6.0, 0.0], [np.pi / 4.0, 0.0]]).force()
+    np.testing.assert_allclose(found.data["force"], expected, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_angles_of_a_straight_throw_are_those_of_a_dense_scan():
+    space = DesignSpace(stiff_screen(0.0, 0.0), dict.fromkeys(ANGLES, ("-85 deg", "85 deg")))
+    best = synthesize(space, straight_at_45(), starts=16, verify=False)
+    bound = np.deg2rad(85.0)
+    z, least = scan((-bound, -bound), (bound, bound), lambda z: turned(z).objective(), points=61, rounds=6)
+    assert best.status_name == "done" and least < 0.2 * turned([[0.0, 0.0]]).objective()[0]
+    assert least * (1.0 - 1e-5) < best.values.min() <= least * (1.0 + 1e-9)
+    np.testing.assert_allclose([support.angle for support in best.scene.machine.supports], z, atol=1e-3)
 
 
 @pytest.mark.slow
