@@ -136,8 +136,9 @@ def test_the_sketch_moves_as_the_regime(linear):
         waves = np.fft.fft(shift, axis=0)[1] / (0.5 * len(shift))  # Re(U exp(i theta)) over one period
         right = complex_amplitude * np.array([1.0, -1.0]) * magnified * scale
         np.testing.assert_allclose(waves, right, atol=0.02 * np.max(np.abs(right)))
-    turns = {each.get("to").split()[0] for each in drawn.iter(f"{SVG}animateTransform") if each.get("type") == "rotate"}
-    assert turns == {"-360", "360"}
+    turns = [each.get("to").split() for each in drawn.iter(f"{SVG}animateTransform") if each.get("type") == "rotate"]
+    by_height = sorted({(float(y), int(turn)) for turn, _, y in turns})  # the first exciter is above the second
+    assert [turn for _, turn in by_height] == [-360, 360]  # in SVG a positive angle is clockwise
 
 
 @pytest.mark.parametrize("count", [3, 4])
