@@ -21,7 +21,7 @@ from jaxvib.results.fields import Labels, columns, labels_of
 def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool = False, decimal_comma: bool = False) -> Path:
     """Write all quantities of a result along an axis into a CSV file, a row for each point of the axis.
 
-    The head of a column consists of the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have 9
+    A point at which two pieces of a curve meet has one row. The head of a column consists of the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have 9
     digits. Complex numbers have one column for the real part and one for the imaginary part.
 
     **Arguments**
@@ -48,9 +48,10 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n", delimiter=";" if decimal_comma else ",")
         writer.writerow(table)
-        shown = (lambda x: _shown(x).replace(".", ",")) if decimal_comma else _shown
-        rows = ([shown(x) for x in row] for row in zip(*table.values(), strict=True))
-        writer.writerows(row for row, _ in itertools.groupby(rows))  # a point at which two pieces of a curve meet occurs twice
+        rows = ([_shown(x, decimal_comma) for x in row] for row in zip(*table.values(), strict=True))
+        if axis == "point":  # a point at which two pieces of a curve meet occurs twice
+            rows = (row for row, _ in itertools.groupby(rows))
+        writer.writerows(rows)
     return path
 
 
@@ -72,12 +73,12 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
             places = [_label(labels, a, k, n) for a, k, n in zip(axes[1:], place, values.shape[1:], strict=True)]
             column_unit = _own_unit(unit, axes[1:], place, units)
             head, column = " ".join([name, *filter(None, places)]), values[(slice(None), *place)]
+            if display and column_unit and np.issubdtype(column.dtype, np.inexact):  # real and imaginary part have one unit
+                largest = float(np.max(np.abs(column), initial=0.0, where=np.isfinite(column)))
+                column_unit, factor = shown_unit(column_unit, largest)
+                column = factor * column
             parts = [("real ", np.real(column)), ("imaginary ", np.imag(column))] if np.iscomplexobj(column) else [("", column)]
             for part, numbers in parts:
-                if display and column_unit and np.issubdtype(numbers.dtype, np.floating):
-                    largest = float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers)))
-                    column_unit, factor = shown_unit(column_unit, largest)
-                    numbers = factor * numbers
                 table[f"{part}{head}" + (f" ({column_unit})" if column_unit else "")] = numbers
     if not table:
         known = sorted({axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes)})
@@ -99,5 +100,7 @@ def _own_unit(unit: str, axes: tuple[str, ...], place: tuple[int, ...], units: S
     return unit
 
 
-def _shown(value: np.generic) -> str:
-    return f"{value:.9g}" if isinstance(value, np.floating) else str(int(value) if isinstance(value, np.bool_) else value)
+def _shown(value: np.generic, decimal_comma: bool) -> str:
+    if isinstance(value, np.floating):
+        return f"{value:.9g}".replace(".", ",") if decimal_comma else f"{value:.9g}"
+    return str(int(value) if isinstance(value, np.bool_) else value)

@@ -2,10 +2,12 @@
 
 import csv
 
+import equinox as eqx
 import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.results.fields import in_unit
 from jaxvib.results.status import status_names
 
 LOADS = jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25)
@@ -20,10 +22,18 @@ ROTOR = jv.rotor(
 )
 
 
-def table(result, axis, path):
-    text = jv.write_csv(result, axis, path).read_bytes().decode("utf-8")
+class Readings(eqx.Module):
+    """Result with complex numbers, real numbers and texts along one axis."""
+
+    amplitude: np.ndarray = eqx.field(metadata=in_unit("m", "load"))
+    mass: np.ndarray = eqx.field(metadata=in_unit("kg", "load"))
+    version: np.ndarray = eqx.field(metadata=in_unit("", "load"))
+
+
+def table(result, axis, path, **options):
+    text = jv.write_csv(result, axis, path, **options).read_bytes().decode("utf-8")
     assert "\r" not in text and text.endswith("\n")
-    head, *rows = csv.reader(text.splitlines())
+    head, *rows = csv.reader(text.splitlines(), delimiter=";" if options.get("decimal_comma") else ",")
     return dict(zip(head, np.array(rows).T, strict=True))
 
 
@@ -44,6 +54,27 @@ def test_truth_values_are_ones_and_zeros(tmp_path):
     for k in range(4):
         np.testing.assert_array_equal(columns[f"forward {k + 1}"].astype(int), found.forward[:, k])
         np.testing.assert_allclose(columns[f"speed {k + 1} (rad/s)"].astype(float), found.speed[:, k], rtol=1e-8)
+
+
+def test_real_and_imaginary_part_have_one_display_unit(tmp_path):
+    numbers = Readings(np.array([0.01 + 0.02j, 2e-6 - 1e-6j]), np.array([0.5, 0.25]), np.array(["a", "b"]))
+    columns = table(numbers, "load", tmp_path / "display.csv", display=True)
+    assert list(columns) == ["real amplitude (mm)", "imaginary amplitude (mm)", "mass (g)", "version"]
+    assert columns["real amplitude (mm)"].tolist() == ["10", "0.002"]
+    assert columns["imaginary amplitude (mm)"].tolist() == ["20", "-0.001"]
+    assert columns["mass (g)"].tolist() == ["500", "250"]
+
+
+def test_equal_entries_have_separate_rows(tmp_path):
+    numbers = Readings(np.array([1j, 1j, 1j]), np.array([0.5, 0.5, 0.5]), np.array(["a", "a", "a"]))
+    assert table(numbers, "load", tmp_path / "equal.csv")["version"].tolist() == ["a", "a", "a"]
+
+
+def test_decimal_commas_are_in_numbers_only(tmp_path):
+    columns = table(
+        Readings(np.array([1.5 + 0j]), np.array([0.5]), np.array(["v1.2"])), "load", tmp_path / "comma.csv", decimal_comma=True
+    )
+    assert columns["version"].tolist() == ["v1.2"] and columns["mass (kg)"].tolist() == ["0,5"]
 
 
 @pytest.mark.parametrize("axis", ["coordinate", "", "time"])
