@@ -21,8 +21,9 @@ from jaxvib.results.fields import Labels, columns, labels_of
 def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool = False, decimal_comma: bool = False) -> Path:
     """Write all quantities of a result along an axis into a CSV file, a row for each point of the axis.
 
-    A point at which two pieces of a curve meet has one row. The head of a column consists of the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have 9
-    digits. Complex numbers have one column for the real part and one for the imaginary part.
+    The head of a column consists of the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have 9
+    digits. Complex numbers have one column for the real part and one for the imaginary part. A point at which two pieces of a
+    curve meet has one row.
 
     **Arguments**
 
