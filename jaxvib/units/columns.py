@@ -47,14 +47,20 @@ _SPELLINGS: dict[str, dict[str, float]] = {
     },
     "N m": {**dict.fromkeys(("nm", "n m", "n*m", "n.m", "n·m"), 1.0), "knm": 1e3},
     "A": {"a": 1.0, "ma": 1e-3},
-    "Hz": {"hz": 1.0, "khz": 1e3, **dict.fromkeys(("s/s", "sps", "1/s", "samples/s"), 1.0)},
+    "Hz": {
+        **dict.fromkeys(("hz", "hertz", "s/s", "sa/s", "sps", "1/s", "samples/s", "samples/sec", "samples/second"), 1.0),
+        **dict.fromkeys(("khz", "ks/s", "ksa/s", "ksps", "ksamples/s"), 1e3),
+    },
 }
 """Units in the heads of columns by the SI unit, in lower case; heads may be in upper or lower case."""
 
 _MULTIPLE = re.compile(r"^(\d+\.?\d*(?:[eE][+-]?\d+)?)\s+([^\s\d/].*)$")
 """Pattern of a multiple of a unit, such as "50 kN"."""
 
-_HEAD = re.compile(r"^(?P<name>.*?)\s*(?:[(\[{]\s*(?P<unit>[^)\]}]*?)\s*[)\]}]|/\s*(?P<per>\S+))$")
+_PRODUCT = r"[^\W\d_]{1,3}(?:[\d^/*·²³-]\S*)?(?: [^\W\d_]{1,3}(?:[\d^/*·²³-]\S*)?)+"
+"""Pattern of a unit with blanks, such as "N s/m"."""
+
+_HEAD = re.compile(rf"^(?P<name>.*?)\s*(?:[(\[{{]\s*(?P<unit>[^)\]}}]*?)\s*[)\]}}]|/\s*(?P<per>{_PRODUCT}|\S+))$")
 _TAIL = re.compile(r"^(?P<name>.+?)[\s_.:-]+(?P<tail>[^\W_]+|°)$")
 
 

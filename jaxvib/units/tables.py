@@ -37,7 +37,7 @@ def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.nda
     >>> jv.csv_column(path, "N/m").tolist()
     [12500.0, 20000.0]
     """
-    head, *rows = _rows(path)
+    (_, head), *rows = _rows(path)
     names = [split_head(each, unit) for each in head]
     matching = [k for k, (name, head_unit) in enumerate(names) if _matches(head[k], name, head_unit, unit, column)]
     if len(matching) != 1:
@@ -49,7 +49,7 @@ def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.nda
     factor = 1.0 if not unit and head_unit in ("", "-") else unit_factor(head_unit, unit) if head_unit else None
     if factor is None:
         raise InputError(str(path), f"has the column {quoted(head[k])} without a unit of {unit}; write {names[k][0]} ({unit})")
-    cells = [(line, row[k].strip()) for line, row in enumerate(rows, 2) if len(row) > k and row[k].strip()]
+    cells = [(line, row[k]) for line, row in rows if len(row) > k and row[k]]
     if not cells:
         raise InputError(str(path), f"has no number in the column {quoted(head[k])}")
     return np.asarray([factor * _number(cell, f"{path}, row {line}") for line, cell in cells])
@@ -61,20 +61,24 @@ def _matches(head: str, name: str, head_unit: str, unit: str, column: str | None
     return bool(head_unit) and unit_factor(head_unit, unit) is not None
 
 
-def _rows(path: str | Path) -> list[list[str]]:
-    """Return the rows of a CSV file. Decimal commas in the cells are replaced by decimal points."""
-    text = read_text(path, "a CSV file")
-    first = text.split("\n", 1)[0]
+def _rows(path: str | Path) -> list[tuple[int, list[str]]]:
+    """Return the rows of a CSV file that are not empty, with their numbers from 1. Decimal commas in the cells below the names
+    are replaced by decimal points."""
+    lines = read_text(path, "a CSV file").splitlines()
+    first = next((line for line in lines if line.strip(";, \t")), "")
     separator = max(";\t,", key=lambda each: (first.count(each) > 0, each != ","))
-    rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=separator) if any(row)]
+    reader = csv.reader(lines, delimiter=separator)
+    rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))]
     if len(rows) < 2:
         raise InputError(str(path), "has no rows; the first row has the names of the columns, the others numbers")
-    return rows if separator == "," else [rows[0], *([cell.replace(",", ".") for cell in row] for row in rows[1:])]
+    if separator != ",":
+        rows[1:] = [(line, [cell.replace(",", ".") for cell in row]) for line, row in rows[1:]]
+    return rows
 
 
 def _number(cell: str, where: str) -> float:
     try:
-        value = float(cell)
+        value = float(cell.replace("_", "?"))  # Python would read "1_000"
     except ValueError as error:
         raise InputError(where, f"has {quoted(cell)}, which is not a number") from error
     if not np.isfinite(value):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.units.columns import split_head
 from optimize import load_design
 
 SCENE = """[machine]
@@ -29,6 +30,7 @@ inertia = 0.02
     [
         "part,rate (N/mm),free length (mm)\nA,12.5,80\nB,20,90\n",
         "part;rate [N/mm];free length [mm]\nA;12,5;80\nB;20,0;90\n",
+        "\n \n;;\npart;rate (N/mm);free length (mm)\n\nA;12,5;80\nB;20,0;90\n",
         "part\trate / N/mm\tfree length / mm\nA\t12.5\t80\n\t\t\nB\t20\t90\n",
         "\ufeffpart;rate (kN/m);free length (mm)\r\nA;12,5;80\r\nC;;95\r\nB;2,0e1;90\r\n",
     ],
@@ -41,6 +43,25 @@ def test_a_column_is_read_in_si(text, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("head", "name", "unit"),
+    [
+        ("torque/N m", "torque", "N m"),
+        ("torque / N m", "torque", "N m"),
+        ("drag / N s/m", "drag", "N s/m"),
+        ("speed / m/s", "speed", "m/s"),
+        ("in/out (N m)", "in/out", "N m"),
+        ("input / output ratio", "input / output ratio", ""),
+        ("Input 1/Channel 2 raw", "Input 1/Channel 2 raw", ""),
+    ],
+)
+def test_units_with_blanks_follow_a_slash(head, name, unit, tmp_path):
+    assert split_head(head, "m") == (name, unit)
+    if unit:
+        (tmp_path / "a.csv").write_text(f"part,{head}\nA,3\n")
+        assert jv.csv_column(tmp_path / "a.csv", unit).tolist() == [3.0]
+
+
+@pytest.mark.parametrize(
     ("text", "column", "words"),
     [
         ("rate (N/mm)\n", None, "has no rows"),
@@ -48,6 +69,8 @@ def test_a_column_is_read_in_si(text, tmp_path):
         ("a (N/mm),b (N/m)\n1,2\n", "c", "has no columns 'c'; name one as column, the columns are: 'a .N/mm.', 'b .N/m.'"),
         ("a (mm)\n1\n", "a", "without a unit of N/m; write a .N/m."),
         ("a (N/mm)\n1\ntwo\n", None, "row 3 has 'two', which is not a number"),
+        ("\na (N/mm)\n\n1\n\ntwo\n", None, "row 6 has 'two', which is not a number"),
+        ("a (N/mm)\n1_000\n", None, "row 2 has '1_000', which is not a number"),
         ("a (N/mm)\nnan\n", None, "a finite number is needed"),
         ("a (N/mm);b\n;3\n", None, "has no number in the column"),
     ],
