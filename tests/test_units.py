@@ -104,6 +104,22 @@ def test_text_that_only_looks_like_a_number_is_refused(text):
         to_float(text, "N/m", "machine.stiffness")
 
 
+@pytest.mark.parametrize("text", ["1_000", "1_000 N/m"])
+def test_underscores_in_numbers_are_refused(text):
+    with pytest.raises(jv.InputError, match=f"^stiffness is '{text}', which is not in N/m; write"):
+        number(text, "N/m", "stiffness")
+
+
+@pytest.mark.parametrize("text", ["30 Grad", "30 grad", "5 grad/s"])
+def test_grad_is_refused_because_it_is_ambiguous(text):
+    for read in (lambda: number(text, "rad", "angle"), lambda: in_own_unit(text, "angle")):
+        with pytest.raises(jv.InputError, match=f"^angle is '{text}', which can mean degrees or gon; write deg or gon"):
+            read()
+    unit = text.split()[1]
+    assert unit_factor(unit, "rad") is None and unit_factor(unit, "rad/s") is None
+    assert float(number("30 gon", "rad", "angle")) == pytest.approx(0.15 * np.pi)
+
+
 @pytest.mark.parametrize("text", ["25 s^-1", "25 1/s", "25 /s", "25 Bq", "25 count/s"])
 def test_a_speed_must_say_what_it_counts(text):
     """Revolutions and radians per second differ by 2 pi, and 1/s is neither."""

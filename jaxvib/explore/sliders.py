@@ -15,6 +15,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.numbers.named import NamedNumber, numbers_of, put_numbers
 from jaxvib.machine.scene import Scene
+from jaxvib.results.table import is_number
 from jaxvib.units.reading import to_float
 
 COUNT = "loads.count"
@@ -180,9 +181,9 @@ def typed_value(scene: Scene, slider: Slider, text: str) -> float:
     (725.0, 720.0)
     """
     text = text.strip()
-    try:
+    if is_number(text, ","):
         value = float(text)
-    except ValueError:
+    else:
         unit = slider.number.unit if slider.number is not None and slider.unit else ""
         value = float(np.asarray(to_float(text, unit, slider.label)))
         if unit and slider.number is not None:

@@ -157,7 +157,8 @@ def is_number(cell: str, mark: str | None) -> bool:
     `mark` is the character between columns; if it is not a comma, the number may have a decimal comma.
     """
     try:
-        return bool(np.isfinite(float(cell if mark == "," else cell.replace(",", "."))))
+        # Python would read "1_000".
+        return "_" not in cell and bool(np.isfinite(float(cell if mark == "," else cell.replace(",", "."))))
     except ValueError:
         return False
 

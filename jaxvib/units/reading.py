@@ -71,6 +71,9 @@ gram."""
 
 _JOINED_PATTERN = re.compile(rf"(?<![^\W\d_])({'|'.join(_JOINED)})((?:\^|\*\*)\d|[²³])?(?![^\W\d_])")
 
+_GRAD = re.compile(r"(?<![^\W\d_])grad(?![^\W\d_])", re.IGNORECASE)
+"""Degrees in German, gon in mathematics and on calculators; pint would read "Grad" as `gigaradian`."""
+
 _FACTORS = {
     "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3},
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
@@ -116,7 +119,8 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
     """
     if isinstance(value, str):
         try:
-            return float(value)
+            if "_" not in value:  # Python would read "1_000"
+                return float(value)
         except ValueError:
             pass
         text = value.strip()
@@ -165,6 +169,8 @@ def require_real(value: object, unit: str, field: str) -> None:
 
 def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
     """Return the error for a string that is not in `unit`, or for a string without a readable unit if `unit` is None."""
+    if _GRAD.search(value):
+        return InputError(field, f"is {quoted(value)}, which can mean degrees or gon; write deg or gon")
     wanted = "not a number with a unit" if unit is None else f"not in {unit}" if unit else "not a plain number"
     return InputError(
         field, f"is {quoted(value)}, which is {wanted}; write for example {_example('m' if unit is None else unit)}"
@@ -175,6 +181,8 @@ def _parsed(unit: str) -> Any:
     """Return pint's unit for a string. **Raises** an error of `_UNREADABLE` or of pint for a string that is not a unit."""
     import pint
 
+    if _GRAD.search(unit):
+        raise ValueError("degrees or gon")
     name = _SPELLINGS.get(unit, unit)
     return pint.get_application_registry().Unit(
         _JOINED_PATTERN.sub(lambda found: f"({_JOINED[found[1]]}{found[2] or ''})", name) or "dimensionless"
