@@ -1,5 +1,6 @@
 """Rules of recorders' formats that a complete run does not show: clocks, rates, names, structures, objects."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -12,6 +13,7 @@ from jaxvib.exchange.recordings.formats import _flat, _flat_hdf, _floating, _sta
 from jaxvib.identification.records.recorded import Recorded
 
 T = np.arange(0.0, 1.0, 0.01)
+RUN = Path("run.csv")
 
 
 def read(path, rate=None):
@@ -118,10 +120,61 @@ def test_names_that_occur_twice_are_numbered():
         ("Sample rate; 2 kHz", 2000.0),
         ("# rate: 0", None),
         ("rated 5 Hz", None),
+        ("Sample rate: 51.2 kS/s", 51200.0),
+        ("Sampling rate (kHz): 51.2", 51200.0),
+        ("Abtastrate / kHz: 51,2", 51200.0),
+        ("rate: 1 MHz", 1e6),
+        ("fs=.5 kHz", 500.0),
+        ("Sampling Frequency;1000,5 Hz", 1000.5),
+        ("Sample rate;2000;kHz", 2e6),
+        ("Sample rate;2000;;;", 2000.0),
+        ("Sample rate,2000,Channels,4", 2000.0),
+        ("rate: 2000 Hz, 24 bit", 2000.0),
     ],
 )
 def test_rate_in_a_remark(line, rate):
-    assert _stated_rate(["# recorder 7", line]) == rate and _stated_rate([]) is None
+    assert _stated_rate(["# recorder 7", line], RUN) == rate and _stated_rate([], RUN) is None
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["rate: 2,000 Hz", "rate: 12 800 Hz", "rate: 2'000", "fs = -5", "Sample rate,2,000 Hz", "rate: 5 m/s", "rate: 1e400 Hz"],
+)
+def test_rates_that_cannot_be_read_are_refused(line):
+    with pytest.raises(
+        jv.InputError, match=r"states a sampling rate that cannot be read: .*; write it as '# rate: 2000 Hz', or "
+    ):
+        _stated_rate([line], RUN)
+
+
+@pytest.mark.parametrize(
+    ("head", "columns"),
+    [
+        ("time (s),T (N m),frame (g)", (T, T + 20.0, T)),
+        ("T (N m),time (s),frame (g)", (T + 20.0, T, T)),
+        ("T,t,frame (g)", (T + 20.0, T, T)),
+        ("T (degC),frame (g),Zeit", (T + 20.0, T, T)),
+    ],
+)
+def test_a_torque_or_temperature_t_is_no_clock(tmp_path, head, columns):
+    (tmp_path / "run.csv").write_text(f"{head}\n" + rows(*columns))
+    found = read(tmp_path / "run.csv")
+    assert list(found) == ["T", "frame"]
+    np.testing.assert_allclose(found["frame"].time, T)
+    np.testing.assert_allclose(found["T"].values, T + 20.0)
+
+
+def test_a_single_column_t_is_the_clock(tmp_path):
+    (tmp_path / "run.csv").write_text("T (ms),frame (g)\n" + rows(1e3 * T, T))
+    np.testing.assert_allclose(read(tmp_path / "run.csv")["frame"].time, T)
+
+
+@pytest.mark.parametrize(("clock", "channels"), [(20.0 + 10.0 * T, ["T", "a"]), (5.0 + T, ["a"])])
+def test_t_of_matlab_agrees_with_the_stated_rate(tmp_path, clock, channels):
+    pytest.importorskip("scipy.io").savemat(tmp_path / "run.mat", {"T": clock, "a": np.sin(T), "fs": 100.0})
+    found = read(tmp_path / "run.mat")
+    assert list(found) == channels
+    np.testing.assert_allclose(found["a"].time, T if channels != ["a"] else clock, atol=1e-12)
 
 
 def rows(*columns, sign=","):
@@ -177,6 +230,7 @@ def test_clocks_and_units_of_tdms(tmp_path, monkeypatch):
         Tdms("own", np.sin(T), wf_increment=0.5, wf_start_offset=2.0, NI_UnitDescription="V"),
         Tdms("with clock", np.cos(T), unit_string="g"),
         Tdms("words", np.array(["a"])),
+        Tdms("T", T + 20.0, unit_string="N m"),
     ]
     file = SimpleNamespace(
         file_status=SimpleNamespace(channel_statuses=None), groups=lambda: [SimpleNamespace(channels=lambda: channels)]
@@ -185,7 +239,7 @@ def test_clocks_and_units_of_tdms(tmp_path, monkeypatch):
     monkeypatch.setattr(formats, "optional_module", lambda *_: library)
     (tmp_path / "run.tdms").write_bytes(b"")
     found = read(tmp_path / "run.tdms")
-    assert [(each.name, each.unit) for each in found.values()] == [("own", "V"), ("with clock", "g")]
+    assert [(each.name, each.unit) for each in found.values()] == [("own", "V"), ("with clock", "g"), ("T", "N m")]
     np.testing.assert_allclose(found["own"].time, 2.0 + 0.5 * np.arange(100))
     np.testing.assert_array_equal(found["with clock"].time, T)
     channels.pop(0)

@@ -5,11 +5,12 @@ Each reader returns the channels of a file with their names, units and times. Li
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,16 @@ _TIME_NAMES = ("time", "t", "times", "timestamp", "x_value", "zeit", "время
 _RATE_NAMES = ("rate", "fs", "sampling rate", "sample rate", "samplerate", "sampling frequency", "sampling_rate", "abtastrate")
 """Names of the sampling rate, in lower case."""
 
-_RATE = re.compile(rf"^\W*({'|'.join(_RATE_NAMES)})\b[^\d;,\t]*[;,\t:=\s]\W*([\d.]+(?:e\d+)?)\s*(k?hz)?", re.IGNORECASE)
+_RATE = re.compile(
+    rf"^\W*(?P<head>(?:{'|'.join(_RATE_NAMES)})\b[^\d;,\t]*(?<![-+.]))(?:(?P<mark>[;,\t])[^\w.+-]*)?(?P<cells>[-+.]?\d.*)",
+    re.IGNORECASE,
+)
+"""Line with a sampling rate."""
+
+_RATE_CELL = re.compile(
+    r"(?!\d+,\d{3}(?!\d))(?P<number>(?:\d+(?:[.,]\d*)?|\.\d+)(?:e[+-]?\d+)?)\s*(?P<unit>(?:1/)?[^\d\s,].*)?", re.IGNORECASE
+)
+"""Number and unit of a sampling rate. Three digits behind a comma may be thousands or decimals, and are not matched."""
 
 _SI = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "force": "N"}
 
@@ -92,11 +102,11 @@ def _read_text(path: Path, rate: float | None) -> Iterator[Recorded]:
     split = [split_head(head, "s") for head in heads]
     if table.units:
         split = [(name, unit or below) for (name, unit), below in zip(split, table.units, strict=True)]
-    clocks = [k for k, (name, _) in enumerate(split) if name.lower() in _TIME_NAMES]
+    clocks = _clocks(split)
     if not table.heads and table.width > 1 and rate is None:
         clocks = [0]
     if rate is None and not clocks:
-        rate = _stated_rate(table.remarks)
+        rate = _stated_rate(table.remarks, path)
         if rate is None:
             names = ", ".join(heads)
             raise InputError(
@@ -121,12 +131,37 @@ def _read_text(path: Path, rate: float | None) -> Iterator[Recorded]:
         yield Recorded(split[k][0], split[k][1], time, values[:, n])
 
 
-def _stated_rate(remarks: list[str]) -> float | None:
-    """Return the sampling rate, Hz, that a line above the table states."""
+def _clocks(columns: Sequence[tuple[str, str]]) -> list[int]:
+    """Return the indices of the columns of times from names and units.
+
+    A column T with a unit of another quantity, or beside a column of times, is a torque or a temperature.
+    """
+    named = [k for k, (name, _) in enumerate(columns) if name.lower() in _TIME_NAMES]
+    times = [k for k in named if columns[k][0].lower() != "t" or unit_factor(columns[k][1] or "s", "s") is not None]
+    return [k for k in times if columns[k][0] != "T"] or times
+
+
+def _stated_rate(remarks: list[str], path: Path) -> float | None:
+    """Return the sampling rate, Hz, that a line above the table states; None without such a line.
+
+    **Raises** `InputError` for a number or a unit that cannot be read.
+    """
     for line in remarks:
         match = _RATE.match(line)
-        if match is not None and float(match[2]) > 0.0:
-            return float(match[2]) * (1e3 if (match[3] or "").lower() == "khz" else 1.0)
+        if match is None:
+            continue
+        cell, beside, *_ = (each.strip("\"' ") for each in [*re.split(r"[;\t]|,(?!\d)", match["cells"]), ""])
+        found = None if match["mark"] == "," and "," in cell else _RATE_CELL.fullmatch(cell)
+        rate = math.inf
+        if found is not None:
+            beside = beside if unit_factor(beside, "Hz") is not None else split_head(match["head"].strip(" :="), "Hz")[1]
+            factor = unit_factor((found["unit"] or "").strip("()[]. ") or beside or "Hz", "Hz")
+            rate = math.inf if factor is None else float(found["number"].replace(",", ".")) * factor
+        if not math.isfinite(rate):
+            problem = f"states a sampling rate that cannot be read: {quoted(line)}"
+            raise InputError(str(path), f"{problem}; write it as '# rate: 2000 Hz', or give the sampling rate, `rate`")
+        if rate > 0.0:
+            return rate
     return None
 
 
@@ -143,8 +178,12 @@ def _read_tdms(path: Path, rate: float | None) -> Iterator[Recorded]:
             raise _cut_off_error(path, f"has {read_count} readings of {name} where its header states {header}")
     for group in tdms.groups():
         channels = [channel for channel in group.channels() if np.issubdtype(channel.dtype, np.number)]
-        clock = next((channel for channel in channels if channel.name.lower() in _TIME_NAMES), None)
-        for channel in channels:
+        units = [
+            str(each.properties.get("unit_string") or each.properties.get("NI_UnitDescription") or "") for each in channels
+        ]
+        clocks = _clocks([(channel.name, unit) for channel, unit in zip(channels, units, strict=True)])
+        clock = channels[clocks[0]] if clocks else None
+        for channel, unit in zip(channels, units, strict=True):
             if channel is clock:
                 continue
             time = None
@@ -154,8 +193,7 @@ def _read_tdms(path: Path, rate: float | None) -> Iterator[Recorded]:
                 )
             elif clock is not None:
                 time = np.asarray(clock[:], float)
-            unit = channel.properties.get("unit_string") or channel.properties.get("NI_UnitDescription") or ""
-            yield Recorded(channel.name, str(unit), time, channel[:])
+            yield Recorded(channel.name, unit, time, channel[:])
 
 
 def _read_uff(path: Path, rate: float | None) -> Iterator[Recorded]:
@@ -206,11 +244,9 @@ def _read_mat(path: Path, rate: float | None) -> Iterator[Recorded]:
     except NotImplementedError:  # version 7.3
         with optional_module("h5py", "mat").File(path) as file:
             arrays = dict(_flat_hdf(file, "", objects))
-    clocks = {
-        name: value for name, value in arrays.items() if name.rpartition(".")[2].lower() in _TIME_NAMES and value.ndim == 1
-    }
     scalars = {name.lower(): float(value) for name, value in arrays.items() if value.size == 1}
     stated = next((scalars[name] for name in _RATE_NAMES if scalars.get(name, 0.0) > 0.0), None)
+    clocks = _clocks_of_arrays(arrays, stated)
     has_channel = False
     for name, value in arrays.items():
         if name in clocks or value.size < 2:
@@ -229,6 +265,18 @@ def _read_mat(path: Path, rate: float | None) -> Iterator[Recorded]:
             f"holds objects of MATLAB ({', '.join(objects[:5])}), such as timetables or Simulink data, which only MATLAB can "
             "read; save arrays there, for example t = x.Time; a = x.Data; save('run.mat', 't', 'a')",
         )
+
+
+def _clocks_of_arrays(arrays: dict[str, np.ndarray], rate: float | None) -> dict[str, np.ndarray]:
+    """Return the arrays of times by their dotted names; T is one only if its step agrees with a stated `rate`, Hz."""
+    folders: dict[str, list[tuple[str, str]]] = {}
+    for name, value in arrays.items():
+        folder, _, last = name.rpartition(".")
+        if value.ndim != 1 or (last == "T" and rate is not None and abs(rate * np.median(np.diff(value)) - 1.0) > 0.01):
+            continue
+        folders.setdefault(folder, []).append((last, name))
+    names = [inside[k][1] for inside in folders.values() for k in _clocks([(last, "") for last, _ in inside])]
+    return {name: arrays[name] for name in names}
 
 
 def _flat(value: Any, name: str, objects: list[str]) -> Iterator[tuple[str, np.ndarray]]:
