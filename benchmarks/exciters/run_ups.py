@@ -59,7 +59,7 @@ def main(runs: int, seconds: float) -> None:
     again = timed(speeds)[1]
     share = found.synchronous_share
     error = np.sqrt(share.value * (1.0 - share.value) / runs)
-    print(f"{runs} run-ups of {seconds:g} s: {share.text}; standard error {100.0 * error:.2g} %")
+    print(f"{runs} run-ups of {seconds:g} s, {int(found.steps)} steps each: {share.text}; standard error {100.0 * error:.2g} %")
     print(f"one run {one:.3g} s; {runs} runs: first call {first / one:.4g} times, second call {again / one:.4g} times one run")
     print(f"processor time per run in the second call: {again / runs / one:.3g} times that of one run")
 
