@@ -368,7 +368,8 @@ def eliminate(a: Array, b: Array) -> Array:
         line = rows[k] / rows[k, k]
         return jnp.where((row == k)[:, None], line[None, :], rows - rows[:, k][:, None] * line[None, :])
 
-    rows = jnp.concatenate([a, b.reshape(n, -1).astype(a.dtype)], axis=1)
+    dtype = jnp.result_type(a, b)
+    rows = jnp.concatenate([a.astype(dtype), b.reshape(n, -1).astype(dtype)], axis=1)
     return jax.lax.fori_loop(0, n, eliminate_column, rows)[:, n:].reshape(b.shape)
 
 

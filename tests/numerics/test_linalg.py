@@ -25,7 +25,9 @@ def test_small_solve_is_numpys(n):
     for _ in range(5):
         a = rng.normal(size=(n, n)) + 1j * rng.normal(size=(n, n))
         b = rng.normal(size=n) + 1j * rng.normal(size=n)
-        np.testing.assert_allclose(small_solve(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-11)
+        for matrix, right in ((a, b), (a.real, b), (a, b.real), (a.real, b.real)):
+            found = small_solve(jnp.asarray(matrix), jnp.asarray(right))
+            np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=1e-11)
 
 
 @pytest.mark.parametrize("shape", [(1, 17), (3, 3), (17, 17)])
