@@ -340,14 +340,24 @@ def _problem_of_float(value: Any) -> str | None:
 def _problem_of_array(value: Any) -> str | None:
     if isinstance(value, (list, tuple)):
         try:
-            value = np.asarray(value)
+            array = np.asarray(value)
         except (ValueError, TypeError):
             return "an array of numbers"
+        if _has_boolean(value):  # NumPy would convert it to a number
+            return "an array of numbers, without Booleans"
+        value = array
     if not is_real(value) or np.ma.is_masked(value):
         return "an array of numbers"
     if isinstance(value, (float, Decimal)) and value != value:
         return "a number or an array of numbers, not NaN"
     return "an array of numbers below 1e308" if isinstance(value, int) and abs(value).bit_length() > 1023 else None
+
+
+def _has_boolean(value: Any) -> bool:
+    """Return True if nested lists contain a Boolean or an array of Booleans."""
+    if isinstance(value, (list, tuple)):
+        return any(map(_has_boolean, value))
+    return isinstance(value, bool) or getattr(value, "dtype", None) == np.bool_
 
 
 def _problem_of_tree(value: Any) -> str | None:
