@@ -141,20 +141,22 @@ def _digest(layout: str, arrays: Mapping[str, np.ndarray]) -> str:
 
 def _encoded(value: object, arrays: dict[str, np.ndarray]) -> Plain:
     """Return a value in a form that JSON can represent. Its arrays are added to `arrays` and replaced by their names."""
+    if isinstance(value, str):
+        _require_legible(str(value))
     if value is None or (isinstance(value, (bool, int, float, str)) and not isinstance(value, np.generic)):
         return value
     if is_status(value):
-        return {"status": _class(enumeration_of(value)), "names": _stored(status_names(value), arrays)}
+        return {"status": _class(enumeration_of(value), eqx.Enumeration), "names": _stored(status_names(value), arrays)}
     if dataclasses.is_dataclass(value):
         fields = {field.name: _encoded_field(field, value, arrays) for field in dataclasses.fields(value)}
-        return {"class": _class(type(value)), "fields": fields}
+        return {"class": _class(type(value), object), "fields": fields}
     if isinstance(value, (jax.Array, np.ndarray, np.generic)):
         kind = "jax" if isinstance(value, jax.Array) else "scalar" if isinstance(value, np.generic) else "numpy"
         return {"array": _stored(np.asarray(value), arrays), "kind": kind}
     if isinstance(value, complex):
         return {"complex": [value.real, value.imag]}
     if is_named_tuple(value):
-        return {"class": _class(type(value)), "entries": [_encoded(entry, arrays) for entry in value]}
+        return {"class": _class(type(value), tuple), "entries": [_encoded(entry, arrays) for entry in value]}
     if isinstance(value, (tuple, list)):
         return {type(value).__name__: [_encoded(entry, arrays) for entry in value]}
     if isinstance(value, Mapping):
@@ -176,13 +178,29 @@ def _stored(array: np.ndarray, arrays: dict[str, np.ndarray]) -> str:
             "result",
             f"contains an array of the type {array.dtype}, which cannot be saved; save the data from which it was computed",
         )
+    if array.dtype.kind == "U":
+        _require_legible("".join(array.ravel().tolist()))
     name = f"array{len(arrays)}"
     arrays[name] = array
     return name
 
 
-def _class(kind: type) -> str:
-    return f"{kind.__module__}:{kind.__qualname__}"
+def _require_legible(text: str) -> None:
+    found = CONTROL.search(text)
+    if found is not None:
+        problem = f"contains the control character {quoted(found[0])} in {quoted(text)}"
+        raise InputError("result", f"{problem}, which cannot be saved; delete it in the name or text from which it comes")
+
+
+def _class(kind: type, base: type) -> str:
+    """Return the name of a class in files. **Raises** `InputError` for a class that `load` would refuse."""
+    name = f"{kind.__module__}:{kind.__qualname__}"
+    try:
+        _class_named(name, base)
+    except (ValueError, AttributeError, LookupError) as error:
+        problem = f"contains an object of the class {kind.__qualname__}, which cannot be saved"
+        raise InputError("result", f"{problem}; save the data from which it was computed") from error
+    return name
 
 
 def _decoded(value: Any, arrays: Mapping[str, np.ndarray], read: Callable[[str], object] | None = None) -> Any:

@@ -3,6 +3,7 @@
 import json
 import os
 import zipfile
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -91,6 +92,23 @@ def test_texts_with_control_characters_are_refused(modes, tmp_path):
     layout["fields"]["omega"] = {"list": ["a\x1b[31m"]}
     with pytest.raises(jv.InputError, match=LOST):
         jv.load(prepared(tmp_path / "x.npz", layout, **arrays))
+
+
+class Mine(NamedTuple):
+    """Class of a user."""
+
+    number: float
+
+
+@pytest.mark.parametrize("value", ["a\u2028b", {"a\x07": 1.0}, np.asarray(["a", "b\x1b"]), (np.str_("a\u202eb"),)])
+def test_save_refuses_texts_that_load_refuses(value):
+    with pytest.raises(jv.InputError, match=r"result contains the control character .*, which cannot be saved; delete it"):
+        _encoded(value, {})
+
+
+def test_save_refuses_classes_that_load_refuses():
+    with pytest.raises(jv.InputError, match="result contains an object of the class Mine, which cannot be saved; save the"):
+        _encoded({"a": Mine(1.0)}, {})
 
 
 @pytest.mark.parametrize(
