@@ -9,7 +9,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, loaded_scene, shared
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, written
 
 if TYPE_CHECKING:
     from jaxvib.motion.start import Start
@@ -65,5 +65,7 @@ def animate(
 @shared
 def sketch(scene: Path, output: Output) -> None:
     """Draw SCENE with the values of its parameters: sketch.png, in --out or the current folder."""
-    jv.sketch(loaded_scene(scene)).savefig(output.main_file("sketch.png"))
+    figure = jv.sketch(loaded_scene(scene))
+    with written(output.main_file("sketch.png")) as part:
+        figure.savefig(part)
     output.done({"status": "done"}, lambda: "a sketch of the machine", "sketch")

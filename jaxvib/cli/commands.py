@@ -20,7 +20,7 @@ from jaxvib.cli.document import (
     run_measures,
     run_text,
 )
-from jaxvib.cli.output import csv_options
+from jaxvib.cli.output import csv_options, write_file
 from jaxvib.errors import InputError
 from jaxvib.machine.templates import SCREENS, TEMPLATES
 
@@ -55,7 +55,7 @@ def new(kind: str, output: Output) -> None:
         return
     if path.exists():
         raise InputError("--out", f"already contains {path.name}, which is not overwritten; give another folder")
-    path.write_text(text, encoding="utf-8")
+    write_file(path, text)
     output.done({"kind": kind, "toml": text}, lambda: f"a commented file for {kind}", "new")
 
 

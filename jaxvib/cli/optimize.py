@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from jaxvib.cli.app import TOLERANCE, Output, app, require_tolerances, shared, table, tolerance_table
-from jaxvib.cli.output import fields_of
+from jaxvib.cli.output import fields_of, write_file
 
 if TYPE_CHECKING:
     from optimize import Demand, Design, Quantity, Synthesis
@@ -60,7 +60,7 @@ def optimize(
     path = output.file("found.toml")
     if path is not None:
         source = design.parent / read_toml(design)["scene"]
-        path.write_text(rewrite_scene(source.read_text(encoding="utf-8"), best.scene), encoding="utf-8")
+        write_file(path, rewrite_scene(source.read_text(encoding="utf-8"), best.scene))
     output.picture("before_after.png", best.plot)
     output.picture("convergence.png", best.plot_convergence)
     _draw_working_regime(output, loaded, best)

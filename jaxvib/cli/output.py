@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shlex
 import shutil
 import sys
 import textwrap
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import jaxvib as jv
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, quoted, written
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,6 +54,12 @@ def fields_of(result: object, *names: str) -> dict[str, object]:
 def note(text: str) -> None:
     """Print a line on stderr, in place of the line of the elapsed time on a terminal."""
     click.echo(("\r\x1b[K" if sys.stderr.isatty() else "") + text, err=True)
+
+
+def write_file(path: Path, text: str) -> None:
+    """Write a text file; an existing file is replaced when the new one is complete."""
+    with written(path) as part:
+        part.write_text(text, encoding="utf-8", errors="replace")
 
 
 class LinesAtIntervals:
@@ -186,7 +193,8 @@ class Output:
             return
         figure = draw()
         if path is not None:
-            figure.savefig(path)
+            with written(path) as part:
+                figure.savefig(part)
         if self.report is not None:
             self.figures.append((Path(name).stem.replace("_", " "), figure))
 
@@ -212,15 +220,15 @@ class Output:
         values = {key: plain(value) for key, value in document.items()}
         body = json.dumps(values, indent=2, allow_nan=False)
         if path is not None:
-            path.write_text(body + "\n", encoding="utf-8")
+            write_file(path, body + "\n")
         if self.report is not None:
             self._write_report(self.report, values, text, name, result)
         if self.as_json:
             click.echo(body)
             return
         click.echo(_wrapped(text()) if sys.stdout.isatty() else text())
-        for written in self.files:
-            click.echo(f"wrote {written}")
+        for name_of_file in self.files:
+            click.echo(f"wrote {name_of_file}")
 
     def _write_report(
         self, path: Path, document: dict[str, Plain], text: Callable[[], str], name: str, result: Result | None
@@ -237,7 +245,7 @@ class Output:
         page = Report(
             title=self.title or name,
             author=self.author or "",
-            command=" ".join(["jaxvib", *arguments]),
+            command=shlex.join(["jaxvib", *arguments]),
             document=document,
             units={} if result is None else units_of(result),
             text=text(),
@@ -245,5 +253,5 @@ class Output:
             sketch=None if scene is None or draw_sketch is None else draw_sketch(scene),
             figures=self.figures,
         )
-        path.write_text(page.html(), encoding="utf-8")
+        write_file(path, page.html())
         self.files.append(str(path))

@@ -10,7 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.cli.output import fields_of
+from jaxvib.cli.output import fields_of, write_file
 from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def _identify_machine(tables: Tables, folder: Path, output: Output, options: lis
     output.save_result("fit.npz", found)
     path = output.file("found.toml")
     if path is not None:
-        path.write_text(rewrite_scene(fit.scene_file.read_text(encoding="utf-8"), found.scene), encoding="utf-8")
+        write_file(path, rewrite_scene(fit.scene_file.read_text(encoding="utf-8"), found.scene))
     document = {"status": found.status_name, "message": found.message}
     document |= fields_of(found, "notes", "names", "units", "estimates", "frequency", "damping_ratio", "gain_names", "gains")
     document |= {name: [each.sentence for each in getattr(found, name)] for name in ("undetermined", "by_gain")}
