@@ -114,7 +114,7 @@ def assemble(scene: Scene) -> Model:
     carrier, mounts = scene.machine.carrier(), tuple(scene.machine.mount(exciter.place) for exciter in scene.exciters)
     for exciter, mount in zip(scene.exciters, mounts, strict=True):
         if exciter.unbalance_mass is not None:
-            rows = mount.rotor_rows()
+            rows = mount.rows[0]
             added = carrier.mass + exciter.unbalance_mass * rows.T @ rows
             carrier = dataclasses.replace(carrier, mass=added)
     return Model(scene, carrier, mounts, tuple(term.rows(scene.machine) for term in terms_of(scene.all_effects, SupportForce)))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.equations.linear import linear_model
 from jaxvib.machine.numbers.named import numbers_of
 
 SPRINGS = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e3, 4e3)) for x in (-1.2, 1.2)]
@@ -48,6 +49,18 @@ def test_mass_of_an_unbalance_is_a_point_mass_at_the_axis():
     np.testing.assert_allclose(found.rotor[1], wanted.rotor[1], rtol=1e-12)
     np.testing.assert_allclose(jv.energy(own, state), jv.energy(other, state), rtol=1e-12)
     np.testing.assert_allclose(jv.natural_frequencies(own), jv.natural_frequencies(other), rtol=1e-12)
+
+
+def test_mass_of_an_unbalance_on_a_tilting_rotor_is_at_its_station():
+    machine = jv.rotor(
+        mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=6e5, damping=400.0, position=(0.165, -0.155)
+    )
+    masses = [
+        linear_model(jv.Scene(machine, exciters=[jv.Exciter(drive=MOTOR, unbalance=0.05, at=0.2, **more)])).mass
+        for more in ({}, {"unbalance_mass": 5.0})
+    ]
+    row = np.kron([1.0, 0.2], np.eye(2))  # y, z, tilts
+    np.testing.assert_allclose(masses[1] - masses[0], 5.0 * row.T @ row, atol=1e-12)
 
 
 def test_motor_that_is_off_slows_down_by_its_bearings():
