@@ -18,6 +18,7 @@ from jaxvib.boundary import call_user
 from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine
+from jaxvib.machine.drives.drive import Motor
 from jaxvib.machine.effects.base import static_imbalances, total_gravity
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import Exciter, Scene, read_unbalance, require_comparable
@@ -186,18 +187,15 @@ def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
 
     The unbalance swings past the height at which the torque would hold it: torque x > S g (1 - cos x) for every angle x.
 
-    The list has an entry for each exciter, which is None if the exciter has no motor or no unbalance, or without gravity.
+    The list has an entry for each exciter. It is None if the exciter has no motor or no unbalance, if the torque at rest
+    changes during a run (`Motor.starting_torque`), or without gravity.
     """
     gravity = total_gravity(scene.all_effects)
     found: list[tuple[Array, Array] | None] = []
     for exciter in scene.exciters:
-        zero = jnp.zeros_like(exciter.drive.speed)
-        motor = exciter.drive.torque_and_inertia(zero, zero)
-        moment = first_moment(exciter)
-        if moment is None or motor is None or 1 not in gravity:
-            found.append(None)
-        else:
-            found.append((_SWING_SHARE * moment * jnp.abs(gravity[1]), motor[0]))
+        moment, drive = first_moment(exciter), exciter.drive
+        start = drive.starting_torque() if 1 in gravity and moment is not None and isinstance(drive, Motor) else None
+        found.append(None if start is None or moment is None else (_SWING_SHARE * moment * jnp.abs(gravity[1]), start))
     return found
 
 

@@ -10,7 +10,7 @@ from scenes import BALLS, machines, scene
 
 import jaxvib as jv
 from jaxvib.machine import validation as module
-from jaxvib.machine.validation import lifting_torques, validate_scene
+from jaxvib.machine.validation import lifting_torques, start_notes, validate_scene
 
 
 def changed(where, value, s=None):
@@ -155,3 +155,21 @@ def test_motor_lifts_the_sum_of_unbalance_and_imbalance(angle, moment):
     table = jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), exciters=[exciter], effects=jv.Gravity())
     ((needed, start),) = lifting_torques(table)
     assert float(needed) == pytest.approx(0.724611 * moment * 9.81, rel=1e-6) and float(start) == 2.5
+
+
+@pytest.mark.parametrize(
+    ("drive", "start"),
+    [
+        (lambda motor: jv.Converter(motor, jv.SpinUp(100.0, 5.0)), None),
+        (lambda motor: jv.Converter(motor, jv.RunUp(100.0, acceleration=20.0)), None),
+        (lambda motor: jv.SwitchedOff(jv.Converter(motor, jv.SpinUp(100.0, 5.0)), at=9.0), None),
+        (lambda motor: jv.Converter(motor, jv.ConstantSpeed(50.0)), 1.25),
+        (lambda motor: jv.SpeedControl(jv.ConstantSpeed(100.0), 0.5, 2.0, torque_limit=8.0, inertia=0.02), None),
+    ],
+)
+def test_torque_at_rest_that_rises_is_not_compared_with_the_weight(drive, start):
+    exciter = jv.Exciter(drive=drive(jv.DCMotor(100.0, stall_torque=2.5, inertia=0.5)), unbalance=0.4)
+    scene = jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), exciters=[exciter], effects=jv.Gravity())
+    (torques,) = lifting_torques(scene)
+    assert (torques is None) if start is None else float(torques[1]) == start
+    assert bool(start_notes(scene)) == (start is not None)

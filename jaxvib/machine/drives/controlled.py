@@ -207,6 +207,10 @@ class Converter(MotorWrapper):
         """Return the torque at time `t`."""
         return self.motor.torque(speed + self.motor.speed - self.reference.speed_at(t))
 
+    def starting_torque(self) -> Array | None:
+        """Return the torque at rest, N m; None for a speed that changes, because the torque at rest then passes its maximum."""
+        return super().starting_torque() if self.reference.constant else None
+
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the times of the jumps of the reference."""
         return self.reference.jump_ts()
@@ -274,6 +278,9 @@ class SpeedControl(Motor):
     def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
         """Return the torque at time `t`."""
         return self._torques(t, speed, states[0])[2] if states else self.torque(speed)
+
+    def starting_torque(self) -> None:
+        """Return None, because the integral raises the torque at rest up to its limit."""
 
     def state_units(self) -> tuple[Array, ...]:
         """Return the torque limit, the typical magnitude of the integral."""

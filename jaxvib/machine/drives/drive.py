@@ -255,6 +255,11 @@ class Motor(Drive):
     def torque(self, speed: Array) -> Array:
         """Return the steady torque T at the rotor's `speed` (rad/s), N m."""
 
+    def starting_torque(self) -> Array | None:
+        """Return the torque at rest when a run begins, N m; None if it changes afterwards, such as that of a converter."""
+        zero = jnp.zeros_like(self.speed)
+        return self.torque_at(zero, zero)
+
 
 class ConstantSpeed(IdealDrive):
     """Drive at a constant rotor speed, which the loads do not change.
@@ -496,6 +501,10 @@ class MotorWrapper(Motor):
     def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
         """Return the rates of the `states` of the motor at time `t` (s) and the rotor's `speed` (rad/s)."""
         return self.motor.state_rates(t, speed, states)
+
+    def starting_torque(self) -> Array | None:
+        """Return the torque at rest when a run begins, N m; None if that of the motor changes afterwards."""
+        return None if self.motor.starting_torque() is None else super().starting_torque()
 
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the times of the motor's jumps."""
