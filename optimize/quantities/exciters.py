@@ -310,10 +310,11 @@ def least_torque() -> Quantity:
 
         max_r max_w (w^4/2) sum_ik S_i S_k |A_ik(w)| / sum_i L_i(w),      A = (H^H - H)/(2 i),    w within 10 % of w_r
 
-    S_i is the unbalance of exciter i, kg m, L_i(w) the torque of its motor, H(w) the matrix of displacements per centrifugal
-    force of the exciters. The numerator is an upper bound, for any phases, of the mean torque of a steady vibration at the
-    speed w. Only resonances w_r up to 95 % of the lowest no-load speed of the motors count. Rotors of large inertia need this
-    torque in a slow run-up; a fast passage needs less, see `jaxvib.run_up`, which integrates the run-up.
+    The maximum over w is a local one below the no-load speed; if there is none, the ratio at w_r is taken. S_i is the unbalance
+    of exciter i, kg m, L_i(w) the torque of its motor, H(w) the matrix of displacements per centrifugal force of the exciters.
+    The numerator is an upper bound, for any phases, of the mean torque of a steady vibration at the speed w. Only
+    resonances w_r up to 95 % of the lowest no-load speed of the motors count. Rotors of large inertia need this torque in a
+    slow run-up; a fast passage needs less, see `jaxvib.run_up`, which integrates the run-up.
 
     **Returns** `Quantity`; typical: 0.1 to 0.8; above 1 the motors are caught by a resonance. A scene with an ideal drive
     raises `InputError` when the quantity is computed.
@@ -345,8 +346,13 @@ def _least_torques(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
 
     frozen = jax.lax.stop_gradient(balance)
 
+    resonances = natural_frequencies(scene)
+    slowest = jax.lax.stop_gradient(jnp.min(jnp.stack([exciter.drive.speed for exciter in scene.exciters])))
+    is_passed = (resonances > 0.0) & (resonances < _MAX_PASSED_RESONANCE * slowest)
+
     def peak(resonance: Array) -> Array:
-        low, high = (1.0 - _PEAK_REACH) * resonance, (1.0 + _PEAK_REACH) * resonance
+        begin = jax.lax.stop_gradient(resonance)
+        low, high = (1.0 - _PEAK_REACH) * begin, jnp.minimum((1.0 + _PEAK_REACH) * begin, 0.5 * (begin + slowest))
 
         def slope(w: Array) -> Array:
             return jax.grad(lambda w: 1.0 / ratio(w, frozen))(w)
@@ -354,14 +360,13 @@ def _least_torques(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
         def step(_: int, w: Array) -> Array:
             value, curvature = jax.jvp(slope, (w,), (jnp.ones_like(w),))
             move = jnp.nan_to_num(value / jnp.abs(curvature))
-            return jnp.clip(w - jnp.clip(move, -0.02 * resonance, 0.02 * resonance), low, high)
+            return jnp.clip(w - jnp.clip(move, -0.02 * begin, 0.02 * begin), low, high)
 
-        # The ratio is stationary at its peak; therefore the derivative of the speed is not needed.
-        return ratio(jax.lax.fori_loop(0, _PEAK_STEPS, step, resonance))
+        # The ratio is stationary at its peak; therefore the derivative of that speed is not needed. Close to the no-load speed
+        # a broad resonance has no peak, because the torques of the motors decrease to 0.
+        found = jax.lax.fori_loop(0, _PEAK_STEPS, step, begin)
+        return ratio(jnp.where((found > low) & (found < high), found, resonance))
 
-    resonances = jax.lax.stop_gradient(natural_frequencies(scene))
-    slowest = jnp.min(jnp.stack([exciter.drive.speed for exciter in scene.exciters]))
-    is_passed = (resonances > 0.0) & (resonances < _MAX_PASSED_RESONANCE * slowest)
     ratios = jax.vmap(peak)(jnp.where(is_passed, resonances, 0.5 * slowest))
     ratios = jnp.where(is_passed, ratios, 0.0)
     return ratios if sign > 0.0 else -jnp.max(ratios)[None]

@@ -159,6 +159,22 @@ def test_least_torque_is_that_of_the_resonance_curve():
     np.testing.assert_allclose(least_torque()(shaft(5.0)), ratio.max(), rtol=1e-8)
 
 
+@pytest.mark.parametrize("ratio", [0.02, 0.05, 0.1, 0.2])
+def test_least_torque_near_the_no_load_speed_is_positive(ratio):
+    """A damping above 0.03 leaves no local maximum below the no-load speed; the value is then that at the resonance."""
+    mass, resonance, speed, stall = 200.0, 93.0, 100.0, 50.0
+    damping = 2.0 * ratio * mass * resonance
+    machine = jv.one_mass(mass=mass, stiffness=mass * resonance**2, damping=damping)
+    motor = jv.DCMotor(speed, stall_torque=stall, inertia=0.5)
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=motor, unbalance=0.2)])
+    w = np.append(np.linspace(0.9 * resonance, 0.999 * speed, 20001), resonance)
+    dynamic = (mass * (resonance**2 - w**2)) ** 2 + (damping * w) ** 2
+    needed = damping * 0.2**2 * w**5 / 2.0 / dynamic / (stall * (1.0 - w / speed))
+    inner = needed[1:-2]
+    peaks = inner[(inner > needed[:-3]) & (inner > needed[2:-1])]
+    np.testing.assert_allclose(least_torque()(scene), peaks[0] if peaks.size else needed[-1], rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_heavy_rotors_need_the_least_torque_to_run_up():
     found = float(least_torque()(shaft(5.0)))
