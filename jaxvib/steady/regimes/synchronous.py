@@ -155,7 +155,11 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
         return Harmonic(self.scene.machine, self.speed, self.displacement)
 
     def vibration(self) -> Vibration:
-        """Return the vibration, for `vibration_measures`."""
+        """Return the vibration, for `vibration_measures`. **Raises** `InputError` for a regime of some of the masses."""
+        count = mass_owners(self.scene).size
+        if self.phases.size != count:
+            problem = f"has {self.phases.size} of the scene's {count} rotating masses"
+            raise InputError("masses", f"{problem}; the others add vibrations of other frequencies, use simulate or envelope")
         return _vibration_of(self)
 
     def summary(self) -> str:
