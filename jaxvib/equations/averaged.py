@@ -50,7 +50,6 @@ antiphase paper in general form.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import cast
 
@@ -74,8 +73,9 @@ from jaxvib.numerics.linalg import eigenvalues_in_turn, magnitude, small_solve, 
 AVERAGED_TERMS = (GravityField, LoadPotential)
 """Terms that the averaged equations include: potentials, whose mean torque is 0."""
 
-LATE = math.inf
-"""Time after all changes of the drives, s, at which steady motions are computed."""
+LATE = 1e30
+"""Time after all changes of the drives, s, at which steady motions are computed. It is finite, because derivatives of products
+with an infinite time are NaN also where they are not selected."""
 
 _CIRCLE = (1.0, -1.0j)
 
