@@ -360,7 +360,5 @@ def _sense(mount: Mount, shapes: Array) -> Array:
 
 def _is_straight(model: LinearModel, shapes: Array) -> Array:
     """Return True for shapes (nd, k) in which the axis moves on straight lines, which needs supports that differ."""
-    if not model.scene.machine.is_split:
-        return jnp.zeros(shapes.shape[1], bool)
     moved = jnp.stack(model.mount.rows).astype(shapes.dtype) @ shapes
-    return jnp.abs(_sense(model.mount, shapes)) <= _STRAIGHT * jnp.sum(jnp.abs(moved) ** 2, axis=(0, 1)) / 2.0
+    return jnp.abs(_sense(model.mount, shapes)) < _STRAIGHT * jnp.sum(jnp.abs(moved) ** 2, axis=(0, 1)) / 2.0

@@ -191,3 +191,16 @@ def test_single_precision_says_which_whirls_it_loses(soft):
         assert bool(np.any(np.isnan(np.asarray(single.speed)))) == (soft < 1e4)
         with pytest.raises(jv.InputError, match=r"within single precision.*or use double precision"):
             found((1e8, 10.0))
+
+
+def test_sense_of_a_whirl_is_the_same_for_a_machine_from_matrices():
+    """Two springs of different stiffness move the axis on straight lines, equal ones on circles in both directions."""
+    loads, drive = jv.balls(count=2, mass=0.05, radius=0.08, drag=1.0), jv.ConstantSpeed(100.0)
+    for up, sense in ((1.4e6, ["straight", "straight"]), (1e6, ["backward", "forward"])):
+        other = {} if up == 1e6 else {"stiffness_up": up}
+        matrices = {"mass": 37.0 * np.eye(2), "damping": 100.0 * np.eye(2), "stiffness": np.diag([1e6, up])}
+        for machine in (
+            jv.from_matrices(**matrices, places=[[[1.0, 0.0], [0.0, 1.0]]]),
+            jv.planar_rotor(mass=37.0, stiffness=1e6, damping=100.0, **other),
+        ):
+            assert jv.critical_speeds(jv.Scene(machine, loads, drive)).sense.tolist() == sense
