@@ -39,6 +39,9 @@ below which the lag is steady. A load with a steady lag is jammed, even if the l
 STILL_SHARE = 0.01
 """Speed of a rotor, relative to a working or resonance speed, below which texts state that it is at rest."""
 
+_EQUAL_FREQUENCIES = 1e-6
+"""Relative difference of natural frequencies up to which they count as equal."""
+
 _BALANCED_UNBALANCE_SHARE = 0.02
 """Residual unbalance below which loads count as balancing the rotor, relative to the unbalance of all loads at one angle."""
 
@@ -252,7 +255,8 @@ def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
     ends = jnp.concatenate([jnp.zeros_like(natural[:1]), natural, jnp.full_like(natural[:1], jnp.inf)])
     below = jnp.sum(natural <= mean)
     rises = jnp.minimum(ends[below + 1], rotor) - mean < mean - ends[below]
-    return jnp.where(rises | (below == 0), 2 * below + 1, 2 * below)
+    first_of_equal = 1 + jnp.sum(natural < ends[below] * (1.0 - _EQUAL_FREQUENCIES))
+    return jnp.where(rises | (below == 0), 2 * below + 1, 2 * first_of_equal)
 
 
 def _is_rotor_caught(scene: Scene, natural: Array, rotor: Array) -> Array:

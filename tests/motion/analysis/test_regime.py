@@ -11,7 +11,7 @@ from scenes import published
 
 import jaxvib as jv
 from jaxvib.motion.analysis.measure import Trajectory
-from jaxvib.motion.analysis.regime import _is_rotor_caught
+from jaxvib.motion.analysis.regime import _is_rotor_caught, _mode
 
 TIME = jnp.linspace(0.0, 1.0, 801)
 
@@ -231,3 +231,12 @@ def test_loads_off_the_mass_centre_balance_tilted_rotors(tilts, label):
     pushed = float(jnp.max(jnp.abs(jv.vector_field(s)(0.0, start).velocity)))
     assert (pushed < 1e-9) == (label == "balanced")
     assert jv.regime(s, motion).label == label
+
+
+def test_mode_numbers_of_equal_frequencies_are_those_of_the_jam_modes():
+    """A planar rotor on equal supports has modes 1, 2 and 5 at its two equal natural frequencies."""
+    machine = jv.planar_rotor(mass=20.0, stiffness=6.3e5, damping=60.0)
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.05, radius=0.08, drag=1.0), jv.ConstantSpeed(320.0))
+    natural = jnp.sort(jv.natural_frequencies(scene))
+    modes = jv.jam_modes(scene).omega
+    assert [int(_mode(natural, modes[k - 1], jnp.asarray(320.0))) for k in (1, 2, 5)] == [1, 2, 5]
