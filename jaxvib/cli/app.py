@@ -321,7 +321,7 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
     @click.option("--author", help="Author of the report.")
     @click.option(
         "--unit",
-        type=click.Choice(["rpm", "Hz", "rad/s", "SI"]),
+        type=click.Choice(["rpm", "Hz", "rad/s", "SI"], case_sensitive=False),
         default="rpm",
         show_default=True,
         help="Unit of speeds; SI: all numbers in SI units. JSON documents are always in SI units.",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -32,6 +33,13 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
             from jaxvib.units import numbers  # slow import, which --help does not need
 
             value = [numbers([part.strip() for part in point.split(",")], "m", "--deck", 2).tolist() for point in value]
+        elif value is not None:
+            from jaxvib.units import number  # slow import, which --help does not need
+
+            value = float(number(value, "rad", "--slope"))
+            if abs(value) >= math.pi / 2.0:
+                problem = f"is {value:.4g} rad ({math.degrees(value):.4g} degrees), no slope of a deck"
+                raise InputError("--slope", f"{problem}; write degrees as '{value:g} deg'")
         if value:
             context.meta.setdefault(_DECK_KEY, {})[parameter.name] = value
 
@@ -102,7 +110,7 @@ def run_text(run: jv.Run, measures: jv.VibrationMeasures | None) -> str:
     from jaxvib.display import quantity_text  # slow import, which --help does not need
 
     peaks = [
-        f"  largest on the way: point ({', '.join(f'{x:.4g}' for x in at)}) m {quantity_text(peak, 'm', 4)}"
+        f"  largest on the way, zero to peak: point ({', '.join(f'{x:.4g}' for x in at)}) m {quantity_text(peak, 'm', 4)}"
         for at, peak in _deck_peaks(run)
     ]
     return "\n".join([run.summary(measures), *peaks])

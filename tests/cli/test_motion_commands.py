@@ -352,6 +352,8 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     assert "954.887" in out and "point (0.4, 0.1) m: stroke" in out and max(map(len, out.splitlines())) <= 80
     assert "rotation: exciter 0 anticlockwise, exciter 1 clockwise" in out and "margin: factor" in out
     assert "natural frequencies: 42.706, 42.706, 51.247 rpm" in out and "stable, above all natural frequencies:" in out
+    code, _, err = typed("regimes", "screen.toml", "--slope", "10")
+    assert code == 2 and "--slope is 10 rad (573 degrees), no slope of a deck; write degrees as '10 deg'" in err
     shown = float(out.split("throw number ")[1].split(",")[0])
     scene = jv.load_scene(tmp_path / "screen.toml")
     np.testing.assert_allclose(shown, jv.working_regime(scene).ellipse((0.4, 0.1), slope="-5 deg").throw_number, rtol=5e-3)
