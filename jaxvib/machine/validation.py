@@ -160,6 +160,9 @@ def implausible_numbers(scene: Scene) -> list[str]:
         if at is not None and lever and (far := float(np.linalg.norm(at))) > _MAX_LEVERS * lever:
             value = f"{far:.4g} m from the centre of mass, the supports at most {lever:.4g} m"
             note(f"{place}at", value, "m", f"{float(np.max(np.abs(at))):g} mm")
+    for k, support in enumerate(getattr(scene.machine, "supports", ())):
+        if (angle := abs(float(getattr(support, "angle", 0.0)))) > 2.0 * np.pi:
+            note(f"machine.supports[{k}].angle", f"{angle:g} rad", "rad", f"{angle:g} deg")
     mass = float(np.sum(getattr(scene.machine, "mass", 0.0)))
     if mass > _MAX_MASS:
         note("machine.mass", f"{mass / 1e3:g} t", "kg", f"{mass / 1e3:g} kg")

@@ -375,6 +375,9 @@ def test_implausible_bodies_in_a_plane_are_noted():
         "machine.supports.stiffness is so small that the machine sags by 2.98e+03 m; a plain number is in N/m: "
         "did you mean '460 N/mm'?",
     ]
+    turned = SCREENS["linear_screen"].replace('# angle = "0 deg"', "angle = 15.0     #", 1)
+    (note,) = implausible_numbers(jv.scene_from_toml(turned))
+    assert note == "machine.supports[0].angle is 15 rad; a plain number is in rad: did you mean '15 deg'?"
 
 
 def test_failure_with_json_is_one_document(typed):
