@@ -194,6 +194,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  {error}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
                 *([] if self.window.time.dtype.itemsize >= 8 else [_SINGLE_PRECISION]),
+                *([] if self.settled else [self._window_text()]),
                 f"  {self.speeds_text(self.scene, self.window.rotor_speeds)}",
                 f"  {self.amplitude_text(self.scene)}",
                 *(f"  {line}" for line in measures_text(self.scene, self.no_vibration, self.vibration, measures)),
@@ -205,6 +206,10 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
             ]
         )
 
+    def _window_text(self) -> str:
+        start, end = (f"{float(self.window.time[k]):.4g}" for k in (0, -1))
+        return f"  the following values are those from {start} to {end} s, while the motion still changes"
+
     def _pass_through_note(self) -> list[str]:
         if not overlap(self.scene, self._stored):
             return []
@@ -214,7 +219,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         structure = self.scene.machine.structure()
         largest = zip(structure.coordinates, np.asarray(self.largest_displacement), structure.units, strict=True)
         named = ", ".join(f"{name} {quantity_text(x, unit, 4)}" for name, x, unit in largest)
-        return f"largest on the way: {named}; foundation force {quantity_text(self.largest_force, 'N', 4)}"
+        return f"largest on the way, zero to peak: {named}; foundation force {quantity_text(self.largest_force, 'N', 4)}"
 
     def _detachment(self) -> list[str]:
         times = np.asarray(self.detached)

@@ -27,7 +27,7 @@ def test_a_screen_that_coasts_down_has_no_measures(stopped):
     assert "turns in the measured window, fewer than 3" in stopped.no_vibration
     text = stopped.summary()
     assert f"no vibration to measure: {stopped.no_vibration}" in text and "% reach the foundation" not in text
-    assert "not settled: the exciters are almost at rest" in text and "largest on the way: x" in text
+    assert "not settled: the exciters are almost at rest" in text and "largest on the way, zero to peak: x" in text
     with pytest.raises(jv.InputError, match="run has no vibration to measure: the exciters make"):
         stopped.vibration()
 
@@ -82,7 +82,7 @@ def test_a_deck_without_vibration_has_a_note_and_its_peak(stopped, tmp_path, mon
     assert run_command(["simulate", str(path), "--until", "60s", "--deck", "1.5,0.1"]) == 0
     text, err = capsys.readouterr()
     peak = 1e3 * float(stopped.point(AT, part="all").largest_displacement)
-    assert f"largest on the way: point (1.5, 0.1) m {peak:.4g} mm" in text
+    assert f"largest on the way, zero to peak: point (1.5, 0.1) m {peak:.4g} mm" in text
     assert "--deck, --slope: no stroke, throw and conveying" in err
     assert run_command(["simulate", str(path), "--until", "60s", "--deck", "1.5,0.1", "--json"]) == 0
     document = json.loads(capsys.readouterr()[0])
