@@ -167,7 +167,7 @@ def test_motor_lifts_the_sum_of_unbalance_and_imbalance(angle, moment):
         (lambda motor: jv.SpeedControl(jv.ConstantSpeed(100.0), 0.5, 2.0, torque_limit=8.0, inertia=0.02), None),
     ],
 )
-def test_torque_at_rest_that_rises_is_not_compared_with_the_weight(drive, start):
+def test_torque_at_rest_that_rises_is_not_judged(drive, start):
     exciter = jv.Exciter(drive=drive(jv.DCMotor(100.0, stall_torque=2.5, inertia=0.5)), unbalance=0.4)
     scene = jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), exciters=[exciter], effects=jv.Gravity())
     (torques,) = lifting_torques(scene)

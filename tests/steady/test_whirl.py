@@ -193,7 +193,7 @@ def test_single_precision_says_which_whirls_it_loses(soft):
             found((1e8, 10.0))
 
 
-def test_sense_of_a_whirl_is_the_same_for_a_machine_from_matrices():
+def test_machines_from_matrices_have_the_same_sense_of_whirls():
     """Two springs of different stiffness move the axis on straight lines, equal ones on circles in both directions."""
     loads, drive = jv.balls(count=2, mass=0.05, radius=0.08, drag=1.0), jv.ConstantSpeed(100.0)
     for up, sense in ((1.4e6, ["straight", "straight"]), (1e6, ["backward", "forward"])):

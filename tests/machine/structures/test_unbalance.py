@@ -51,7 +51,7 @@ def test_mass_of_an_unbalance_is_a_point_mass_at_the_axis():
     np.testing.assert_allclose(jv.natural_frequencies(own), jv.natural_frequencies(other), rtol=1e-12)
 
 
-def test_mass_of_an_unbalance_on_a_tilting_rotor_is_at_its_station():
+def test_mass_of_an_unbalance_on_a_rotor_is_at_its_station():
     machine = jv.rotor(
         mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=6e5, damping=400.0, position=(0.165, -0.155)
     )

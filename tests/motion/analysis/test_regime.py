@@ -233,7 +233,7 @@ def test_loads_off_the_mass_centre_balance_tilted_rotors(tilts, label):
     assert jv.regime(s, motion).label == label
 
 
-def test_mode_numbers_of_equal_frequencies_are_those_of_the_jam_modes():
+def test_modes_of_equal_frequencies_are_those_of_jam_modes():
     """A planar rotor on equal supports has modes 1, 2 and 5 at its two equal natural frequencies."""
     machine = jv.planar_rotor(mass=20.0, stiffness=6.3e5, damping=60.0)
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.05, radius=0.08, drag=1.0), jv.ConstantSpeed(320.0))
