@@ -111,6 +111,8 @@ def test_group_of_one_mass_is_a_scene_of_its_own():
     np.testing.assert_allclose(alone.speed, single.speed, rtol=1e-12)
     np.testing.assert_allclose(alone.growth, single.growth, rtol=1e-6)
     np.testing.assert_allclose(alone.power, single.power, rtol=1e-9)
+    with pytest.raises(jv.InputError, match=f"masses has 1 of the scene's {len(scene.exciters)} rotating masses"):
+        alone.vibration()
 
 
 def test_a_motion_is_stable_if_all_its_groups_are():
