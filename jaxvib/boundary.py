@@ -356,7 +356,7 @@ def _problem_of_array(value: Any) -> str | None:
 def _has_boolean(value: Any) -> bool:
     """Return True if nested lists contain a Boolean or an array of Booleans."""
     if isinstance(value, (list, tuple)):
-        return any(map(_has_boolean, value))
+        return not set(map(type, value)) <= {int, float} and any(map(_has_boolean, value))
     return isinstance(value, bool) or getattr(value, "dtype", None) == np.bool_
 
 
