@@ -12,6 +12,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.cli.app import app, run
+from optimize import load_design
 
 ROOT = pathlib.Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -97,6 +98,17 @@ def test_the_rotor_without_balls_of_the_page_is_a_scene_file():
     with_balls = jv.scene_from_toml(balancer)
     assert float(scene.exciters[0].unbalance) == float(with_balls.all_effects[0].moment) and scene.exciters[0].loads is None
     assert scene.exciters[0].drive == with_balls.drive
+
+
+def test_the_design_file_of_the_page_is_read(tmp_path):
+    page = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+    (tmp_path / "feeder.toml").write_text(template("feeder"))
+    for name, first in (("design.toml", "scene = "), ("springs.csv", "spring;")):
+        (text,) = re.findall(rf"```\w+\n({first}.*?)```", page, flags=re.S)
+        (tmp_path / name).write_text(text)
+    design = load_design(tmp_path / "design.toml")
+    assert design.space.size == 2 and len(design.space.choices) == 1
+    assert design.objective.name == "foundation_force" and len(design.subject_to) == 1
 
 
 def template(name):
