@@ -395,7 +395,7 @@ def _samples(
         used = np.isfinite(values) & (index >= 0) & (index < count)
         raw[index[used], k], mask[index[used], k] = values[used], ~clipped[used]
         bounded_by = index[used & clipped]
-        bounds[bounded_by, k] = np.sign(raw[bounded_by, k] - np.median(raw[:, k]))
+        bounds[bounded_by, k] = np.sign(raw[bounded_by, k] - np.median(values[used] if np.any(used) else 0.0))
     numbers, actions, amounts = _changes(scene, run)
     samples = Samples(
         drives=tuple(angle.without_errors() for angle in angles),

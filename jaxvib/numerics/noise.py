@@ -66,24 +66,25 @@ def noise_of(residual: np.ndarray) -> Noise:
 
 
 def is_outlier(residual: np.ndarray) -> np.ndarray:
-    """Return True for samples (n,) far from the median of the samples around them.
+    """Return True for samples (n,) far from the median of the samples around them; samples that are NaN are left out.
 
     >>> residual = np.random.default_rng(0).normal(size=1000)
     >>> residual[[200, 500]] = 50.0
     >>> np.flatnonzero(is_outlier(residual)).tolist()
     [200, 500]
     """
-    finite = np.where(np.isfinite(residual), residual, 0.0)
-    if np.max(np.abs(finite), initial=0.0) <= _OUTLIER_DISTANCE * _spread(finite):
-        return np.zeros(residual.size, bool)
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(finite, _NEIGHBORS, mode="edge"), 2 * _NEIGHBORS + 1)
-    distance = finite - np.median(around, axis=1)
-    return np.abs(distance) > _OUTLIER_DISTANCE * max(_spread(distance), 1e-300)
+    present = np.flatnonzero(np.isfinite(residual))
+    values, flags = residual[present], np.zeros(residual.size, bool)
+    if np.max(np.abs(values), initial=0.0) > _OUTLIER_DISTANCE * _spread(values):
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(values, _NEIGHBORS, mode="edge"), 2 * _NEIGHBORS + 1)
+        distance = values - np.median(around, axis=1)
+        flags[present] = np.abs(distance) > _OUTLIER_DISTANCE * max(_spread(distance), 1e-300)
+    return flags
 
 
 def _spread(values: np.ndarray) -> float:
     """Return the standard deviation of normally distributed values, from the median of their absolute values."""
-    return 1.4826 * float(np.median(np.abs(values)))
+    return 1.4826 * float(np.median(np.abs(values))) if values.size else 0.0
 
 
 def outliers_of(white: np.ndarray) -> tuple[float, float, float]:

@@ -105,6 +105,15 @@ def test_channels_with_different_times_are_on_one_grid():
     np.testing.assert_allclose(problem.angles[0][:, 0], time**2, atol=1e-12)
 
 
+def test_sides_of_clipped_readings_of_a_slow_channel():
+    slow = 9.0 + np.sin(T[::4])
+    slow[[20, 60]] = 7.5, 9.8
+    clipped = {"b": np.isin(np.arange(slow.size), [20, 60])}
+    run = run_with({"a": np.sin(T), "b": slow}, {"a": T, "b": T[::4]}, clipped=clipped)
+    problem = build_problem(scene_of(), [run], ["machine.stiffness"], {})
+    assert problem.bounds[0][[80, 240], 1].tolist() == [-1, 1]
+
+
 def test_span_of_the_angle_bounds_the_samples():
     channels = [channel("a"), jv.Channel("rotor", "angle")]
     turning = 12.0 * T[50:350]

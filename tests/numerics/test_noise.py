@@ -1,8 +1,9 @@
 """Noise of residuals: samples that are no part of it."""
 
 import numpy as np
+import pytest
 
-from jaxvib.numerics.noise import is_outlier
+from jaxvib.numerics.noise import is_outlier, noise_of
 
 
 def test_residuals_that_decay_from_the_start_are_no_outliers():
@@ -12,3 +13,24 @@ def test_residuals_that_decay_from_the_start_are_no_outliers():
     )
     residual[1000] += 30.0
     assert np.flatnonzero(is_outlier(residual)).tolist() == [1000]
+
+
+@pytest.mark.parametrize(
+    "present",
+    [pytest.param(slice(None, None, n), id=f"each {n}") for n in (1, 2, 3, 10)] + [pytest.param(slice(3600, None), id="end")],
+)
+def test_missing_samples_do_not_change_the_noise(present):
+    residual = np.full(6000, np.nan)
+    residual[present] = np.random.default_rng(0).normal(size=6000)[present]
+    noise = noise_of(residual)
+    assert noise.taps.tolist() == [1.0]
+    assert noise.outliers == 0.0
+    assert noise.deviation == pytest.approx(1.0, rel=0.05)
+
+
+def test_outliers_are_found_between_missing_samples():
+    residual = np.full(3000, np.nan)
+    residual[::3] = np.random.default_rng(0).normal(size=1000)
+    residual[[300, 1500]] = 50.0
+    assert np.flatnonzero(is_outlier(residual)).tolist() == [300, 1500]
+    assert not np.any(is_outlier(np.full(5, np.nan)))

@@ -108,7 +108,8 @@ def filter_readings(value: np.ndarray, factor: int) -> tuple[np.ndarray, int]:
     for _ in range(_PASSES):
         smooth = _smooth(value, taps)
         deviation = value - smooth
-        spread = 1.4826 * float(np.median(np.abs(deviation[inside][:: max(value.size // 100_000, 1)])))
+        present = np.abs(deviation[inside][~is_missing[inside]][:: max(value.size // 100_000, 1)])
+        spread = 1.4826 * float(np.median(present)) if present.size else 0.0
         limit = max(_OUTLIER_DISTANCE * spread, _RIPPLE * float(np.std(value)))
         far_indices = np.flatnonzero(np.abs(deviation[inside]) > limit) + half
         local_median = np.median(deviation[far_indices[:, None] + np.arange(-_NEIGHBORS, _NEIGHBORS + 1)], axis=1)

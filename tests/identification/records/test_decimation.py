@@ -56,6 +56,15 @@ def test_readings_near_a_gap_are_missing():
     np.testing.assert_allclose(found[~missing], SIGNAL[KEPT][~missing], atol=2e-5)
 
 
+def test_missing_readings_make_no_outliers_of_the_others():
+    values = SIGNAL + 0.05 * np.random.default_rng(0).normal(size=T.size)
+    whole, _ = filter_readings(values, FACTOR)
+    values[15_000:35_000] = np.nan
+    found, outliers = filter_readings(values, FACTOR)
+    assert outliers == 0
+    np.testing.assert_allclose(found[np.isfinite(found)], whole[np.isfinite(found)], atol=1e-12)
+
+
 def test_long_run_is_filtered_with_a_note():
     found = decimated(run_of(SIGNAL), HIGHEST)
     assert found.notes == (
