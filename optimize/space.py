@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
 from types import ModuleType
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -402,7 +403,19 @@ def _read_ties(scene: Scene, ties: Mapping[str, Source], used: set) -> tuple[Tie
             raise InputError(f"ties.{name}", f"has no ratio to {source_name}, which is 0 in the scene; give a factor")
         used = used | target.entries
         read.append(Tie(target, source, tuple(map(float, ratio))))
-    return tuple(read)
+    return _in_order(read)
+
+
+def _in_order(ties: Sequence[Tie]) -> tuple[Tie, ...]:
+    """Return the ties in an order in which each follows the ties that determine its source."""
+    before = {
+        k: [n for n, other in enumerate(ties) if other.target.entries & tie.source.entries] for k, tie in enumerate(ties)
+    }
+    try:
+        return tuple(ties[k] for k in TopologicalSorter(before).static_order())
+    except CycleError as error:
+        first, *others, _ = (ties[k].target.name for k in error.args[1])
+        raise InputError(f"ties.{first}", f"is tied to itself through {' and '.join(others)}; remove one of these ties") from None
 
 
 def _with_value(held: HeldQuantity, scene: Scene) -> HeldQuantity:

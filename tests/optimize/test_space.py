@@ -60,6 +60,13 @@ def test_ties_follow_in_order():
     np.testing.assert_allclose(all_of_them.at(jnp.array([0.0, 1.0])).machine.damping, [10.0, 90.0])
 
 
+def test_order_of_ties_does_not_matter():
+    ties = {"machine.stiffness[0]": "machine.stiffness[1]", "machine.stiffness[1]": ("machine.stiffness[2]", 2.0)}
+    for order in (ties, dict(reversed(ties.items()))):
+        built = DesignSpace(THREE, {"machine.stiffness[2]": (1e4, 9e4)}, ties=order).at(jnp.array([0.5]))
+        np.testing.assert_allclose(built.machine.stiffness, [1e5, 1e5, 5e4])
+
+
 def test_residual_of_a_held_quantity_is_relative():
     space = DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4)}, [hold(total("machine.stiffness"), "100 N/mm")])
     from optimize.quantities.evaluation import Evaluation
@@ -94,6 +101,12 @@ FREE = {"machine.stiffness": (1e4, 9e4)}
         (lambda: DesignSpace(SCENE, FREE, ties={"machine.damping": 3.0}), "or (name, factor)"),
         (lambda: DesignSpace(SCENE, FREE, ties={"machine.damping": ("a", "b", "c")}), "or (name, factor)"),
         (lambda: DesignSpace(SCENE, FREE, ties={"machine.damping[0]": "machine.damping"}), "is tied to itself"),
+        (
+            lambda: DesignSpace(
+                SCENE, FREE, ties={"loads.mass": "machine.damping[0]", "machine.damping[0]": ("loads.mass", 2.0)}
+            ),
+            "is tied to itself through",
+        ),
         (lambda: DesignSpace(THREE, FREE, ties={"loads.drag": "machine.damping"}), "name a single entry"),
         (lambda: DesignSpace(SCENE, FREE, ties=[1.0]), "ties is [1.0]; it must be a dictionary"),
         (lambda: DesignSpace(SCENE, 3.0), "free is 3.0; it must be a dictionary"),
