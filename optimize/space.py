@@ -408,14 +408,13 @@ def _read_ties(scene: Scene, ties: Mapping[str, Source], used: set) -> tuple[Tie
 
 def _in_order(ties: Sequence[Tie]) -> tuple[Tie, ...]:
     """Return the ties in an order in which each follows the ties that determine its source."""
-    before = {
-        k: [n for n, other in enumerate(ties) if other.target.entries & tie.source.entries] for k, tie in enumerate(ties)
-    }
+    before = {k: [n for n, other in enumerate(ties) if other.target.entries & tie.source.entries] for k, tie in enumerate(ties)}
     try:
         return tuple(ties[k] for k in TopologicalSorter(before).static_order())
     except CycleError as error:
         first, *others, _ = (ties[k].target.name for k in error.args[1])
-        raise InputError(f"ties.{first}", f"is tied to itself through {' and '.join(others)}; remove one of these ties") from None
+        problem = f"is tied to itself through {' and '.join(others)}; remove one of these ties"
+        raise InputError(f"ties.{first}", problem) from None
 
 
 def _with_value(held: HeldQuantity, scene: Scene) -> HeldQuantity:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import enum
 import hashlib
+import json
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -47,6 +49,9 @@ def _programs(value: Any) -> Iterator[Any]:
             yield from _programs(each)
 
 
+PYTHON = "calls Python"
+"""First words of the digest of a program that calls Python; such a program cannot be compared with other programs."""
+
 _IRRELEVANT_PARAMETERS = ("name", "debug_info", "source_info")
 """Parameters of operations that do not change results."""
 
@@ -72,6 +77,16 @@ def calls_python(program: ClosedJaxpr) -> bool:
     called = [e.params["callback"] for e in _walk(program.jaxpr) if e.primitive.name in ("pure_callback", "io_callback")]
     functions = [getattr(each, "callback_func", each) for each in called]
     return not all(str(getattr(each, "__module__", "")).startswith("equinox.") for each in functions)
+
+
+def program_digest(program: ClosedJaxpr) -> str:
+    """Return a digest of the text of a program, a string of 32 hexadecimal digits, the same in every process.
+
+    If the program calls Python, the digest begins with `PYTHON` and is different in each call.
+    """
+    if calls_python(program):
+        return f"{PYTHON} {uuid.uuid4().hex}"
+    return hashlib.sha256(json.dumps(program_text(program)).encode()).hexdigest()[:32]
 
 
 def _lines(closed: Any, depth: int = 0) -> Iterator[str]:

@@ -25,10 +25,6 @@ _OPTIONS = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_p
 """Options of JAX that change results."""
 
 
-PYTHON = "calls Python"
-"""First words of the digest of a program that calls Python; such a program cannot be compared with other programs."""
-
-
 class CaseStatus(eqx.Enumeration):
     """Outcomes of a case. The value of each member is the message shown to the user. The order is part of the format of the
     store."""

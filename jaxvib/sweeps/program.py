@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -18,11 +17,10 @@ from jaxvib.motion.batch import PARTS_OF_RUN, BatchPlan, run_in_batch
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state
 from jaxvib.motion.stiffness import equal_step_length, fastest_decay
-from jaxvib.results.fields import Plain
-from jaxvib.runtime.operations import calls_python, program_text
+from jaxvib.runtime.operations import program_digest
 from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Axis, Target, extreme_cases, put, put_start
-from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, Study, digest
+from jaxvib.sweeps.definition import CASE_STATUSES, Study
 from jaxvib.sweeps.measures import Measure, RunMeasure
 from optimize.quantities.evaluation import Evaluation
 
@@ -161,9 +159,7 @@ def traced_program(study: Study) -> tuple[list[jax.ShapeDtypeStruct], str]:
         return _measure_cases(study.scene, values, *study.choices)
 
     program, (leaves, _) = jax.make_jaxpr(cases, return_shape=True)(values)
-    text: list[Plain] = [*program_text(program)]
-    identity = f"{PYTHON} {uuid.uuid4().hex}" if calls_python(program) else digest(text)
-    return [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves], identity
+    return [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves], program_digest(program)
 
 
 def compute(study: Study, chunk: int) -> Chunk:

@@ -28,9 +28,10 @@ from jaxvib.errors import InputError, optional_module, quoted
 from jaxvib.machine.files import Tables
 from jaxvib.results.fields import Plain
 from jaxvib.results.status import member, sentence
+from jaxvib.runtime.operations import PYTHON
 from jaxvib.sweeps import seals
 from jaxvib.sweeps.axes import SAMPLE
-from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, CaseStatus, Study, difference
+from jaxvib.sweeps.definition import CASE_STATUSES, CaseStatus, Study, difference
 from jaxvib.sweeps.measures import RunMeasure
 from jaxvib.sweeps.program import Chunk
 

@@ -22,9 +22,10 @@ from jaxvib.motion.start import Start
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member, sentence
+from jaxvib.runtime.operations import PYTHON
 from jaxvib.runtime.parallel import in_parallel
 from jaxvib.sweeps.axes import AxisSpec
-from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, CaseStatus, Study, SweepStatus
+from jaxvib.sweeps.definition import CASE_STATUSES, CaseStatus, Study, SweepStatus
 from jaxvib.sweeps.measures import RUN_MEASURES
 from jaxvib.sweeps.program import compute, traced_program
 from jaxvib.sweeps.store import ChunkState, Store

@@ -23,7 +23,9 @@ import numpy as np
 from jax import Array
 
 from jaxvib.machine.scene import Scene
+from jaxvib.runtime.compat import ClosedJaxpr
 from jaxvib.runtime.devices import on_device
+from jaxvib.runtime.operations import program_digest
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import JamModes, jam_modes
@@ -54,6 +56,7 @@ class Problem(eqx.Module):
     - `scales` (mi,): positive numbers by which the excesses of the demands are divided
     - `batch_size`: the number of designs in a batch
     - `parts`: the number of smooth pieces whose maximum is the objective
+    - `program`: digest of the program of the user's functions, see `find_targets`
     """
 
     space: DesignSpace
@@ -64,6 +67,7 @@ class Problem(eqx.Module):
     scales: Array | np.ndarray
     batch_size: int = eqx.field(static=True, default=_MAX_BATCH_SIZE)
     parts: int = eqx.field(static=True, default=1)
+    program: str = eqx.field(static=True, default="")
 
     @property
     def equalities(self) -> int:
@@ -105,8 +109,8 @@ class Problem(eqx.Module):
         kept_demands = [k for k, d in enumerate(demands) if not (_needs_other_tier(d.quantity) or _needs_other_tier(d.limit))]
         space = eqx.tree_at(lambda s: s.held, self.space, held)
         forms, index = tuple(demands[k] for k in kept_demands), np.asarray(kept_demands, int)
-        keys, parts = _keys_and_parts(space, objective, forms)
-        return Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.batch_size, parts)
+        keys, *traced = _targets_of_search(space, objective, forms)
+        return Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.batch_size, *traced)
 
     @property
     def forward_only(self) -> bool:
@@ -115,10 +119,11 @@ class Problem(eqx.Module):
         return any(q.forward_only for q in quantities) or any(h.quantity.forward_only for h in self.space.held)
 
 
-def _keys_and_parts(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> tuple[tuple[Key, ...], int]:
-    """Return the keys of the load speeds that a search follows, and the number of smooth pieces of the objective."""
+def _targets_of_search(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> tuple[tuple[Key, ...], int, str]:
+    """Return the keys of the load speeds that a search follows, the number of smooth pieces of the objective, and the digest of
+    the program, see `find_targets`."""
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
-    return _targets((objective, *(h.quantity for h in space.held), *sides), _Shapes.of(space.scene))
+    return find_targets((objective, *(h.quantity for h in space.held), *sides), space.scene)
 
 
 def _needs_other_tier(quantity: Quantity) -> bool:
@@ -182,13 +187,13 @@ def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand
     quantity and limit for the initial design, or 1 if both are 0 within rounding.
     """
     forms = tuple(demand.form() for demand in demands)
-    keys, parts = _keys_and_parts(space, objective, forms)
+    keys, *traced = _targets_of_search(space, objective, forms)
     constants = np.asarray([demand.constant or 0.0 for demand in demands], float)
     scales = np.abs(constants)
     if np.any(scales == 0.0):
         sizes = _sizes(space, tuple(q for d in demands for q in (d.quantity, d.limit))).reshape(-1, 2).max(axis=1)
         scales = np.where(scales > 0.0, scales, np.where(np.isfinite(sizes) & (sizes > 0.0), sizes, 1.0))
-    return Problem(space, objective, forms, keys, constants, scales, _batch_size(starts), parts)
+    return Problem(space, objective, forms, keys, constants, scales, _batch_size(starts), *traced)
 
 
 def _sizes(space: DesignSpace, quantities: tuple[Quantity, ...]) -> np.ndarray:
@@ -301,10 +306,28 @@ class _Shapes(NamedTuple):
         return cls(tree, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
 
 
+def find_targets(quantities: Sequence[Quantity], scene: Scene) -> tuple[tuple[Key, ...], int, str]:
+    """Return the keys of the load speeds that these quantities of a scene follow, the number of smooth pieces whose maximum is
+    the first quantity, and the digest of the program of the quantities, "" without a function of the user.
+
+    A user's function is equal to itself after a change of its global variables. Without the digest among the arguments of the
+    compiled functions, the program from before the change would be used again.
+    """
+    quantities, shapes = tuple(quantities), _Shapes.of(scene)
+    parts = (part for quantity in quantities for part in walk(quantity))
+    if any(part.function is not None and not isinstance(part, BuiltinQuantity) for part in parts):
+        keys, count, program = _traced(quantities, shapes)
+        return keys, count, program_digest(program)
+    return *_targets_of_builtin(quantities, shapes), ""
+
+
 @functools.lru_cache(maxsize=256)
-def _targets(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key, ...], int]:
-    """Return the keys of the load speeds that these quantities of a scene follow, and the number of smooth pieces whose maximum
-    is the first quantity."""
+def _targets_of_builtin(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key, ...], int]:
+    return _traced(quantities, shapes)[:2]
+
+
+def _traced(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key, ...], int, ClosedJaxpr]:
+    """Return the keys and the number of smooth pieces, see `find_targets`, and the program of the quantities."""
     recorder = TargetRecorder()
 
     def evaluate_all(scene: Scene) -> tuple[Array, list[Array]]:
@@ -312,17 +335,14 @@ def _targets(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[K
         return quantities[0].pieces(evaluation), [q.read(evaluation) for q in quantities]
 
     scene = jax.tree.unflatten(shapes.tree, [jax.ShapeDtypeStruct(*leaf) for leaf in shapes.leaves])
-    pieces, _ = jax.eval_shape(evaluate_all, scene)
-    return tuple(recorder.keys), pieces.shape[0]
-
-
-def report_keys(quantities: Sequence[Quantity], scene: Scene) -> tuple[Key, ...]:
-    """Return the keys of the load speeds that these quantities follow."""
-    return _targets(tuple(quantities), _Shapes.of(scene))[0]
+    program, (pieces, _) = jax.make_jaxpr(evaluate_all, return_shape=True)(scene)
+    return tuple(recorder.keys), pieces.shape[0], program
 
 
 @cached
-def _evaluate_all(quantities: tuple[Quantity, ...], keys: tuple[Key, ...], scenes: Scene, near: tuple[Array, ...]) -> Array:
+def _evaluate_all(
+    quantities: tuple[Quantity, ...], keys: tuple[Key, ...], program: str, scenes: Scene, near: tuple[Array, ...]
+) -> Array:
     def values_of_scene(scene: Scene, speeds: tuple[Array, ...]) -> Array:
         evaluation = Evaluation(scene, dict(zip(keys, speeds, strict=True)))
         return jnp.stack([q.read(evaluation) for q in quantities])
@@ -339,11 +359,11 @@ def evaluate_quantities(quantities: Sequence[Quantity], scenes: Scene, problem: 
     quantities, leaves = tuple(quantities), jax.tree.leaves(scenes)
     if not quantities:
         return np.zeros((leaves[0].shape[0], 0))
-    keys = report_keys(quantities, jax.tree.map(lambda leaf: leaf[0], scenes))
+    keys, _, program = find_targets(quantities, jax.tree.map(lambda leaf: leaf[0], scenes))
     followed = keys if problem is None or set(keys) - set(problem.keys) else problem.keys
 
     def part(batch: Scene) -> Array:
         near = dict(zip(followed, _speeds_of_branches(followed, batch), strict=True)) if followed else {}
-        return _evaluate_all(quantities, keys, batch, tuple(near[key] for key in keys))
+        return _evaluate_all(quantities, keys, program, batch, tuple(near[key] for key in keys))
 
     return in_chunks(_batch_size(leaves[0].shape[0]) if problem is None else problem.batch_size, part, scenes)

@@ -35,7 +35,7 @@ from optimize import (
 )
 from optimize.quantities import evaluation
 from optimize.quantities.evaluation import Evaluation, guesses
-from optimize.search.problem import report_keys
+from optimize.search.problem import find_targets
 
 OFF = {"machine.stiffness": 0.05}
 FORCE = foundation_force(mode=3)
@@ -78,7 +78,7 @@ class Routes:
     """All derivatives of some quantities, compiled once: of the whole branch, and as a search follows jams."""
 
     def __init__(self, quantities, modes=("forward", "reverse"), whole=True):
-        self.quantities, self.keys = quantities, report_keys(quantities, machine(0))
+        self.quantities, self.keys = quantities, find_targets(quantities, machine(0))[0]
         self.near = eqx.filter_jit(self.speeds)
         by = {"forward": jax.jacfwd, "reverse": jax.jacrev}
         self.routes = {}

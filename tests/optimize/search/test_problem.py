@@ -17,8 +17,8 @@ from optimize.search.problem import (
     evaluate,
     evaluate_quantities,
     find_speeds,
+    find_targets,
     problem_of,
-    report_keys,
     scenes_of,
 )
 
@@ -200,7 +200,20 @@ def test_evaluated_quantities_are_those_of_each_scene():
     other = problem_of(DesignSpace(SCENE, FREE), NEAREST, [], 4)
     np.testing.assert_allclose(evaluate_quantities([SUM, frequency], batch, other), told, rtol=1e-12)
     assert evaluate_quantities([], batch).shape == (3, 0)
-    assert report_keys([SUM, frequency, foundation_force(mode=3)], SCENE) == (((), ("jam", 3)),)
+    assert find_targets([SUM, frequency, foundation_force(mode=3)], SCENE)[0] == (((), ("jam", 3)),)
+
+
+def test_change_of_a_captured_value_changes_a_search():
+    def value():
+        problem = problem_of(DesignSpace(SCENE, FREE), cost, [cost < 1.0], 1)
+        point = evaluate(problem, np.array([[0.25, 0.5]]), ())
+        return [*point.values[0], *evaluate_quantities([cost], scenes_of(problem, np.array([[3e4, 5e4]])))[0]]
+
+    price = [1.0]
+    cost = Quantity("cost", "", lambda s: price[0] * s.machine.stiffness[0] / 1e4)
+    np.testing.assert_allclose(value(), [3.0, 2.0, 3.0])
+    price[0] = 2.0
+    np.testing.assert_allclose(value(), [6.0, 5.0, 6.0])
 
 
 def test_modes_of_cases_are_looked_up_in_their_scenes():
