@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -145,10 +145,25 @@ def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:
     return value, best, max(first - best, 0.0)
 
 
-def relative(value: ArrayLike, reference: np.ndarray) -> float:
-    """Return the largest difference, relative to the largest reference value; infinite for values that are not finite."""
-    difference = float(np.max(np.abs(np.ravel(np.asarray(value, float)) - reference)) / np.max(np.abs(reference)))
+def relative(value: ArrayLike, reference: np.ndarray, units: Sequence[str] = ()) -> float:
+    """Return the largest difference, relative to the largest reference value; infinite for values that are not finite.
+
+    **Arguments**: `units` of the values, if they differ; a difference is then relative to the largest value of its unit.
+    """
+    differences = np.abs(np.ravel(np.asarray(value, float)) - reference)
+    largest = largest_by_unit(np.abs(reference), units or [""] * len(reference))
+    difference = float(np.max(differences[largest > 0.0] / largest[largest > 0.0], initial=-np.inf))
     return difference if np.isfinite(difference) else np.inf
+
+
+def largest_by_unit(values: ArrayLike, units: Sequence[str]) -> np.ndarray:
+    """Return the largest of the `values` (n,) with the same unit, for each of the `units` (n,).
+
+    >>> largest_by_unit([1e-3, 2e-3, 0.1], ["m", "m", "rad"]).tolist()
+    [0.002, 0.002, 0.1]
+    """
+    values, units = np.asarray(values, float), np.asarray(units)
+    return np.array([np.max(values[units == unit]) for unit in units])
 
 
 def row_of(

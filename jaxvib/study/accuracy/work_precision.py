@@ -180,8 +180,10 @@ def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) 
 
     reference = np.ravel(np.asarray(read(jam.fine), float))
 
+    units = scene.machine.structure().units if quantity == "amplitude" else ()
+
     def error(value: Array) -> float:
-        return relative(value, reference)
+        return relative(value, reference, units)
 
     def leading(scene: Scene, dtype: str) -> CostRow:
         call = _compiled(lambda s: read(jam_modes(s).select(mode)), scene)
@@ -210,7 +212,7 @@ def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) 
 
         integrated, reasons = _integrated(request, read, error, start, length)
         rows, left_out = rows + integrated, left_out + reasons
-    return Cost(quantity, reference.tolist(), relative(read(jam.coarse), reference), rows, tuple(left_out))
+    return Cost(quantity, reference.tolist(), error(read(jam.coarse)), rows, tuple(left_out))
 
 
 def _at_the_end(request: _Request, quantity: str, end: float | None, reason: str) -> Cost:
@@ -221,6 +223,7 @@ def _at_the_end(request: _Request, quantity: str, end: float | None, reason: str
         return getattr(found, quantity)
 
     start = initial_state(request.scene)
+    units = request.scene.machine.structure().units if quantity == "amplitude" else ()
 
     @functools.cache
     def reference(tolerance: float = 1e-13) -> np.ndarray:
@@ -229,8 +232,11 @@ def _at_the_end(request: _Request, quantity: str, end: float | None, reason: str
         run = simulate(request.scene, end, save="window", stepsize_controller=Tolerance(tolerance), estimate=False)
         return np.ravel(np.asarray(read(run), float))
 
-    rows, left_out = _integrated(request, read, lambda value: relative(value, reference()), start, lambda tolerance: end)
-    return Cost(quantity, reference().tolist(), relative(reference(1e-11), reference()), rows, (reason, *left_out))
+    def error(value: Array) -> float:
+        return relative(value, reference(), units)
+
+    rows, left_out = _integrated(request, read, error, start, lambda tolerance: end)
+    return Cost(quantity, reference().tolist(), relative(reference(1e-11), reference(), units), rows, (reason, *left_out))
 
 
 def _integrated(

@@ -21,7 +21,7 @@ from jaxvib.motion.run import Run
 from jaxvib.motion.start import initial_state
 from jaxvib.runtime.cache import compiled_anew
 from jaxvib.runtime.operations import count_operations
-from jaxvib.study.accuracy.cost import timed
+from jaxvib.study.accuracy.cost import largest_by_unit, timed
 from jaxvib.study.audit.comparisons import JamComparison, MotionValues, RunComparison, without_excluded_effects
 from jaxvib.study.audit.variants import Variant
 
@@ -142,9 +142,8 @@ def relative_changes(new: MotionValues, old: MotionValues, own: MotionValues, un
     **Arguments**: `units` (nd,): unit of each coordinate.
     """
     differences, size = np.asarray(new.amplitude) - np.asarray(old.amplitude), own.magnified * np.asarray(own.amplitude)
-    largest = {unit: max(x for x, u in zip(size, units, strict=True) if u == unit) for unit in units}
-    shares = [float(d) / largest[u] if largest[u] > 0.0 else math.nan for d, u in zip(differences, units, strict=True)]
-    known_shares = [x for x in shares if not math.isnan(x)]
+    largest = largest_by_unit(size, units)
+    known_shares = [float(d / x) for d, x in zip(differences, largest, strict=True) if x > 0.0 and not math.isnan(d)]
     changes = {"amplitude": float(max(known_shares, key=abs)) if known_shares else math.nan}
     for name in CHANGES[1:]:
         before, after, scale = getattr(old, name), getattr(new, name), getattr(own, name)

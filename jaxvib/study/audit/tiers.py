@@ -18,7 +18,7 @@ from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.results.status import status_name
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.study.accuracy.cost import timed
+from jaxvib.study.accuracy.cost import largest_by_unit, timed
 from jaxvib.study.accuracy.exact_reference import WINDOW_PERIODS, slow_period
 from jaxvib.study.audit.comparisons import JamComparison, MotionValues, RunComparison
 
@@ -30,8 +30,8 @@ class TierRow(NamedTuple):
 
     - `tier`: its name; `applicable`: True if it can compute the quantities of the audit for the scene
     - `amplitude`, `foundation_force`, `omega`: the relative error of this quantity, compared with the best tier, not the
-      quantity itself; for `amplitude` the error of the coordinate with the largest error, in units of the largest amplitude;
-      NaN if `applicable` is False
+      quantity itself; for `amplitude` the error of the coordinate with the largest error, relative to the largest
+      amplitude in the same unit; NaN if `applicable` is False, and for an error relative to 0
     - `seconds` of a computation; `compile`: additional seconds of the first computation; NaN without timings
     - `note`: purpose of the tier, the reason why it cannot compute the quantities, or the motion to which the run left the jam
     """
@@ -49,7 +49,7 @@ class TierRow(NamedTuple):
         """Return the row as text."""
         if not self.applicable:
             return f"not applicable; {self.note}"
-        largest_error = max(abs(self.amplitude), abs(self.foundation_force), abs(self.omega))
+        largest_error = max((abs(x) for x in self[2:5] if not math.isnan(x)), default=math.nan)
         time_text = "" if math.isnan(self.seconds) else f", {self.seconds:.2g} s"
         return f"error {100.0 * largest_error:.2g} %{time_text}; {self.note}"
 
@@ -83,17 +83,23 @@ def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, re
     note = tier.purpose
     if isinstance(comparison, JamComparison) and isinstance(result, MotionValues) and result.kind != "jammed":
         note = f"the run left the jam: {result.kind}"
-    errors = (amplitude - size) / np.max(size)
+    largest = largest_by_unit(size, scene.machine.structure().units)
+    errors = (amplitude - size)[largest > 0.0] / largest[largest > 0.0]
     return TierRow(
         tier.name,
         True,
-        float(errors[np.argmax(np.abs(errors))]),
-        float(result.foundation_force) / reference.foundation_force - 1.0,
-        float(result.omega) / reference.omega - 1.0,
+        float(max(errors, key=abs, default=math.nan)),
+        _relative_error(float(result.foundation_force), reference.foundation_force),
+        _relative_error(float(result.omega), reference.omega),
         seconds,
         compiling,
         note,
     )
+
+
+def _relative_error(value: float, reference: float) -> float:
+    """Return the relative error of a value; NaN if only the reference is 0, such as the force on a missing foundation."""
+    return 0.0 if value == reference else value / reference - 1.0 if reference else math.nan
 
 
 def _call(

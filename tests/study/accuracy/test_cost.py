@@ -1,6 +1,7 @@
 """Cost of accuracy: all methods for a quantity against one reference."""
 
 import json
+import math
 
 import jax
 import numpy as np
@@ -9,7 +10,7 @@ from scenes import published
 
 import jaxvib as jv
 from jaxvib.cli.app import run
-from jaxvib.study.accuracy.cost import Cost, CostRow, cost_figure
+from jaxvib.study.accuracy.cost import Cost, CostRow, cost_figure, relative
 from jaxvib.study.accuracy.exact_reference import slow_period
 
 
@@ -27,6 +28,14 @@ def test_methods_agree_within_their_errors(tmp_path, capsys):
     assert 1e-7 < by_tier["leading order"][0] < 1e-2 and min(by_tier["exact orbit"]) < 1e-9
     assert told["reference_error"] < 1e-9 and told["cheapest"]["1e-06"]["tier"] == "exact orbit"
     assert (tmp_path / "out" / "cost.png").stat().st_size > 10_000
+
+
+def test_errors_are_relative_within_a_unit():
+    reference, units = np.array([1e-3, 1e-3, 0.1]), ("m", "m", "rad")
+    assert relative([2e-3, 1e-3, 0.1], reference, units) == pytest.approx(1.0)
+    assert relative([2e-3, 1e-3, 0.1], reference) == pytest.approx(0.01)
+    assert relative([1e-9, 0.0, 0.2], np.array([0.0, 0.0, 0.1]), units) == pytest.approx(1.0)
+    assert relative([math.nan, 1e-3, 0.1], reference, units) == relative([1.0], np.zeros(1)) == math.inf
 
 
 def light():

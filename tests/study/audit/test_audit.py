@@ -415,13 +415,33 @@ def test_exciters_without_loads_are_refused(drive):
         jv.audit(scene)
 
 
+OWN_TIER = SimpleNamespace(name="own", purpose="a purpose", refusal=lambda scene: None)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.0])
+def test_errors_of_a_tier_are_relative_within_a_unit(monkeypatch, scale):
+    """A twofold displacement is an error of 100 % beside tilts of any size; a force or motion of 0 has no relative error."""
+    units = np.array(ROTOR.machine.structure().units)
+    size = np.where(units == "m", 1e-3 * scale, 0.1)
+    reference = MotionValues("jam", 50.0, tuple(size.tolist()), 100.0 * scale, math.nan, 1e-9)
+    found = SimpleNamespace(amplitude=np.where(units == "m", 2e-3, 0.1), foundation_force=100.0, omega=50.0)
+    monkeypatch.setattr(tiers, "_call", lambda *_: lambda: found)
+    row = tiers._row(OWN_TIER, ROTOR, None, reference, 0)
+    np.testing.assert_allclose(row[2:5], [scale, 0.0 if scale else math.nan, 0.0])
+    assert row.words() == f"error {100 * scale:.2g} %; a purpose"
+    found.foundation_force = 0.0
+    np.testing.assert_allclose(tiers._row(OWN_TIER, ROTOR, None, reference, 0).foundation_force, -scale)
+
+
 def test_a_motion_of_which_a_part_is_unknown_does_not_exist(monkeypatch):
-    tier = SimpleNamespace(name="own", purpose="a purpose", refusal=lambda scene: None)
+    scene = SCENE.replace(
+        machine=jv.two_mass(mass=(50.0, 50.0), stiffness=(4e4, 4e4), damping=(1.0, 1.0), link_stiffness=2e5, link_damping=60.0)
+    )
     reference = MotionValues("jam", 27.0, (2e-3, 1e-3), 600.0, math.nan, 1e-9)
     for amplitude in ((2e-3, math.nan), (math.nan, math.nan), (2e-3, 1.1e-3)):
         found = SimpleNamespace(amplitude=amplitude, foundation_force=600.0, omega=27.0)
         monkeypatch.setattr(tiers, "_call", lambda *_, found=found: lambda: found)
-        row = tiers._row(tier, SCENE, None, reference, 0)
+        row = tiers._row(OWN_TIER, scene, None, reference, 0)
         assert row.applicable == bool(np.all(np.isfinite(amplitude)))
         assert row.note == ("a purpose" if row.applicable else "this motion does not exist")
     np.testing.assert_allclose(row.amplitude, 0.05)
