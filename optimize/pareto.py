@@ -25,7 +25,7 @@ from optimize.synthesize import synthesize
 _SAME_POINT_DIFFERENCE = 1e-6
 """Difference of quantities, relative to the range of the front, below which two machines count as one point."""
 
-_NO_LIMIT = 1e100
+_NO_LIMIT = 1e30
 """Limit that no quantity reaches."""
 
 

@@ -5,6 +5,7 @@ import sys
 from types import SimpleNamespace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -30,6 +31,13 @@ FIRST = of_springs("first", lambda x, y, link: x)
 BENT = of_springs("bent", lambda x, y, link: (90.0 - x**2) ** 0.5 + 0.1 * (y - 3.0) ** 2)  # its front is concave
 SUM = of_springs("sum", lambda x, y, link: x + y + link)
 DEEP = of_springs("deep", lambda x, y, link: (x - 6.0) ** 2 + 0.5 * (y - 5.0) ** 2 + (link - x) ** 2 + 1.0)
+
+
+def test_single_precision_is_refused():
+    with jax.enable_x64(False):
+        space = DesignSpace(scene("two_mass", speed=120.0), TWO)
+        with pytest.raises(jv.InputError, match="needs double precision"):
+            pareto(space, FIRST[0], BOWL[0], points=3, starts=2)
 
 
 @pytest.mark.parametrize(

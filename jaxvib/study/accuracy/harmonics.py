@@ -25,7 +25,7 @@ from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import light_rotor_speed
 from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
-from jaxvib.units import Number, numbers
+from jaxvib.units import Number, count, numbers
 
 
 class HarmonicConvergence(Result):
@@ -90,6 +90,7 @@ def harmonic_convergence(
     """
     if len(points) == 0 or any(b <= a for a, b in itertools.pairwise(points)):
         raise InputError("points", f"are {quoted(points)}; give numbers of points in ascending order")
+    count(points[0], "points[0]", low=2)
     speeds = jnp.atleast_1d(numbers(omega, "rad/s", "omega", None, low=0.0, open_low=True))
     half = has_half_turn_symmetry(scene.all_effects)
     rows = [_errors(scene, speeds, grid_of(m, half).theta.size) for m in (*points, 2 * points[-1])]

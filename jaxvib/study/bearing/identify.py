@@ -191,12 +191,13 @@ def identify_bearing(
 
 
 def _decay_time(turns: TurningPoints) -> float:
-    """Return the time, s, at which the swing has decayed to a tenth, at least that of the fifth turning point.
+    """Return the time, s, at which the swing has decayed to a tenth, at least that of the fifth turning point, if
+    there are five.
 
     **Returns** infinity if the swing does not decay to a tenth.
     """
     small = np.flatnonzero(turns.amplitude < 0.1 * turns.amplitude[0])
-    return float(turns.time[max(small[0], 4)]) if small.size else math.inf
+    return float(turns.time[min(max(small[0], 4), turns.time.size - 1)]) if small.size else math.inf
 
 
 def _interpret_fit(

@@ -131,7 +131,7 @@ def stability_onset(
     - `between`: two positive values of x; at the lower value the diagram has no such point, at the higher value it has one
     - `omega`: the lowest and the highest load speed of the search, rad/s
     - `points` of each diagram; typical: 60 to 300 (the default). The time is proportional to it
-    - `accuracy` of x, relative; typical: 0.1 to 1e-3 (the default). Each diagram halves the range
+    - `accuracy` of x, relative; at least 1e-12; typical: 0.1 to 1e-3 (the default). Each diagram halves the range
 
     **Returns** x, which is too large by at most `accuracy` (relative). **Raises** `InputError` for an unknown kind, and if the
     diagrams of both values of `between` have such a point, or neither.
@@ -150,7 +150,7 @@ def stability_onset(
         diagram = exact_branches(make_scene(make, x), points=points, least=omega[0], most=omega[1])
         return any(point.kind == kind for point in diagram.special)
 
-    number(accuracy, "", "accuracy", low=0.0, open_low=True)
+    number(accuracy, "", "accuracy", low=1e-12)
     if kind not in MARKS:
         raise InputError("kind", f"is {quoted(kind)}; it must be one of {', '.join(MARKS)}")
     low, high = between

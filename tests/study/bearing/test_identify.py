@@ -14,6 +14,7 @@ from jaxvib.results.estimate import student_quantile
 from jaxvib.runtime.compat import no_host_checks
 from jaxvib.study.bearing.decrement import turning_points
 from jaxvib.study.bearing.fit import _least_squares, first_guess, fit_swing, steps_for
+from jaxvib.study.bearing.identify import _decay_time
 
 
 @pytest.mark.parametrize("degrees", [2.0, 20.0, 40.0, 80.0])
@@ -218,3 +219,9 @@ def test_a_growing_swing_and_a_wrong_length_are_named():
     for length, inertia, status in ((0.25, 0.00625, "found"), (0.26, 0.00625, "found"), (0.4, 0.0, "contradicted")):
         told = jv.BearingPendulum(mass=0.3, length=length, inertia=inertia)
         assert jv.identify(told, jv.Record(t, clean)).status_name == status, length
+
+
+def test_decay_of_a_swing_with_few_turning_points():
+    time, w = np.arange(0.0, 6.0, 0.02), float(ROD.frequency)
+    turns = turning_points(jv.Record(time, 0.5 * np.exp(-0.6 * w * time) * np.sin(w * time)))
+    assert turns.time.size == 4 and _decay_time(turns) == turns.time[-1]
