@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from typing import Generic, NamedTuple, TypeVar, get_args
+from collections.abc import Sequence
+from typing import get_args
 
 import equinox as eqx
 import jax
@@ -243,7 +243,7 @@ def capture(
         flags = (np.all(lag < MAX_CAPTURED_LAG, axis=1) & finite, finite, np.any(runs.detached, axis=1))
         return [flag.reshape(initial_speeds.size, starts) for flag in flags]
 
-    def scan(_: np.ndarray, multiple: int) -> list[Capture]:
+    def scan(multiple: int) -> Capture:
         speed, steps = first_speeds, first * multiple
         flags = outcomes(speed, steps)
         while resolution is not None:
@@ -255,12 +255,16 @@ def capture(
             speed = np.concatenate([speed, finer])[order]
             flags = [np.concatenate(pair)[order] for pair in zip(flags, outcomes(finer, steps), strict=True)]
         captured, finite, detached = flags
-        return [_summarize_captures(speed, captured, finite, detached, turns, steps)]
+        return _summarize_captures(speed, captured, finite, detached, turns, steps)
 
     # A threshold close to one of the speeds may be in the interval below or above it, depending on the steps.
     tolerance = 1.001 * max(np.max(np.diff(first_speeds), initial=0.0) if resolution is None else resolution, 1e-12)
-    scans = refine(scan, lambda result: np.array([result.border]), 1, tolerance, largest_doublings if controller is None else 0)
-    (result,), last_change = scans.results, float(scans.last_change[0, 0])
+    result, last_change = scan(1), math.nan
+    for doubling in range(1, largest_doublings + 1 if controller is None else 1):
+        coarser, result = result, scan(2**doubling)
+        last_change = _change(coarser.border, result.border)
+        if last_change <= tolerance:
+            break
     uncertainty = jnp.fmax(result.uncertainty, last_change) if np.isfinite(result.threshold) else result.uncertainty
     status = CaptureStatus.not_converged if last_change > tolerance else result.status
     return dataclasses.replace(result, last_change=jnp.asarray(last_change), uncertainty=uncertainty, status=status)
@@ -305,6 +309,13 @@ def _threshold_index(captured: np.ndarray) -> int:
     """Return the index of the lowest speed from which on all starts are captured, or the number of speeds if there is none."""
     failing = np.flatnonzero(~np.all(captured, axis=1))
     return 0 if failing.size == 0 else int(failing[-1]) + 1
+
+
+def _change(first: float, second: float) -> float:
+    """Return the absolute difference of two borders: 0 between two NaN, infinite between NaN and a number."""
+    if math.isnan(first) or math.isnan(second):
+        return 0.0 if math.isnan(first) and math.isnan(second) else math.inf
+    return abs(first - second)
 
 
 def _summarize_captures(
@@ -386,59 +397,6 @@ in the first scan."""
 _DECAY_PER_STEP = 3.0
 """Largest product of decay rate and step. The method of order 8 is stable up to 5.2; the margin is needed because normal forces
 can be larger than on the equator of the tube, where the rate is computed."""
-
-Scanned = TypeVar("Scanned")
-
-
-class Refined(NamedTuple, Generic[Scanned]):
-    """Results of the finest scans.
-
-    **Attributes**: `results` of P points; `multiple` (P,): the number of steps of each result divided by that of the first
-    scan; `last_change` (P, K): the change of the K borders of each result by the last doubling, infinite if only one of the two
-    scans has the border, NaN without a doubling.
-    """
-
-    results: list[Scanned]
-    multiple: np.ndarray
-    last_change: np.ndarray
-
-
-def refine(
-    scan: Callable[[np.ndarray, int], list[Scanned]],
-    borders: Callable[[Scanned], np.ndarray],
-    points: int,
-    tolerance: float,
-    doublings: int = DOUBLINGS,
-) -> Refined[Scanned]:
-    """Double the steps of each point until its borders change by less than the tolerance.
-
-    **Arguments**: `scan(indices, multiple)` returns the results of points with `multiple` times the steps; `borders` returns
-    the borders of a result, NaN for one that does not exist; `points`: their number P; `tolerance`: the largest allowed change
-    of a border; `doublings`: the largest number of doublings.
-
-    >>> found = refine(lambda i, n: [1.0 / n] * i.size, lambda x: np.array([x]), 1, tolerance=0.3)
-    >>> found.results, found.multiple.tolist(), found.last_change.tolist()
-    ([0.25], [4], [[0.25]])
-    """
-    multiple, unconverged = np.ones(points, dtype=int), np.arange(points)
-    results = scan(unconverged, 1)
-    last_change = np.full((points, *borders(results[0]).shape), np.nan)
-    for k in range(1, doublings + 1):
-        if unconverged.size == 0:
-            break
-        multiple[unconverged] = 2**k
-        for i, finer in zip(unconverged, scan(unconverged, 2**k), strict=True):
-            last_change[i] = _distance(borders(results[i]), borders(finer))
-            results[i] = finer
-        unconverged = unconverged[np.any(last_change[unconverged] > tolerance, axis=1)]
-    return Refined(results, multiple, last_change)
-
-
-def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the absolute differences: 0 between two NaN, infinite between NaN and a number."""
-    difference = np.abs(first - second)
-    missing = np.isnan(first) != np.isnan(second)
-    return np.where(missing, np.inf, np.where(np.isnan(difference), 0.0, difference))
 
 
 def steps_per_second(scene: Scene, equations: Equations = vector_field) -> float:

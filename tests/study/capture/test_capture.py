@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from papers.machines import published_torus
 from papers.printed_torus import printed_torus
+from torus.step_doubling import refine
 
 import jaxvib as jv
 from jaxvib.cli.app import run as command
 from jaxvib.draw.capture import torus_paths
-from jaxvib.study.capture.capture import capture_time, moving_state, refine, steps_per_second
+from jaxvib.study.capture.capture import capture_time, moving_state, steps_per_second
 
 
 def test_a_threshold_is_bracketed_ever_finer():

@@ -20,7 +20,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import require_torus_balls
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.plan import EqualSteps
-from jaxvib.study.capture.capture import DOUBLINGS, MAX_CAPTURED_LAG, moving_state, refine, steps_per_second
+from jaxvib.study.capture.capture import DOUBLINGS, MAX_CAPTURED_LAG, moving_state, steps_per_second
 from papers.machines import TORUS_SPEED, published_torus
 from papers.printed_torus import TABLES, PublishedRow, cosine_torus, gap_torus, printed_torus
 
