@@ -280,7 +280,7 @@ def scene_from_tables(tables: Tables) -> Scene:
         if name not in tables:
             instead = ", or [[exciters]] with an unbalance if it has no loads" if name == "loads" else ""
             raise InputError(name, f"is missing; a scene file needs the table [{name}]{instead}")
-        parts[name] = _build_kind(tables[name], name, SECTIONS[name])
+        parts[name] = build_kind(tables[name], name, SECTIONS[name])
     for name in ("loads", "drive") if several else ():
         if name in tables:
             raise InputError(name, f"is given as well as [[exciters]]; write [exciters.{name}] below each [[exciters]]")
@@ -298,7 +298,7 @@ def _build_exciter(table: object, k: int) -> Exciter:
         raise InputError(f"exciters[{k}]", f"is {quoted(table)}; it must be a table, write [[exciters]]")
     with within(f"exciters[{k}]."):
         values = {name: value for name, value in table.items() if name not in ("loads", "drive", "effects")}
-        parts = {name: _build_kind(table[name], name, SECTIONS[name]) for name in ("loads", "drive") if name in table}
+        parts = {name: build_kind(table[name], name, SECTIONS[name]) for name in ("loads", "drive") if name in table}
         if isinstance(values.get("unbalance"), Mapping):
             values["unbalance"] = build_part(unbalance, values["unbalance"], "unbalance")
         effects = _build_effects(table.get("effects", {}))
@@ -323,7 +323,8 @@ def _build_effects(chosen: object) -> tuple[Effect, ...]:
     return tuple(effects)
 
 
-def _build_kind(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -> T:
+def build_kind(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -> T:
+    """Return the part of a table with its `kind`, one of `kinds`. **Raises** `InputError` for an unknown or missing name."""
     if not isinstance(table, Mapping):
         raise InputError(section, f"is {quoted(table)}; it must be a table, write [{section}]")
     if "kind" not in table:
@@ -334,11 +335,6 @@ def _build_kind(table: object, section: str, kinds: Mapping[str, Callable[..., T
     return build_part(kinds[kind], {k: v for k, v in table.items() if k != "kind"}, section)
 
 
-def build_drive(table: object, section: str) -> Drive:
-    """Return the drive of a table with its `kind`. **Raises** `InputError` for an unknown or missing name."""
-    return _build_kind(table, section, DRIVES)
-
-
 def build_part(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
     """Return `build(**values)`. **Raises** `InputError` for an unknown or missing name, as `section.name`."""
     parameters = inspect.signature(build).parameters
@@ -346,9 +342,10 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
     for name in values:
         if name not in parameters:
             raise InputError(prefix + name, f"is not a field here; {suggest_name(name, list(parameters), values)}")
-    for name, parameter in parameters.items():
-        if parameter.default is parameter.empty and name not in values:
-            raise InputError(prefix + name, f"is missing; needed here: {', '.join(_needed(parameters))}")
+    needed = [name for name, parameter in parameters.items() if parameter.default is parameter.empty]
+    for name in needed:
+        if name not in values:
+            raise InputError(prefix + name, f"is missing; needed here: {', '.join(needed)}")
     entries = {name: _build_entries(_ENTRIES[name], values[name], prefix + name) for name in _ENTRIES if name in values}
     if isinstance(drag := values.get("drag"), Mapping):
         with within(f"{prefix}drag."):
@@ -359,7 +356,7 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
             entries["mass"] = build_part(ball_mass, {**size, **mass}, "")
     for name in ("motor", "reference"):  # drives within a drive
         if isinstance(values.get(name), Mapping):
-            entries[name] = _build_kind(values[name], prefix + name, DRIVES)
+            entries[name] = build_kind(values[name], prefix + name, DRIVES)
     return build(**{**values, **entries})
 
 
@@ -381,10 +378,6 @@ def rebuild_part(part: Any, section: str) -> Any:
     if build is None or not all(hasattr(part, name) for name in inspect.signature(build).parameters):
         return part
     return build_part(build, _fields(part, build), section)
-
-
-def _needed(parameters: Mapping[str, inspect.Parameter]) -> list[str]:
-    return [name for name, parameter in parameters.items() if parameter.default is parameter.empty]
 
 
 @validated

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxvib.boundary import is_real
 from jaxvib.errors import InputError, quoted
@@ -89,14 +90,14 @@ def require_loads(loads: Loads) -> None:
     each, single = (loads.count,), ()
     if np.shape(loads.mass) not in (each, single):
         raise InputError("loads.mass", f"is {_described(loads.mass)}; the shape {each} or {single} is needed")
-    rest = _require_tuple("loads.rest", "", _shapes(lambda loads: loads.rest(), loads), "coordinates")
+    rest = _require_tuple("loads.rest", "", eqx.filter_eval_shape(lambda loads: loads.rest(), loads), "coordinates")
     for u in rest:
         _require_shape("loads.rest", "", u, each)
-    place = _shapes(lambda loads: loads.position(*loads.rest()), loads)
+    place = eqx.filter_eval_shape(lambda loads: loads.position(*loads.rest()), loads)
     position = _require_tuple("loads.position", "", place, "2 or 3 coordinates", 2, 3)
-    force = _shapes(lambda loads: loads.resistance(loads.rest(), loads.rest(), jnp.ones(())), loads)
+    force = eqx.filter_eval_shape(lambda loads: loads.resistance(loads.rest(), loads.rest(), jnp.ones(())), loads)
     resistance = _require_tuple("loads.resistance", "", force, f"{len(rest)}, one force for each coordinate,", len(rest))
-    factor = _shapes(lambda loads: loads.inertia_factor(), loads)
+    factor = eqx.filter_eval_shape(lambda loads: loads.inertia_factor(), loads)
     for name, values in (("position", position), ("resistance", resistance), ("inertia_factor", (factor,))):
         for value in values:
             _require_shape(f"loads.{name}", "", value, each, single)
@@ -107,7 +108,7 @@ def require_drive(drive: Drive) -> None:
     """**Raises** `InputError` for a drive whose methods do not return single numbers."""
     names = ("speed_at", "angle_at", "acceleration_at") if isinstance(drive, IdealDrive) else ()
     for name in ("torque",) if isinstance(drive, Motor) else names:
-        value = _shapes(lambda drive, name=name: getattr(drive, name)(jnp.ones(())), drive)
+        value = eqx.filter_eval_shape(lambda drive, name=name: getattr(drive, name)(jnp.ones(())), drive)
         _require_shape(f"drive.{name}", "", value, ())
 
 
@@ -126,7 +127,7 @@ def require_terms(effect: Effect) -> None:
 def require_forces(effect: Effect, loads: Loads) -> None:
     """**Raises** `InputError` for an effect whose resistance of the `loads` is not one force for each coordinate."""
 
-    def forces(effect: Effect, loads: Loads) -> tuple[Any, list[Any]]:
+    def forces(effect: Effect, loads: Loads) -> tuple[tuple[Array, ...], list[tuple[Array, ...]]]:
         rest, terms = loads.rest(), [term for term in effect.terms() if isinstance(term, LoadResistance)]
         return rest, [term.resistance(loads, rest, rest) for term in terms]
 
@@ -135,10 +136,6 @@ def require_forces(effect: Effect, loads: Loads) -> None:
     for force in found:
         for value in _require_tuple(field, "", force, f"{len(rest)}, one force for each coordinate,", len(rest)):
             _require_shape(field, "", value, (loads.count,), ())
-
-
-def _shapes(function: Callable[[T], Any], part: T) -> Any:
-    return eqx.filter_eval_shape(function, part)
 
 
 def _require_tuple(field: str, name: str, value: Any, needed: str, *lengths: int, least: int = 1) -> Sequence[Any]:

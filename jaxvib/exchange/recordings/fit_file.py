@@ -12,7 +12,7 @@ from jaxvib.identification.further_runs.planned import PlannedRun
 from jaxvib.identification.problem import MOTIONS
 from jaxvib.identification.records.channel import Channel
 from jaxvib.identification.run import MeasuredRun
-from jaxvib.machine.files import Tables, build_drive, build_part, load_scene, suggest_name
+from jaxvib.machine.files import DRIVES, Tables, build_kind, build_part, load_scene, suggest_name
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number
 
@@ -123,7 +123,7 @@ def _candidate(table: Mapping[str, object], k: int, channels: list[Mapping[str, 
         raise InputError(f"{field}.rate", "is missing; write for example rate = '500 Hz'")
     values: dict[str, object] = {
         "name": table["name"],
-        "drive": build_drive(table["drive"], f"{field}.drive"),
+        "drive": build_kind(table["drive"], f"{field}.drive", DRIVES),
         "duration": table["duration"],
         "channels": [build_part(Channel, each, f"{field}.channel") for each in (*moved_channels, *new)],
         "rate": table["rate"] if "rate" in table else first.rate(measured[0]),
