@@ -24,10 +24,7 @@ from optimize.search.find import require_searcher
 from optimize.space import DesignSpace, hold
 
 _QUANTITIES = {
-    name: getattr(module, name)
-    for module in (exciters, jams, machine, motion, response, severity)
-    for name in module.__all__
-    if name != "between"
+    name: getattr(module, name) for module in (exciters, jams, machine, motion, response, severity) for name in module.__all__
 }
 """Quantities of design files by name."""
 

@@ -131,8 +131,7 @@ def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine, and for loads
     of different masses.
     """
-    machine = _platforms(scene, 1)
-    del machine
+    _platforms(scene, 1)
     mass = np.asarray(scene.loads.mass)
     if mass.ndim:
         raise InputError("loads.mass", "differs from load to load; this recipe needs equal loads")

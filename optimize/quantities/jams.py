@@ -22,7 +22,6 @@ from optimize.quantities.quantity import TIERS, BuiltinQuantity, Pair, Quantity,
 
 __all__ = [
     "amplitude",
-    "between",
     "fold_margin",
     "force_per_amplitude",
     "foundation_force",
