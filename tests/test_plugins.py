@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from light_jams import jam_rotor_speed
 from plugins.drive import Turbine
 from plugins.effect import SealFriction
 from plugins.load import TorusPoints
@@ -13,7 +14,6 @@ from scenes import machines, published
 import jaxvib as jv
 from jaxvib.equations.averaged import averaged_field
 from jaxvib.machine.loads import CircularLoads
-from jaxvib.steady.jams.folds import jam_rotor_speed
 from jaxvib.study.audit.tiers import TIERS
 
 TORQUE = 2e-5

@@ -21,10 +21,10 @@ from parts.common import best, first, published, say
 
 import jaxvib as jv
 from jaxvib.equations.jammed_bodies import jammed_bodies
-from jaxvib.equations.linear import jammed_model, steady_displacement
+from jaxvib.equations.linear import jammed_model
 from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import grid_of
-from jaxvib.steady.jams.folds import jam_rotor_speed, rotor_speed_at
+from jaxvib.steady.jams.folds import rotor_speed_at
 from jaxvib.steady.orbits.solve import harmonics_of, periodic_motion
 from jaxvib.steady.orbits.stability import floquet, steps_for
 
@@ -213,8 +213,9 @@ def orbits(quick: bool = False) -> None:
             say(GROUP, name, each, base, error(call()[0]), compiling)
 
     def from_leading_order(w):
-        displacement = steady_displacement(scene, w)
-        return jnp.concatenate([displacement.real, -w * displacement.imag, jnp.stack([w, jam_rotor_speed(scene, w)])])
+        light = jammed_model(scene)
+        displacement = light.displacement(w)
+        return jnp.concatenate([displacement.real, -w * displacement.imag, jnp.stack([w, rotor_speed_at(light, w)])])
 
     start = jax.vmap(from_leading_order)(omega)
     for steps in (32,) if quick else (32, 128):

@@ -15,7 +15,8 @@ import numpy as np
 from parts.common import best, best_in_turn, first, published, say, thrown
 
 import jaxvib as jv
-from jaxvib.steady.jams.folds import jam_rotor_speed
+from jaxvib.equations.linear import jammed_model
+from jaxvib.steady.jams.folds import rotor_speed_at
 
 NAMES = ("stiffness", "damping", "link_stiffness", "link_damping")
 
@@ -84,7 +85,7 @@ def designs(quick: bool = False) -> None:
 
     def one(k: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jax.value_and_grad(
-            lambda k: jam_rotor_speed(eqx.tree_at(lambda s: s.machine.stiffness, scene, k), jnp.asarray(0.9))
+            lambda k: rotor_speed_at(jammed_model(eqx.tree_at(lambda s: s.machine.stiffness, scene, k)), jnp.asarray(0.9))
         )(k)
 
     call = jax.jit(lambda k: jax.lax.map(jax.vmap(one), k.reshape(-1, 1000, 2)))

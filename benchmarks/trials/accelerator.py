@@ -37,7 +37,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from parts.common import best, cpu_name, first, published, thrown, versions  # noqa: E402
 
-from jaxvib.steady.jams.folds import jam_rotor_speed  # noqa: E402
+from jaxvib.equations.linear import jammed_model  # noqa: E402
+from jaxvib.steady.jams.folds import rotor_speed_at  # noqa: E402
 
 Call = Callable[[], Any]
 
@@ -71,7 +72,7 @@ def designs(values: np.ndarray, batch: int) -> Call:
     scene = published()
 
     def speed(k: jax.Array) -> jax.Array:
-        return jam_rotor_speed(eqx.tree_at(lambda s: s.machine.stiffness, scene, k), jnp.asarray(0.9))
+        return rotor_speed_at(jammed_model(eqx.tree_at(lambda s: s.machine.stiffness, scene, k)), jnp.asarray(0.9))
 
     stiffness = jnp.asarray(np.stack([0.05 + 0.15 * values, 0.2 - 0.1 * values], axis=1))
     call = jax.jit(lambda k: jax.lax.map(jax.value_and_grad(speed), k, batch_size=min(batch, len(values))))

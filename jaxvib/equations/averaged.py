@@ -33,7 +33,7 @@ eps = S/(M R), the loads' share of the mass, times the dynamic magnification. If
 circle (two equal directions), e^T B A = 0 and the averaged equations are exact.
 
 The equilibria are exactly the leading-order jams: V = i Omega Y and A = -Omega^2 Y turn the equations into those of
-`steady_displacement` and `jam_rotor_speed`. Gravity and every other potential of the load's angle have mean torque 0.
+`JammedModel.displacement` and `rotor_speed_at`. Gravity and every other potential of the load's angle have mean torque 0.
 
 **Several exciters.** The same equations are valid for every rotating mass, a load or an unbalanced rotor, in either direction:
 its angle in the fixed frame is sigma phi with sigma = +1 (anticlockwise) or -1, and e = (1, -i sigma). The motor of an

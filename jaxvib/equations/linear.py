@@ -226,7 +226,21 @@ class JammedModel(ExcitedModel):
         return cast(CircularLoads, self.scene.loads)
 
     def displacement(self, omega: Array, speed: Array | None = None) -> Array:
-        """Return `steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
+        """Return the complex amplitudes Y (nd,) m of the carrier under loads that turn together at `omega` (scalar, rad/s).
+
+            (K - w^2 (M + sum m_j B^T B) + i w (C + n G)) Y = S w^2 B^T e,     q(t) = Re(Y exp(i w t)),    S = sum m_j R_j
+
+        The angle of the loads is w t. The result is the limit of light loads (eps -> 0) of a jam. If the carrier has a
+        gyroscopic matrix G, the rotor's `speed` n, rad/s, is needed; without it, **raises** `InputError`.
+
+        >>> import jaxvib as jv
+        >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
+        >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+        >>> print(abs(jammed_model(scene).displacement(100.0)[0]))      # 0.1 100^2 / (50 100^2 - 4e4)
+        0.002173913...
+
+        Source: Filimonikhin et al. 2022, section 4; the antiphase paper, equations (25)-(29).
+        """
         if self.mount.gyroscopic is not None and speed is None:
             problem = "jam modes are defined for platforms; use phase_jams, or jam_orbit near a load speed"
             raise InputError("machine.kind", f"is {quoted(self.scene.machine.kind)}; {problem}")
@@ -294,28 +308,6 @@ def lost_frequencies(model: LinearModel, frequencies: Array, shapes: Array) -> A
     restoring = jnp.max(jnp.abs(carrier.foundation_stiffness @ x), axis=0)
     resisted = restoring > 1e-3 * jnp.max(jnp.abs(carrier.foundation_stiffness)) * jnp.max(jnp.abs(x), axis=0)
     return jnp.where(w > 0.0, lost, resisted)
-
-
-def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
-    """Return the complex amplitudes Y (nd,) m of the carrier under loads that turn together at `omega` (scalar, rad/s).
-
-        (K - w^2 (M + sum m_j B^T B) + i w (C + n G)) Y = S w^2 B^T e,     q(t) = Re(Y exp(i w t)),    S = sum m_j R_j
-
-    The angle of the loads is w t. The result is the limit of light loads (eps -> 0) of a jam. If the carrier has a gyroscopic
-    matrix G, the rotor's `speed` n, rad/s, is needed.
-
-    **Returns** (nd,) complex. **Raises** `InputError` for a carrier with a gyroscopic matrix if `speed` is None, for loads at
-    different stations, for a motor instead of an ideal drive, and for effects that this function does not include.
-
-    >>> import jaxvib as jv
-    >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
-    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
-    >>> print(abs(steady_displacement(scene, 100.0)[0]))      # 0.1 100^2 / (50 100^2 - 4e4)
-    0.002173913...
-
-    Source: Filimonikhin et al. 2022, section 4; the antiphase paper, equations (25)-(29).
-    """
-    return jammed_model(scene).displacement(omega, speed)
 
 
 def rotating_direction(mount: Mount, direction: int = 1) -> Array:

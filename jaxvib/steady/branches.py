@@ -115,7 +115,7 @@ def branches(
 
         n(Omega) = Omega + (mean braking torque of the vibration on the loads) / sum b_W R^2      (light loads, no dry friction)
 
-    For light loads n(Omega) is an explicit function (`jam_rotor_speed`). Every point, also of the exact branch, is computed
+    For light loads n(Omega) is an explicit function (`rotor_speed_at`). Every point, also of the exact branch, is computed
     separately, without continuation from a neighbouring point. Therefore no part of the branch is missed.
 
     **Arguments**

@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gyroscopic_rotor import rotor
+from light_jams import jam_rotor_speed, steady_displacement
 from scenes import machines, published, scene
 
 import jaxvib as jv
 from jaxvib.equations.averaged import Amplitudes, _with_conjugate, amplitudes_of, averaged_field, averaged_model
-from jaxvib.equations.linear import linear_model, steady_displacement
-from jaxvib.steady.jams.folds import jam_rotor_speed
+from jaxvib.equations.linear import linear_model
 
 
 def at_jam(jam):

@@ -14,11 +14,10 @@ from jax import Array
 
 from jaxvib.equations.averaged import mean_torque
 from jaxvib.equations.jammed_bodies import friction_on_light_loads
-from jaxvib.equations.linear import ExcitedModel, JammedModel, LinearModel, jammed_model
+from jaxvib.equations.linear import ExcitedModel, JammedModel, LinearModel
 from jaxvib.equations.torque_balance import UnbalancedModel
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
-from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_solve
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
@@ -58,45 +57,37 @@ class DraggedModel(JammedModel):
         return self.scene.drive.speed * (1.0 - float(jnp.finfo(self.mass.dtype).eps) ** 0.5)
 
 
-def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
+def rotor_speed_at(model: ExcitedModel, omega: Array, speed: Array | None = None) -> Array:
     """Return the rotor speed n (rad/s) of a jam of light, coincident loads with load speed `omega` (scalar, rad/s).
 
         n(w) = w - S w^2 Im(e^H B Y(w)) / (2 sum_j b_Wj R_j^2)
 
-    with Y from `steady_displacement`: the torque of the drag balances the mean torque of the vibration. The formula is explicit
-    in `omega` and single-valued through the folds. If the rotor speed couples the carrier's coordinates, Y is computed at the
-    rotor speed `speed`.
+    with Y from `JammedModel.displacement`: the torque of the drag balances the mean torque of the vibration. The formula is
+    explicit in `omega` and single-valued through the folds. If the rotor speed couples the carrier's coordinates, Y is computed
+    at the rotor speed `speed`.
 
     Dry friction with the coefficient mu2 in a bearing of diameter d adds the torque mu2 (d/2) N sign(n - w) of each load to the
     drag; n is then the root of this balance of torques between w and the value above, with N = m R w^2. The weight of the loads
     is neglected, because its effect on N averages to zero over a turn unless the weight exceeds N. An imbalance of the rotor
     acts at the frequency n and not at w, and has no effect here.
 
-    **Returns** n, a scalar. **Raises** `InputError` for the same scenes as `jam_modes`.
+    For a model with unbalances instead of loads (`UnbalancedModel`) the value returned is not a speed but the torque of the
+    vibration divided by that of the motors; for a `DraggedModel` it is the factor of the drag. Two motions merge at the folds
+    of these functions too.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
-    >>> round(float(jam_rotor_speed(form.scene(), 1.0015)), 4)
+    >>> round(float(rotor_speed_at(jammed_model(form.scene()), 1.0015)), 4)
     5.1829
 
     Source: the antiphase paper, equations (31), (35).
-    """
-    return rotor_speed_at(jammed_model(scene), omega, speed)
-
-
-def rotor_speed_at(model: ExcitedModel, omega: Array, speed: Array | None = None) -> Array:
-    """Return `jam_rotor_speed` for an assembled scene.
-
-    For a model with unbalances instead of loads (`UnbalancedModel`) the value returned is not a speed but the torque of the
-    vibration divided by that of the motors; for a `DraggedModel` it is the factor of the drag. Two motions merge at the folds
-    of these functions too.
     """
     return _speed_and_amplitudes(model, omega, speed)[0]
 
 
 def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
-    """Return the rotor speed of light loads at a load speed (rad/s), see `jam_rotor_speed`. The search for exact jams starts
+    """Return the rotor speed of light loads at a load speed (rad/s), see `rotor_speed_at`. The search for exact jams starts
     from it.
 
     If the response of the carrier depends on the rotor speed (gyroscopic), n = w + torque(w, n)/drag can have several roots.

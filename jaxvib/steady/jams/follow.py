@@ -20,7 +20,7 @@ _NEWTON_STEPS = 6
 def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
     """Solve for the jam mode with number `mode` and a load speed near `near` (scalar, rad/s), at the scene's rotor speed n.
 
-    Newton's method solves (n(w) - w)^(-1/2) = (n - w)^(-1/2), see `jam_rotor_speed`. Near a resonance w_r the left side is
+    Newton's method solves (n(w) - w)^(-1/2) = (n - w)^(-1/2), see `rotor_speed_at`. Near a resonance w_r the left side is
     almost proportional to |w - w_r|, therefore a few steps converge from far away. `jam_modes` computes the whole branch,
     which takes a hundred times as long, and determines the number of the mode. This function keeps the number, and does not
     detect that modes exchange their numbers.

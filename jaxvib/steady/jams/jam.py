@@ -283,7 +283,7 @@ def jam_modes(scene: Scene) -> JamModes:
         sum b_W R^2 (n - Omega) + dry friction = mean braking torque of the vibration at Omega,  solved for Omega at the rotor
         speed n
 
-    The branch n(Omega) of `jam_rotor_speed` is cut at its folds dn/dOmega = 0 into monotone pieces; each piece that contains
+    The branch n(Omega) of `rotor_speed_at` is cut at its folds dn/dOmega = 0 into monotone pieces; each piece that contains
     the rotor speed gives one mode.
 
     - Mode numbers follow the resonances: mode 2r - 1 is on the piece that rises to the peak of resonance r, mode 2r on the

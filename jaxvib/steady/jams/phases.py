@@ -18,7 +18,6 @@ from jaxvib.equations.torque_balance import (
     TorqueBalance,
     assemble_torque_balance,
     balance_residuals,
-    influence_of,
     motion_of,
     response_of,
     torques_at,
@@ -124,42 +123,12 @@ class PhaseJam(AbstractPhaseJam):
         return phase_circles([(speed_text(self.omega, 4), np.asarray(self.phase))], ax=ax)
 
 
-def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
-    """Return the mean torque (count,) N m of the vibration on loads that turn at `omega` (scalar, rad/s), at `phase` (count,).
-
-        T_j = (w^4/2) S_j sum_k S_k Im[exp(i (a_k - a_j)) e^H L_j D(w)^-1 L_k^T e],     S = m R
-        D(w) = K - w^2 (M + sum_j m_j L_j^T L_j) + i w (C + n G)
-
-    w is `omega` and a is `phase`; e = (1, -i) for two directions of the mount, 1 for one. L_j (directions of the mount, nd)
-    maps the carrier's coordinates to the displacement of the mount at the station of load j; M, C, K and G are the matrices
-    of the carrier, and n is the rotor speed.
-
-    **Returns** an array (count,). **Raises** `InputError` for loads that are not on a circle, drives without a prescribed
-    speed, and effects that this function does not include.
-
-    >>> import jax.numpy as jnp, jaxvib as jv
-    >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
-    >>> scene = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.14), jv.ConstantSpeed(460.0))
-    >>> abs(float(phase_torques(scene, 170.0, jnp.array([0.0, jnp.pi]))[0])) < 1e-12    # opposite phases: no vibration
-    True
-
-    Source: Artyunin 2013, the pendulums' equation of (1), averaged over a turn.
-    """
-    return _phase_torques(scene, jnp.asarray(omega, dtype=scene.drive.speed.dtype), jnp.asarray(phase))
-
-
-@cached
-def _phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
-    balance = assemble_torque_balance(scene)
-    return torques_at(balance.unbalance, influence_of(balance, omega), omega, jnp.exp(1j * phase))
-
-
 def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     """Return the jam that Newton's method finds from a speed `omega` (scalar, rad/s) and phases (count,) rad of the loads.
 
         b_j R_j^2 (n - w) + T_j(w, a) = 0,     j = 1 .. count
 
-    is solved for w and all phases but the first, see `phase_torques`. Stability is determined by the growth rate of small
+    is solved for w and all phases but the first, see `torques_at`. Stability is determined by the growth rate of small
     disturbances of the averaged motion, q = Re(z(t) exp(i w t)), in which the angle of each load is free: an autonomous system
     of dimension 4 nd + 2 count, without a quasi-static assumption. For isotropic supports averaging is exact.
 

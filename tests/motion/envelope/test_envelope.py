@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from light_jams import jam_rotor_speed
 from scenes import published
 
 import jaxvib as jv
 from jaxvib.equations.model import assemble
 from jaxvib.machine.effects.terms import LoadResistance
 from jaxvib.motion.envelope.envelope import _measure, _Tolerance
-from jaxvib.steady.jams.folds import jam_rotor_speed
 
 
 def one(eps, speed, damping=0.2):

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from light_jams import jam_rotor_speed
 from load_speeds import all_load_speeds
 from scenes import published
 
@@ -12,7 +13,7 @@ import jaxvib as jv
 from jaxvib.equations.linear import linear_model
 from jaxvib.steady.jams import folds
 from jaxvib.steady.jams.branch_plot import modes_of
-from jaxvib.steady.jams.folds import jam_rotor_speed, piece_modes, sampled_modes, without_ripples
+from jaxvib.steady.jams.folds import piece_modes, sampled_modes, without_ripples
 
 rotor_speeds = eqx.filter_jit(eqx.filter_vmap(jam_rotor_speed, in_axes=(None, 0)))
 

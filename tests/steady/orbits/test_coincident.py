@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from gyroscopic_rotor import rotor
 from jax.flatten_util import ravel_pytree
+from light_jams import jam_rotor_speed
 from periodic import integrate, monodromy, ordered
 from scenes import assembled, machines, scene
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
-from jaxvib.steady.jams.folds import jam_rotor_speed, light_rotor_speed
+from jaxvib.steady.jams.folds import light_rotor_speed
 from jaxvib.steady.orbits.describe import _least_contact_torque
 from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution, periodic_motion
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gyroscopic_rotor import rotor
+from light_jams import jam_rotor_speed
 from periodic import integrate, monodromy, ordered
 from scenes import assembled, machines
 
@@ -13,7 +14,6 @@ import jaxvib as jv
 from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.balance.criterion import criterion_functional
-from jaxvib.steady.jams.folds import jam_rotor_speed
 from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from light_jams import jam_rotor_speed
 from periodic import integrate
 from scenes import assembled, machines, published
 from scipy.integrate import solve_ivp
@@ -16,7 +17,6 @@ from scipy.optimize import fsolve
 
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
-from jaxvib.steady.jams.folds import jam_rotor_speed
 from jaxvib.steady.orbits.describe import Orbit, _peaks, half_range
 from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 

@@ -4,12 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from light_jams import jam_rotor_speed, steady_displacement
 
 import jaxvib as jv
-from jaxvib.equations.linear import steady_displacement
 from jaxvib.ode import replay
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.folds import jam_rotor_speed
 
 SCENE = jv.Scene(
     jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),

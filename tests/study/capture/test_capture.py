@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from papers.machines import published_torus
 from papers.printed_torus import printed_torus
-from torus.step_doubling import refine
+from papers.step_doubling import refine
 
 import jaxvib as jv
 from jaxvib.cli.app import run as command

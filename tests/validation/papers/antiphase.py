@@ -13,7 +13,7 @@ import numpy as np
 import scenes
 from jax import Array
 
-from jaxvib.equations.linear import natural_frequencies, steady_displacement
+from jaxvib.equations.linear import jammed_model, natural_frequencies
 from jaxvib.machine.dimensionless import Dimensionless
 from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.numerics.roots import bracketed_root
@@ -65,14 +65,14 @@ def _quiet() -> tuple[float, float, float]:
     """The speed at which the supports' forces cancel, and the platforms' motion there."""
     form = _other((0.0, 0.0), 0.0)
     scene, near = form.scene(), _ideal()
-    stiffness = cast(Platforms, scene.machine).stiffness
+    light, stiffness = jammed_model(scene), cast(Platforms, scene.machine).stiffness
 
     @jax.jit
     def solve() -> tuple[Array, Array]:
         omega = bracketed_root(
-            lambda w: jnp.sum(stiffness * steady_displacement(scene, w).imag), jnp.asarray(0.9 * near), jnp.asarray(1.1 * near)
+            lambda w: jnp.sum(stiffness * light.displacement(w).imag), jnp.asarray(0.9 * near), jnp.asarray(1.1 * near)
         )
-        return omega, -form.convert_results(amplitude=steady_displacement(scene, omega).imag)["amplitude"]
+        return omega, -form.convert_results(amplitude=light.displacement(omega).imag)["amplitude"]
 
     omega, (first, second) = solve()
     return float(omega), float(first), float(second)
@@ -81,7 +81,7 @@ def _quiet() -> tuple[float, float, float]:
 def _platform_2() -> float:
     """Amplitude of platform 2 with damping, from the machine's equations."""
     form = _other(_DAMPING, _LINK_DAMPING)
-    answer = jax.jit(steady_displacement)(form.scene(), jnp.asarray(_OMEGA))
+    answer = jax.jit(jammed_model(form.scene()).displacement)(jnp.asarray(_OMEGA))
     return float(jnp.abs(form.convert_results(amplitude=answer)["amplitude"][1]))
 
 

@@ -10,12 +10,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.equations.linear import natural_frequencies
+from jaxvib.equations.linear import jammed_model, natural_frequencies
 from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor
 from jaxvib.machine.loads import balls
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.structures.platforms import one_mass
-from jaxvib.steady.jams.folds import jam_rotor_speed
+from jaxvib.steady.jams.folds import rotor_speed_at
 from jaxvib.steady.jams.jam import jam_modes
 from papers.printed import PrintedNumber
 
@@ -38,7 +38,7 @@ def _counts() -> tuple[tuple[int, int], ...]:
     scene = Scene(machine, balls(count=2, mass=0.5, radius=0.1, drag=0.2), ConstantSpeed(20.0))
     folds = np.sort(np.asarray(jam_modes(scene).folds.rotor_speed))
     resonance = natural_frequencies(scene)[0]
-    ends = [0.5 * folds[0], folds[0], float(jam_rotor_speed(scene, resonance)), folds[1], 1.5 * folds[1]]
+    ends = [0.5 * folds[0], folds[0], float(rotor_speed_at(jammed_model(scene), resonance)), folds[1], 1.5 * folds[1]]
     found = []
     for low, high in itertools.pairwise(ends):
         changed = eqx.tree_at(lambda s: s.drive.speed, scene, jnp.asarray(0.5 * (low + high)))

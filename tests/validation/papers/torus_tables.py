@@ -23,6 +23,7 @@ from jaxvib.motion.plan import EqualSteps
 from jaxvib.study.capture.capture import DOUBLINGS, MAX_CAPTURED_LAG, moving_state, steps_per_second
 from papers.machines import TORUS_SPEED, published_torus
 from papers.printed_torus import TABLES, PublishedRow, cosine_torus, gap_torus, printed_torus
+from papers.step_doubling import refine
 
 __all__ = ["CONTACT", "MODELS", "TorusTables", "published_tables"]
 
