@@ -17,7 +17,7 @@ from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.motion.run import Run
 from jaxvib.results.fields import Plain, in_unit, plain
 from jaxvib.results.result import Result
-from jaxvib.units import unit_ratio
+from jaxvib.units.reading import unit_ratio
 
 _MAX_SHOWN_PERCENT = 1000.0
 """Largest change that is shown in per cent; larger ones are shown in the unit of the objective."""

@@ -40,8 +40,6 @@ from optimize.search.problem import Problem, evaluate_quantities, problem_of, sc
 from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours
 from optimize.space import DesignSpace
 
-__all__ = ["Outcome", "Synthesis", "synthesize"]
-
 _CONVERGED_DECREASE = 1e-6
 """Predicted relative decrease of the objective below which a design has converged."""
 

@@ -10,9 +10,9 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.display import shown_unit
-from jaxvib.units import count, in_own_unit, known_number, number, numbers, to_float, unit_ratio
+from jaxvib.units import count, known_number, number, numbers
 from jaxvib.units.columns import unit_factor
-from jaxvib.units.reading import _FACTORS
+from jaxvib.units.reading import _FACTORS, in_own_unit, to_float, unit_ratio
 
 
 @pytest.mark.parametrize(

@@ -23,21 +23,6 @@ if TYPE_CHECKING:
     from jaxvib.machine.scene import Exciter, Scene
     from optimize import ToleranceRange
 
-__all__ = [
-    "SPEED",
-    "TOLERANCE",
-    "WITHOUT",
-    "Output",
-    "app",
-    "loaded_scene",
-    "ranges_within",
-    "require_tolerances",
-    "run",
-    "shared",
-    "table",
-    "tolerance_table",
-]
-
 
 def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = None, *, constant: bool = False) -> Scene:
     """Load the scene of a file, and change its effects and its drive.

@@ -27,31 +27,12 @@ from jaxvib.machine.scene import Exciter, Scene, unbalance
 from jaxvib.machine.structures.plane_body import body, plane_body, plane_network, support
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.structures.rotor import planar_rotor, rotor
-from jaxvib.machine.templates import SCREENS, TEMPLATES, Templates
+from jaxvib.machine.templates import SCREENS as SCREENS
+from jaxvib.machine.templates import TEMPLATES as TEMPLATES
+from jaxvib.machine.templates import Templates as Templates
 from jaxvib.machine.torus import torus_balls
 from jaxvib.units.known import require_known, when_known
 from jaxvib.units.tables import csv_column
-
-__all__ = [
-    "DRIVES",
-    "EFFECTS",
-    "LOADS",
-    "MACHINES",
-    "SCREENS",
-    "SECTIONS",
-    "TEMPLATES",
-    "Tables",
-    "Templates",
-    "build_part",
-    "load_scene",
-    "misplaced_name",
-    "read_toml",
-    "rebuild_part",
-    "save_scene",
-    "scene_from_toml",
-    "scene_to_toml",
-    "suggest_name",
-]
 
 MACHINES: dict[str, Callable[..., Machine]] = {
     "one_mass": one_mass,

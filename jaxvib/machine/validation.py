@@ -24,8 +24,9 @@ from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import Exciter, Scene, read_unbalance, require_comparable
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.runtime.devices import float_dtype
-from jaxvib.units import conditions_of_traced_values, require_real
+from jaxvib.units import conditions_of_traced_values
 from jaxvib.units.known import is_known, when_known
+from jaxvib.units.reading import require_real
 
 _VALID_SCENES: weakref.WeakValueDictionary[tuple[int, np.dtype], Scene] = weakref.WeakValueDictionary()
 """Validated scenes by their `id` and the precision of their arrays. Scenes are immutable and therefore stay valid."""

@@ -32,8 +32,9 @@ from jaxvib.runtime.devices import known as numpy_of_known
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
 from jaxvib.steady.outcome import unknown_is_positive
-from jaxvib.units import Number, count, known_number, require_real, validate_tolerance
+from jaxvib.units import Number, count, known_number, validate_tolerance
 from jaxvib.units.known import is_known, when_known
+from jaxvib.units.reading import require_real
 
 Control = StepControl | diffrax.AbstractStepSizeController
 

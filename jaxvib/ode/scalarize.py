@@ -45,17 +45,6 @@ from jaxvib.runtime.compat import (
     operation_like,
 )
 
-__all__ = [
-    "MAX_SCALARS",
-    "NotScalarizable",
-    "arrays_program",
-    "scalar_program",
-    "scalarize",
-    "scalarized_program",
-    "scalarized_vmap",
-    "scalars_of",
-]
-
 X = TypeVar("X")
 Shared = TypeVar("Shared")
 Out = TypeVar("Out")

@@ -30,35 +30,6 @@ from jax.core import Tracer
 if TYPE_CHECKING:
     import equinox as eqx
 
-__all__ = [
-    "HAS_JAXPRS",
-    "Atoms",
-    "ClosedJaxpr",
-    "Instead",
-    "Jaxpr",
-    "JaxprEqn",
-    "Literal",
-    "Primitive",
-    "Var",
-    "accepted_flags",
-    "backend_started",
-    "enumeration_names",
-    "enumeration_of",
-    "evaluating",
-    "fast_diffrax_loop_end",
-    "inner_value",
-    "jaxpr_as_fun",
-    "loops_need_a_flag",
-    "no_host_checks",
-    "operation_like",
-    "rewritten",
-    "traced",
-    "user_folder",
-    "value_of",
-    "wide_vectors_are_right",
-    "without_source_locations",
-]
-
 _TESTED_JAXLIB = ((0, 10), (0, 12))
 """First and last version (major, minor) of jaxlib with tested flags, see `accepted_flags`."""
 

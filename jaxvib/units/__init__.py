@@ -19,26 +19,7 @@ from jaxvib.boundary import is_whole
 from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.compat import traced
 from jaxvib.runtime.devices import numpy_of
-from jaxvib.units.reading import Number, Numbers, Quantity, in_own_unit, require_real, to_float, unit_name, unit_ratio
-
-__all__ = [
-    "Bounds",
-    "Number",
-    "Numbers",
-    "Quantity",
-    "conditions_of_traced_values",
-    "count",
-    "in_own_unit",
-    "known_number",
-    "number",
-    "numbers",
-    "random_numbers",
-    "require_real",
-    "to_float",
-    "traced",
-    "unit_ratio",
-    "validate_tolerance",
-]
+from jaxvib.units.reading import Number, Numbers, to_float, unit_name
 
 
 class Bounds(NamedTuple):

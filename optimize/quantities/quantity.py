@@ -16,8 +16,9 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns
 from jaxvib.numerics.extrema import greatest
 from jaxvib.steady.jams.jam import JamModes
-from jaxvib.units import Number, count, in_own_unit
-from jaxvib.units import Quantity as UnitQuantity
+from jaxvib.units import Number, count
+from jaxvib.units.reading import Quantity as UnitQuantity
+from jaxvib.units.reading import in_own_unit
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.user_inputs import count_required_arguments, number_in, same_unit
 

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.units import Number, number, unit_ratio
+from jaxvib.units import Number, number
 from jaxvib.units.known import require_known
+from jaxvib.units.reading import unit_ratio
 
 Point = tuple[float, float]
 """Point (x, y) of a body, m from its centre of mass."""

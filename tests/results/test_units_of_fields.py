@@ -9,7 +9,7 @@ import pytest
 
 import jaxvib
 import optimize
-from jaxvib.units import unit_ratio
+from jaxvib.units.reading import unit_ratio
 
 
 def results():

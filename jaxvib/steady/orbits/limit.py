@@ -35,8 +35,6 @@ from jaxvib.steady.orbits.whole import (
     residual_of,
 )
 
-__all__ = ["LimitStatus", "SynchronizationLimit", "synchronization_limit"]
-
 _STEP = 0.1
 """Distance between two points of a branch: change of the phase, rad, or of the speed in units of `_SPEED_PER_STEP`."""
 

@@ -47,8 +47,6 @@ from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.units import Number, Numbers, count, known_number, number, numbers, validate_tolerance
 from jaxvib.units.known import is_known
 
-__all__ = ["HasSpeedAndPhases", "SynchronousOrbit", "SynchronousStatus", "synchronous_orbit"]
-
 _MAX_UNKNOWN_STEPS = 128
 """Limit of the integration steps for the multipliers under a JAX transformation; reverse derivatives need a static limit."""
 
