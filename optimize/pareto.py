@@ -72,10 +72,7 @@ class Front(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the front; each point is labelled with its number `k`, for which `scene(k)` returns the machine.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the front; each point is labelled with its number `k`, for which `scene(k)` returns the machine."""
         from jaxvib.draw.charts import front_chart  # slow import
 
         labels, values = self._shown()

@@ -252,10 +252,7 @@ class Synthesis(Result):
         return lines
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot every quantity after the search relative to its value before, on a logarithmic axis.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot every quantity after the search relative to its value before, on a logarithmic axis."""
         from jaxvib.draw.charts import before_after  # slow import
 
         shown = []

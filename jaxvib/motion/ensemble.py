@@ -140,10 +140,7 @@ class Ensemble(Result):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot the mean speed of each load in `unit` over the runs.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
-        """
+        """Plot the mean speed of each load in `unit` over the runs."""
         from jaxvib.display import speed_unit
         from jaxvib.draw.results import points_chart  # slow import
 

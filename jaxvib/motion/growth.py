@@ -88,7 +88,7 @@ class Growth(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the rate of each stretch and the exponent over time. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot the rate of each stretch and the exponent over time."""
         from jaxvib.draw.results import growth_chart  # slow to import
 
         return growth_chart(self.time, self.rates, self.exponent, self.uncertainty, ax=ax)

@@ -258,9 +258,6 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
         - `unit` of speeds, "rad/s", "rpm" or "Hz"
         - `ax`: axes to draw onto, one for each panel, by rows
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for an unknown unit or a wrong number of
-        axes.
         """
         from jaxvib.draw.motion.histories import time_histories  # slow import
 

@@ -69,7 +69,13 @@ class Result(Readable):
 
     @abc.abstractmethod
     def plot(self) -> "Figure":
-        """Plot the result by matplotlib; `plot(ax=axes)` draws onto given axes, one for each panel, and returns them."""
+        """Plot the result by matplotlib.
+
+        **Arguments** (those of a result that has them): `unit` of speeds, "rad/s", "rpm" or "Hz"; `ax`: axes to draw onto, one
+        for each panel.
+
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
+        """
 
     def _repr_html_(self) -> str:
         """Return the representation and, for a single result, its figure, for notebooks."""

@@ -73,7 +73,7 @@ class Branches(AbstractJam):
         - `linear`: True for linear axes of amplitudes and force; default: logarithmic ones
         - `ax`: axes to draw onto, as many as there are panels
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit, panel or number of axes.
+        **Raises** `InputError` for another unit, panel or number of axes.
         """
         folds = self.folds
         existing = np.flatnonzero(np.asarray(folds.exists)).tolist()

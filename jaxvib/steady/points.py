@@ -185,10 +185,7 @@ class Deck(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the ellipses at their points, magnified; a dot marks the phase at one common time.
-
-        **Arguments**: `ax`: axes to draw onto. **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the ellipses at their points, magnified; a dot marks the phase at one common time."""
         from jaxvib.draw.machine.deck import deck_chart  # slow import
 
         return deck_chart(np.asarray(self.points), np.asarray(self.amplitude), ax=ax)

@@ -195,7 +195,7 @@ class Response(AbstractResponse, Result):
         - `show`: names of the panels, such as `("force",)`
         - `ax`: axes to draw onto, as many as there are panels
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit, panel or number of axes.
+        **Raises** `InputError` for another unit, panel or number of axes.
         """
         from jaxvib.draw.motion.response import response_chart  # slow import
 

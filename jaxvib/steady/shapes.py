@@ -58,10 +58,7 @@ class ModeShapes(Result):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot the shapes as bars, a group for each mode with its frequency in `unit`.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
-        """
+        """Plot the shapes as bars, a group for each mode with its frequency in `unit`."""
         from jaxvib.draw.results import shapes_chart  # slow import
 
         return shapes_chart(np.asarray(self.frequency), np.asarray(self.shape), names=self.coordinates, unit=unit, ax=ax)

@@ -77,10 +77,7 @@ class CriticalSpeeds(Result):
         return "\n".join([*lines, *lost]) or "no critical speed"
 
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot the critical speeds in `unit`, on a line for each sense.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
-        """
+        """Plot the critical speeds in `unit`, on a line for each sense."""
         from jaxvib.draw.results import speeds_chart  # slow import
 
         speed, sense = np.asarray(self.speed), self.sense
@@ -135,9 +132,7 @@ class Whirl(Result):
         Critical speeds are marked on the line on which the whirl speed is equal to the rotor speed. A vertical line marks the
         operating speed `at` if it is given.
 
-        **Arguments**: `at`, rad/s; `unit` of the speeds; `ax`: axes to draw onto.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
+        **Arguments**: `at`, rad/s; `unit` of the speeds.
         """
         from jaxvib.draw.whirl import campbell_diagram  # slow import
 

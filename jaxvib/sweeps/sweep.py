@@ -132,7 +132,7 @@ class Sweep(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the figure that fits the study, see `plot_sweep`. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot the figure that fits the study, see `plot_sweep`."""
         from jaxvib.sweeps.figures import plot_sweep
 
         return plot_sweep(self.store, ax=ax)

@@ -147,10 +147,7 @@ class Regime(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the loads on a circle at their `phase`, relative to the first load or to the rotor.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the loads on a circle at their `phase`, relative to the first load or to the rotor."""
         from jaxvib.draw.results import phase_circles  # slow import
 
         title = self.label

@@ -89,10 +89,8 @@ class Spectrum(Result):
         - `coordinate`: name of the coordinate that is shown; default: all coordinates, in a waterfall diagram the coordinate
           with the largest amplitude
         - `unit` of frequencies, "rad/s", "rpm" or "Hz"
-        - `ax`: axes to draw onto
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for unknown names of `show`, `coordinate`
-        and `unit`.
+        **Raises** `InputError` for unknown names of `show`, `coordinate` and `unit`.
         """
         from jaxvib.draw.motion.spectra import spectrum_chart, waterfall_chart  # slow import
 

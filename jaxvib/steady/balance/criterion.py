@@ -85,10 +85,7 @@ class Criterion(Result):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot the characteristic speeds with damping, and the intervals between them, in `unit`.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
-        """
+        """Plot the characteristic speeds with damping, and the intervals between them, in `unit`."""
         from jaxvib.draw.results import speeds_chart  # slow import
 
         rows = [("resonances", self.speeds.damped_resonances), ("additional", self.speeds.damped_additional)]

@@ -91,10 +91,7 @@ class CharacteristicSpeeds(Result):
         return "\n".join(lines)
 
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot resonances and additional speeds, without and with damping, on a line each, in `unit`.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
-        """
+        """Plot resonances and additional speeds, without and with damping, on a line each, in `unit`."""
         from jaxvib.draw.results import speeds_chart  # slow import
 
         rows = [("resonances", self.resonances), ("additional", self.additional)]

@@ -156,7 +156,7 @@ class BalancedStates(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the arrangements in the rotor's frame, each on a circle. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot the arrangements in the rotor's frame, each on a circle."""
         from jaxvib.draw.results import phase_circles  # slow import
 
         sides = _sides(turning_loads(self.scene))
@@ -538,10 +538,7 @@ class BalancedStability(Result):
         )
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the multipliers in the complex plane, and the unit circle.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the multipliers in the complex plane, and the unit circle."""
         from jaxvib.draw.results import multiplier_chart  # slow import
 
         return multiplier_chart(np.asarray(self.multipliers), ax=ax)

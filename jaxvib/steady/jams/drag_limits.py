@@ -70,10 +70,7 @@ class DragLimits(Result):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot the greatest drag over the load speed of its jam, in `unit`, with the resonances as lines.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the greatest drag over the load speed of its jam, in `unit`, with the resonances as lines."""
         from jaxvib.draw.results import drag_limits_chart  # slow import
 
         omega, drag, resonances = map(np.asarray, (self.omega, self.drag, self.resonances))

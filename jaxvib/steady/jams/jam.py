@@ -113,10 +113,7 @@ class Jam(AbstractJam):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
-        """Plot the speed of the loads in `unit`, and the amplitudes; `ax`: two axes to plot onto.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the speed of the loads in `unit`, and the amplitudes; `ax`: two axes to plot onto."""
         return _modes_chart(jax.tree.map(lambda leaf: leaf[None], self), None, unit, ax)
 
 
@@ -210,11 +207,7 @@ class JamModes(AbstractJam):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
-        """Plot the load speed of each mode in `unit`, with the resonances, and the amplitudes; `ax`: two axes to plot onto.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for an unknown unit or a wrong number of
-        axes.
-        """
+        """Plot the load speed of each mode in `unit`, with the resonances, and the amplitudes; `ax`: two axes to plot onto."""
         return _modes_chart(self, self.resonances, unit, ax)
 
 

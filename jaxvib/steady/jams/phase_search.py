@@ -90,9 +90,6 @@ class PhaseJams(AbstractPhaseJam):
         jams.
 
         Colours show the arrangement of the loads; stable solid, unstable dashed, the jams themselves as points.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for a `unit` other than "rad/s", "rpm",
-        "Hz".
         """
         from jaxvib.draw.results import drag_diagram  # slow import
 
@@ -359,8 +356,6 @@ class PhaseBranch(Result):
         """Plot the speeds of loads and rotor over the drag; stable solid, unstable dashed.
 
         The drag is in N s/m, or a multiple of the scene's drag if the loads have different drags.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.results import drag_diagram  # slow import
 

@@ -114,10 +114,7 @@ class PhaseJam(AbstractPhaseJam):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the phases of the loads on a circle.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the phases of the loads on a circle."""
         from jaxvib.draw.results import phase_circles  # slow import
 
         return phase_circles([(speed_text(self.omega, 4), np.asarray(self.phase))], ax=ax)

@@ -86,10 +86,7 @@ class SynchronizationLimit(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the parameter over the phase, or over the speed of a single motor, along the branch.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the parameter over the phase, or over the speed of a single motor, along the branch."""
         from jaxvib.draw.results import signals_chart  # slow import
 
         values = [(self.over, np.asarray(self.branch_values)[:, None], [self.over])]

@@ -116,7 +116,7 @@ class RegimePartitions(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the speed of each mass over the number of the motion. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot the speed of each mass over the number of the motion."""
         from jaxvib.draw.results import points_chart  # slow import
 
         return points_chart(self.speed, x_label="motion", y_label="speed, rad/s", ax=ax)

@@ -173,10 +173,7 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the phases of the masses on a circle, each in its direction of rotation.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the phases of the masses on a circle, each in its direction of rotation."""
         from jaxvib.draw.results import phase_circles  # slow import
 
         return phase_circles([(speed_text(self.speed, 6), np.asarray(self.phases))], **_circle_options(self.scene), ax=ax)

@@ -89,10 +89,7 @@ class Cost(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot error over computing time, with a line for each method; see `cost_figure`.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot error over computing time, with a line for each method; see `cost_figure`."""
         return cost_figure({"": self}, ax=ax)
 
 

@@ -142,8 +142,6 @@ class GradientCheck(Result):
         """Plot the deviation of the central differences from the first route over their step, with a line for each parameter.
 
         The best steps are marked.
-
-        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.comparison import steps_chart  # slow import
 

@@ -55,10 +55,7 @@ class HarmonicConvergence(Result):
         )
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the error over the highest harmonic, with a line for each load speed; the estimates are dashed lines.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the error over the highest harmonic, with a line for each load speed; the estimates are dashed lines."""
         names = [speed_text(w, 4) for w in self.omega]
         from jaxvib.draw.comparison import convergence_chart  # slow import
 

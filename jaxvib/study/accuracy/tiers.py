@@ -64,8 +64,6 @@ class Tiers(Result):
         """Plot relative differences of load speed, amplitude and foundation force against the mass of a load.
 
         Hollow symbols mark unstable jams.
-
-        **Returns** a matplotlib figure, or the given `ax`.
         """
         differences = {
             "load speed": np.abs(self.leading.omega / self.exact.omega - 1.0),

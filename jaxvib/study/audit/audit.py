@@ -92,10 +92,7 @@ class Audit(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the change by each effect, with the requested accuracy.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the change by each effect, with the requested accuracy."""
         from jaxvib.draw.comparison import audit_chart  # slow import
 
         plain_names = dict(zip(CHANGES, ("amplitude", "foundation force", "load speed", "end of the jam"), strict=True))

@@ -83,10 +83,7 @@ class Decrement(Result):
         return abs(self.drift) > 4.0
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot mu1 of each pair of swings, first to last.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot mu1 of each pair of swings, first to last."""
         from jaxvib.draw.results import points_chart  # slow import
 
         return points_chart(self.estimates[:, None], x_label="pair of swings", y_label="mu1, N m s", ax=ax)

@@ -110,10 +110,7 @@ class Identified(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the record with the fit, and its residuals, onto two axes `ax` if given.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the record with the fit, and its residuals, onto two axes `ax` if given."""
         from jaxvib.draw.record import swing_chart  # slow import
 
         return swing_chart(self.record.time, self.record.angle, self.fitted, self.noise, ax=ax)

@@ -156,7 +156,7 @@ class Swing(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot angle and rate over time, onto two axes `ax` if given. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot angle and rate over time, onto two axes `ax` if given."""
         from jaxvib.draw.results import signals_chart  # slow import
 
         angle, rate = (np.asarray(x)[:, None] for x in (self.angle, self.rate))

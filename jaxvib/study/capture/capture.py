@@ -130,10 +130,7 @@ class Capture(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the share of captured starts over the initial speed, and the threshold, onto the axes `ax` if given.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the share of captured starts over the initial speed, and the threshold."""
         from jaxvib.draw.capture import threshold_chart  # slow import
 
         error = None if self.captured.shape[1] == 1 else self.standard_error

@@ -62,10 +62,7 @@ class ThresholdCurve(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot thresholds with their uncertainty, and the lowest captured speeds, over the values.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot thresholds with their uncertainty, and the lowest captured speeds, over the values."""
         from jaxvib.draw.capture import curve_chart  # slow import
 
         return curve_chart(self.value, self.threshold, self.uncertainty, self.least, ax=ax)

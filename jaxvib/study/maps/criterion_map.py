@@ -66,8 +66,6 @@ class CriterionMap(Result):
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot agreement and disagreement of the criterion over rotor speed in `unit` and load mass, one panel for each drag,
         onto as many axes `ax` if given.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
         """
         from jaxvib.draw.criterion import agreement_maps  # slow import
 

@@ -96,10 +96,7 @@ class RunUpMap(Result):
         return "\n".join(lines)
 
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
-        """Plot the shares of the kinds of motion, and the load speeds in `unit`, over drag, onto two axes `ax` if given.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
-        """
+        """Plot the shares of the kinds of motion, and the load speeds in `unit`, over drag, onto two axes `ax` if given."""
         shares = {kind: self.fraction(kind) for kind in (*REGIMES, _FAILED) if np.any(self.kind == kind)}
         rotor = np.max(np.asarray(self.regime.rotor_speed), initial=0.0, where=self.finished)
         from jaxvib.draw.charts import regime_chart  # slow import

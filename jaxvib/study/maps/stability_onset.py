@@ -50,8 +50,6 @@ class StabilityMap(Result):
     def plot(self, *, label: str = "x", unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot stable jams as shaded areas over the load speed in `unit` and x, with special points as marks; `label`: name of
         x.
-
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
         marks: dict[str, list[tuple[float, float]]] = {}
         for x, points in zip(self.value, self.special, strict=True):
