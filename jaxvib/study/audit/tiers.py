@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-from jax import Array
 
 from jaxvib.equations.averaged import averaged_loads
 from jaxvib.equations.jammed_bodies import require_periodic_jams
@@ -15,8 +14,10 @@ from jaxvib.equations.linear import jammed_loads
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.envelope.envelope import envelope
+from jaxvib.motion.envelope.result import Envelope
 from jaxvib.results.status import status_name
-from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.jams.jam import Jam, jam_modes
+from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.study.accuracy.cost import largest_by_unit, timed
 from jaxvib.study.accuracy.exact_reference import WINDOW_PERIODS, slow_period
@@ -104,7 +105,7 @@ def _relative_error(value: float, reference: float) -> float:
 
 def _call(
     tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, reference: MotionValues
-) -> Callable[[], JamValues | MotionValues] | str:
+) -> Callable[[], Jam | Orbit | Envelope | MotionValues] | str:
     """Return a function that evaluates the tier, or the reason why the tier cannot be evaluated."""
     without_integration = tier.name in ("leading order", "exact orbit")
     if isinstance(comparison, JamComparison):
@@ -121,25 +122,6 @@ def _call(
     return lambda: envelope(scene, comparison.until, start=start, save="window", throw=False)
 
 
-class JamValues(Protocol):
-    """Common quantities of the results of all tiers."""
-
-    @property
-    def omega(self) -> Array:
-        """Speed of the loads, rad/s."""
-        ...
-
-    @property
-    def amplitude(self) -> Array:
-        """Amplitudes (nd,) m (rad for tilts), zero to peak."""
-        ...
-
-    @property
-    def foundation_force(self) -> Array:
-        """Amplitude of the foundation force, N, zero to peak."""
-        ...
-
-
 class Tier(NamedTuple):
     """Method to compute a jam.
 
@@ -151,7 +133,7 @@ class Tier(NamedTuple):
     name: str
     purpose: str
     require: Callable[[Scene], object]
-    jam: Callable[[Scene, int, float], JamValues] | None
+    jam: Callable[[Scene, int, float], Jam | Orbit | Envelope] | None
 
     def refusal(self, scene: Scene) -> str | None:
         """Return a sentence with the reason why the tier does not support the scene; None if the tier supports it.
