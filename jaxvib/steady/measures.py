@@ -32,9 +32,8 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import Jam
 from jaxvib.steady.jams.phases import PhaseJam
 from jaxvib.steady.orbits.describe import Orbit
-from jaxvib.steady.points import STANDARD_GRAVITY, ellipse_at, rows_in_plane
+from jaxvib.steady.points import STANDARD_GRAVITY, ellipse_at, require_amplitudes, rows_in_plane
 from jaxvib.units import Number, known_number, number, numbers
-from jaxvib.units.known import when_known
 
 ZONE_LIMITS = {
     ("large", "rigid"): (2.3e-3, 4.5e-3, 7.1e-3),
@@ -495,16 +494,9 @@ def conveying_speed(amplitude: Array | complex, speed: Number, *, slope: Number 
     in periods and F the frequency, Hz. Sloot and Kruyt (Powder Technology 87, 1996) add sliding, and report larger deviations
     from experiments for conveyors that throw than for those that slide.
     """
-    if jnp.shape(amplitude) != (2,):
-        raise InputError("amplitude", f"has the shape {jnp.shape(amplitude)}; give two amplitudes, horizontal and up")
-    when_known(_require_finite, amplitude)
+    require_amplitudes(amplitude)
     w, tilt = number(speed, "rad/s", "speed", low=0.0, open_low=True), number(slope, "rad", "slope")
     return _conveying_speed(jnp.asarray(amplitude, complex), w, tilt)
-
-
-def _require_finite(amplitude: np.ndarray) -> None:
-    if not np.all(np.isfinite(amplitude)):
-        raise InputError("amplitude", f"is {quoted(amplitude)}; finite numbers are needed")
 
 
 def conveying_speed_at(amplitude: Array, w: Array, slope: Array) -> Array:

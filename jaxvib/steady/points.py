@@ -105,11 +105,16 @@ def ellipse_of(amplitude: Array | complex, speed: Number, *, slope: Number = 0.0
     >>> print(ellipse_of(jnp.array([0.005, -0.005j]), 100.0).summary())
     semi-axes 5 and 5 mm, anticlockwise, a circle, 5.099 g, throw number 5.099
     """
+    require_amplitudes(amplitude)
+    w, along = number(speed, "rad/s", "speed"), number(slope, "rad", "slope")
+    return ellipse_at(jnp.asarray(amplitude), w, along, number(remainder, "", "remainder", low=0.0))
+
+
+def require_amplitudes(amplitude: Array | complex) -> None:
+    """**Raises** `InputError` for anything other than two finite amplitudes."""
     if jnp.shape(amplitude) != (2,):
         raise InputError("amplitude", f"has the shape {jnp.shape(amplitude)}; give two amplitudes, horizontal and up")
     when_known(_require_finite, amplitude)
-    w, along = number(speed, "rad/s", "speed"), number(slope, "rad", "slope")
-    return ellipse_at(jnp.asarray(amplitude), w, along, number(remainder, "", "remainder", low=0.0))
 
 
 def _require_finite(amplitude: np.ndarray) -> None:
