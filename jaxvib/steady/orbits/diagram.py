@@ -28,6 +28,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.branch_plot import branch_summary, plot_branch
 from jaxvib.steady.jams.folds import fold_points, light_rotor_speed
 from jaxvib.steady.orbits.describe import OrbitStatus, orbits
+from jaxvib.steady.orbits.solve import collocation_points
 from jaxvib.steady.orbits.stability import Floquet, is_stiff, steps_for
 from jaxvib.units import Number, count, number
 
@@ -35,7 +36,6 @@ _ORBITS_PER_BATCH = 32
 """Number of orbits in a batch: enough to fill vector registers, few enough for the cache."""
 
 _COLLOCATION_POINTS = (16, 32, 64)
-
 
 _STABILITY_CRITERION = "by the multipliers of the full equations"
 
@@ -143,7 +143,8 @@ def exact_branches(
     count(points, "points", low=2, each=1e4)
     if not _search_grid.is_ready(scene):
         load_speeds = np.ones(_ORBITS_PER_BATCH, scene.drive.speed.dtype)
-        in_background(functools.partial(_values.prepare, scene, load_speeds, _points(scene)[0], accuracy, False))
+        fewest = collocation_points(scene, _COLLOCATION_POINTS[0])
+        in_background(functools.partial(_values.prepare, scene, load_speeds, fewest, accuracy, False))
     grid, resonances = map(np.asarray, _search_grid(scene))
     lowest = np.min(resonances[resonances > 0.0], initial=np.max(resonances))
     low = float(0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True))
@@ -188,7 +189,7 @@ class _Solver:
 
     def __call__(self, omega: np.ndarray) -> _Values:
         """Solve for the jams at load speeds; a batch takes as many integration steps as its slowest loads need."""
-        first, *more = _points(self.scene)
+        first, *more = (collocation_points(self.scene, points) for points in _COLLOCATION_POINTS)
         found = self._batches(omega, first)
         for point_count in more:
             todo = np.flatnonzero(~(found.error <= self.accuracy))
@@ -199,14 +200,6 @@ class _Solver:
 
     def _batches(self, omega: np.ndarray, points: int) -> _Values:
         return in_chunks(_ORBITS_PER_BATCH, lambda w: _values(self.scene, w, points, self.accuracy, self.implicit), omega)
-
-
-def _points(scene: Scene) -> list[int]:
-    """Return the numbers of collocation points to try one after the other.
-
-    The points lie on half a period if the motion has the half-turn symmetry, otherwise on a period.
-    """
-    return [p if has_half_turn_symmetry(scene.all_effects) else 2 * p + 1 for p in _COLLOCATION_POINTS]
 
 
 def _replaced_rows(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:

@@ -21,7 +21,6 @@ from jaxvib.boundary import validated
 from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
 from jaxvib.errors import InputError
-from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.fourier import grid_of
@@ -32,7 +31,7 @@ from jaxvib.steady.jams.folds import light_rotor_speed
 from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.describe import Orbit, OrbitStatus, differentiable_fields, orbits
 from jaxvib.steady.orbits.search import exact_mode_speeds
-from jaxvib.steady.orbits.solve import Parameter, periodic_motion
+from jaxvib.steady.orbits.solve import Parameter, collocation_points, periodic_motion
 from jaxvib.steady.orbits.stability import is_stiff, steps_for
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, count, number, validate_tolerance
@@ -179,9 +178,7 @@ def plan_orbit(
         accuracy = 1e-9 if dtype.itemsize >= 8 else 1e-3
     accuracy = validate_tolerance(accuracy, "accuracy", dtype, 1e3)
     if points is None:
-        # The points lie on half a period if the motion has the half-turn symmetry, otherwise on a period.
-        half = has_half_turn_symmetry(scene.all_effects)
-        tried = _COLLOCATION_POINTS if half else tuple(2 * p + 1 for p in _COLLOCATION_POINTS)
+        tried = tuple(collocation_points(scene, points) for points in _COLLOCATION_POINTS)
         tried = tried if all_known else tried[:1]
     else:
         size = _BYTES_PER_ENTRY * (1 if loads.alike else loads.count) ** 2 * float(points if isinstance(points, int) else 1)

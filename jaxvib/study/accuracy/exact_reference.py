@@ -9,11 +9,11 @@ import numpy as np
 
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.solve import collocation_points
 
 WINDOW_PERIODS, MAX_RUN_PERIODS = 20.0, 2000.0
 """Measuring window at the end of a run, and longest run, in slow periods (see `slow_period`)."""
@@ -57,12 +57,6 @@ def usual_mode(scene: Scene) -> int:
     if not rising:
         raise InputError("mode", "is missing, and no jam mode of this scene is stable by slope; give its number")
     return rising[-2] if len(rising) > 1 else rising[-1]  # in the last mode the loads turn almost with the rotor
-
-
-def collocation_points(scene: Scene, points: int) -> int:
-    """Return the number of collocation points: `points` on half a period for a scene with half-turn symmetry, otherwise
-    2 `points` + 1 on the whole period."""
-    return points if has_half_turn_symmetry(scene.all_effects) else 2 * points + 1
 
 
 def slow_period(scene: Scene) -> float:

@@ -19,8 +19,9 @@ from jaxvib.motion.plan import Tolerance, enough_steps
 from jaxvib.motion.simulate import simulate
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.solve import collocation_points
 from jaxvib.study.accuracy.cost import Cost, relative, row_of
-from jaxvib.study.accuracy.exact_reference import ExactJam, collocation_points, unstable_reason
+from jaxvib.study.accuracy.exact_reference import ExactJam, unstable_reason
 
 _GRADIENT_TOLERANCE = 1e-8
 
