@@ -76,7 +76,8 @@ def even_samples(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.nd
         if count > _MAX_MISSING * value.size:
             share = f"has {count} of {value.size} readings that are not numbers, {first}"
             raise InputError(where, f"{share}; at most {_MAX_MISSING:.0%} may be missing, use another part of the record")
-        notes.append(f"{where} has {count} {_readings(count)} that {_are(count)} not {_numbers(count)}, {first}; left out")
+        readings = "reading that is not a number" if count == 1 else "readings that are not numbers"
+        notes.append(f"{where} has {count} {readings}, {first}; left out")
     is_dropout = dropouts(value)
     if np.any(is_dropout):
         count = int(np.count_nonzero(is_dropout))
@@ -203,15 +204,3 @@ def _clipped_above(value: np.ndarray) -> float:
         if in_last_bin >= _MIN_CLIPPED and in_last_bin > _SPIKE * in_next_bins and in_triples >= _MIN_CLIPPED // 2:
             level = top - 2.0 * width  # noise on the clipped readings may exceed one bin
     return level
-
-
-def _readings(count: int) -> str:
-    return "reading" if count == 1 else "readings"
-
-
-def _are(count: int) -> str:
-    return "is" if count == 1 else "are"
-
-
-def _numbers(count: int) -> str:
-    return "a number" if count == 1 else "numbers"
