@@ -15,7 +15,6 @@ from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.identification.checks import FitStatus, coverage_notes, resembles, status_of
 from jaxvib.identification.directions import (
     Direction,
-    Information,
     combined_information,
     directions_of,
     eliminate,
@@ -288,7 +287,8 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         lambda scene: np.concatenate(natural(scene)),
     )
     logarithmic = known.logarithmic & ~known.vanished
-    estimates = list(map(_estimate, known.values, known.scale, logarithmic, _spreads(known), known.determined))
+    spreads = np.sqrt(np.maximum(np.diagonal(known.covariance), 0.0))
+    estimates = list(map(_estimate, known.values, known.scale, logarithmic, spreads, known.determined))
     estimates = [
         each._replace(low=max(each.low, 0.0)) if is_zero else each
         for each, is_zero in zip(estimates, known.vanished, strict=True)
@@ -340,10 +340,6 @@ def fitted_scene(problem: Problem, x: np.ndarray, linear: np.ndarray) -> Scene:
             number = find_number(scene, f"exciters[{k}].unbalance", "unknown")
             scene = put_numbers(scene, (number,), np.hypot(*linear[2 * k : 2 * k + 2])[None])
     return validate_scene(scene)
-
-
-def _spreads(known: Information) -> np.ndarray:
-    return np.sqrt(np.maximum(np.diagonal(known.covariance), 0.0))
 
 
 def _estimate(value: float, scale: float, logarithmic: bool, spread: float, determined: bool) -> Estimate:
