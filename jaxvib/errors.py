@@ -10,7 +10,8 @@ import stat
 import threading
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from types import ModuleType
+from typing import IO
 
 MAX_TEXT_BYTES = 2**24
 """Largest size, bytes, of a text file that is read."""
@@ -173,7 +174,7 @@ def written(path: Path) -> Iterator[Path]:
                 part.unlink()  # fails, without effect, if this file has already replaced the one at `path`
 
 
-def optional_module(name: str, extra: str) -> Any:
+def optional_module(name: str, extra: str) -> ModuleType:
     """Import the module `name` of an optional package.
 
     **Raises** `InputError` if the package is missing, with the command that installs it by the `extra` of this project.

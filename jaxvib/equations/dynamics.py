@@ -7,7 +7,7 @@ import functools
 import itertools
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -35,6 +35,8 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.fence import fence, hidden_one
 from jaxvib.numerics.linalg import small_inverse, small_solve, solve_definite, times
+
+T = TypeVar("T")
 
 
 class _Support(eqx.Module):
@@ -115,11 +117,11 @@ class Dynamics(eqx.Module):
         rates = self._fenced(rates, unforced)
         return State(state.velocity, carrier, exciters=ungroup(self.groups, rates))
 
-    def _each(self, function: Callable[..., Any], *values: Sequence[Any]) -> list[Any]:
+    def _each(self, function: Callable[..., T], *values: Sequence[object]) -> list[T]:
         """Return function(exciter, *values) of each exciter, by group."""
         return [group.each(function, *of_group) for group, *of_group in zip(self.groups, *values, strict=True)]
 
-    def _fenced(self, parts: list[Any], unforced: Array) -> list[Any]:
+    def _fenced(self, parts: list[T], unforced: Array) -> list[T]:
         """Return parts of the groups with fences, if there are any."""
         if not self.has_fences or all(len(group.members) == 1 for group in self.groups):
             return parts

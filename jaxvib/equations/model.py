@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -23,6 +23,7 @@ _MIN_GROUP_SIZE = 8
 """Smallest number of parts of equal structure that are computed as one group."""
 
 Part = TypeVar("Part")
+T = TypeVar("T")
 
 
 class Group(eqx.Module, Generic[Part]):
@@ -37,7 +38,7 @@ class Group(eqx.Module, Generic[Part]):
     part: Part
     members: tuple[int, ...] = eqx.field(static=True)
 
-    def each(self, function: Callable[..., Any], *values: Any) -> Any:
+    def each(self, function: Callable[..., T], *values: object) -> T:
         """Return function(part, *values) of each member."""
         return (function if len(self.members) == 1 else eqx.filter_vmap(function))(self.part, *values)
 
@@ -55,16 +56,16 @@ def grouped(parts: Sequence[Part], kinds: Sequence[Hashable] | None = None) -> t
     return tuple(Group(stack_members(members, parts), tuple(members)) for members in sorted(groups))
 
 
-def stack_members(members: Sequence[int], trees: Sequence[Any]) -> Any:
+def stack_members(members: Sequence[int], trees: Sequence[T]) -> T:
     """Return the trees of the `members` as one tree, with a leading axis over the members if there are several."""
     if len(members) == 1:
         return trees[members[0]]
     return jax.tree.map(lambda *x: jnp.stack(x), *(trees[k] for k in members))
 
 
-def ungroup(groups: Iterable[Group], trees: Iterable[Any]) -> list[Any]:
+def ungroup(groups: Iterable[Group], trees: Iterable[T]) -> list[T]:
     """Return the trees of all exciters in the order of the exciters, from the trees of their groups."""
-    of_exciter = {}
+    of_exciter: dict[int, T] = {}
     for group, tree in zip(groups, trees, strict=True):
         for i, k in enumerate(group.members):
             of_exciter[k] = tree if len(group.members) == 1 else jax.tree.map(lambda x, i=i: x[i], tree)

@@ -184,7 +184,7 @@ def _is_real(equation: JaxprEqn) -> bool:
     return np.issubdtype(_dtype(equation.invars[0]), np.floating)
 
 
-def _variables(equation: JaxprEqn) -> list[Any]:
+def _variables(equation: JaxprEqn) -> list[Var | None]:
     return [atom if isinstance(atom, Var) else None for atom in equation.invars]
 
 

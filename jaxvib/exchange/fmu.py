@@ -13,7 +13,7 @@ import tempfile
 import zipfile
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -210,7 +210,7 @@ def _programs(scene: Scene, equations: Equations, events: bool, parameters: int)
     def tangent(scene: Scene, t: Array, states: object, inputs: object, *direction: object) -> object:
         return jax.jvp(lambda *changing: equations.rates(scene, t, *changing), (states, inputs), direction)[1]
 
-    def full_tangent(*values: Any) -> object:
+    def full_tangent(*values: object) -> object:
         return jax.jvp(equations.rates, values[: len(arguments)], values[len(arguments) :])[1]
 
     try:

@@ -7,6 +7,7 @@ along the axis, +Y horizontal, +Z up.
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -31,7 +32,7 @@ _ORDERS: dict[str, tuple[int, str]] = {"displacement": (8, "m"), "velocity": (11
 
 _FORCE, _REACTION, _TIME, _FREQUENCY = 13, 9, 17, 18
 _HISTORY, _RESPONSE, _GENERAL = 1, 4, 0
-_KINDS = {_HISTORY: "history", _RESPONSE: "response"}
+_KINDS: Mapping[int, Literal["history", "response"]] = {_HISTORY: "history", _RESPONSE: "response"}
 _EXPONENTS = {8: (1, 0), 11: (1, 0), 12: (1, 0), 9: (0, 1), 13: (0, 1), 15: (-2, 1), 16: (-1, 1)}
 """Exponents of length and force in the unit of a quantity, by its specific data type."""
 
@@ -403,11 +404,10 @@ def read_uff(path: str | Path) -> UffFile:
 
 def _read_function(dataset: dict[str, Any], length: float, force: float) -> UffFunction:
     """Return a function in SI units."""
-    kind = _KINDS.get(int(dataset["func_type"]), "other")
     scale = _scale(dataset, "ordinate", length, force) / _scale(dataset, "orddenom", length, force)
     names = {code: name for name, (code, _) in _ORDERS.items()} | {_FORCE: "force", _REACTION: "force"}
     return UffFunction(
-        kind,  # pyright: ignore[reportArgumentType]
+        _KINDS.get(int(dataset["func_type"]), "other"),
         np.asarray(dataset["x"], float),
         np.asarray(dataset["data"]) * scale,
         names.get(int(dataset["ordinate_spec_data_type"]), ""),

@@ -3,7 +3,7 @@
 import abc
 import functools
 from collections.abc import Hashable, Sequence
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal, cast
 
 import equinox as eqx
 import jax
@@ -48,8 +48,7 @@ def read_place(at: int | Number | Sequence[Number] | None, name: str) -> int | A
         return count(at, name)
     if isinstance(at, (list, tuple)) or getattr(at, "ndim", 0) > 0:
         return numbers(at, "m", name, 2)
-    distance: Any = at
-    return number(distance, "m", name)
+    return number(cast(Number, at), "m", name)
 
 
 def on_body(at: int | Array | None, body: int) -> Place:

@@ -6,7 +6,6 @@ import math
 import re
 import tomllib
 from collections.abc import Sequence
-from typing import Any
 
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
@@ -65,9 +64,9 @@ def rewrite_scene(text: str, scene: Scene) -> str:
     return result if is_same else scene_to_toml(scene)
 
 
-def _added_lines(read: Any, old: Any, new: Any) -> list[str]:
+def _added_lines(read: object, old: object, new: object) -> list[str]:
     """Return lines for the numbers of a table that differ from a default, which the file does not state."""
-    if not all(isinstance(each, dict) for each in (read, old, new)):
+    if not (isinstance(read, dict) and isinstance(old, dict) and isinstance(new, dict)):
         return []
     return [
         f"{name} = {_with_unit(None, old[name], value)}  # was {_with_unit(None, None, old[name])}, the default"
@@ -101,7 +100,7 @@ def _section_of(names: Sequence[str], is_array: bool, counts: dict[_Path, int]) 
     return path
 
 
-def _value_at(tables: Any, path: _Path) -> Any:
+def _value_at(tables: object, path: _Path) -> object:
     for step in path:
         if isinstance(tables, list):
             tables = tables[step] if isinstance(step, int) and step < len(tables) else None
@@ -110,7 +109,7 @@ def _value_at(tables: Any, path: _Path) -> Any:
     return tables
 
 
-def _rewritten_line(line: str, entry: re.Match[str], read: Any, old: Any, new: Any, is_other_machine: bool) -> str:
+def _rewritten_line(line: str, entry: re.Match[str], read: object, old: object, new: object, is_other_machine: bool) -> str:
     """Return a line whose value, `read` in the file, is `old` in SI, with the value `new` in SI.
 
     A damping that is given as a ratio is written as a number for another machine: its constant stays, the ratio does not.
@@ -122,7 +121,7 @@ def _rewritten_line(line: str, entry: re.Match[str], read: Any, old: Any, new: A
     return f"{entry[1]}{_with_unit(read, old, new)}  # was {former}{comment}"
 
 
-def _with_unit(read: Any, old: Any, new: Any) -> str:
+def _with_unit(read: object, old: object, new: object) -> str:
     """Return the value `new`, SI, as TOML in the form and unit of the value `read` in a file, which is `old` in SI."""
     if isinstance(new, list):
         size = len(new)
@@ -137,13 +136,13 @@ def _with_unit(read: Any, old: Any, new: Any) -> str:
         return f'"{new}"'
     if not isinstance(new, float):
         return str(new).lower()
-    is_plain = written is None or bool(_RELATIVE.search(read)) or float(written[2]) == 0.0
+    is_plain = written is None or bool(_RELATIVE.search(written[0])) or float(written[2]) == 0.0
     if written is None or is_plain or not isinstance(old, float) or old == 0.0:
         return f"{new:.{_DIGITS}g}"
     return f'"{written[1]}{new * float(written[2]) / old:.{_DIGITS}g}{written[3]}"'
 
 
-def _is_close(one: Any, other: Any) -> bool:
+def _is_close(one: object, other: object) -> bool:
     """Return True if two values of TOML are equal, numbers to the digits of changed numbers."""
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(_is_close(one[name], other[name]) for name in one)

@@ -153,6 +153,6 @@ def _require_shape(field: str, name: str, value: Any, *shapes: Shape) -> None:
         raise InputError(field, f"returns {name}{_described(value)}; the shape {needed} is needed")
 
 
-def _described(value: Any) -> str:
+def _described(value: object) -> str:
     is_array = isinstance(value, (jax.ShapeDtypeStruct, jax.Array, np.ndarray))
     return f"an array of shape {value.shape}" if is_array else quoted(value)

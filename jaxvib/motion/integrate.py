@@ -123,10 +123,10 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
     return fastest, jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
 
 
-def angle_wrapping(scene: Scene, dtype: Any) -> tuple[bool, bool]:
+def angle_wrapping(scene: Scene, dtype: np.dtype) -> tuple[bool, bool]:
     """Return two flags: True if the integration keeps angles within one turn (single precision); True if the same number of
     turns is subtracted from the angles of all loads (loads in contact)."""
-    return jnp.dtype(dtype).itemsize < 8, has_term(scene.all_effects, LoadInteraction)
+    return dtype.itemsize < 8, has_term(scene.all_effects, LoadInteraction)
 
 
 class IntegrationPlan(NamedTuple):
@@ -295,7 +295,7 @@ def _stages(solver: diffrax.AbstractSolver) -> int:
     return 0 if tableau is None else tableau.num_stages - tableau.fsal
 
 
-def is_finite(state: Any) -> Array:
+def is_finite(state: object) -> Array:
     """Return True if every number of a state, or of another tree, is finite."""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
 

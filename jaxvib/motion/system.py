@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from collections.abc import Callable, Hashable
+from typing import TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -74,7 +74,7 @@ class PackedSystem(eqx.Module):
     size: int = eqx.field(static=True)
     is_on_scalars: bool = eqx.field(static=True)
     has_fences: bool = eqx.field(static=True)
-    treedef: Any = eqx.field(static=True)
+    treedef: Hashable = eqx.field(static=True)
     shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     wrapped: bool = eqx.field(static=True)
     has_common_turns: bool = eqx.field(static=True)

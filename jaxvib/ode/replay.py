@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -122,7 +122,7 @@ def _reverse_only_jvp(primals: Any, tangents: Any) -> tuple[list[Array], list[An
     return numbers, [slope if isinstance(slope, SymbolicZero) else next(nonzero) for slope in slopes]
 
 
-def _refuse_forward(*_: Any) -> Any:
+def _refuse_forward(*_: object) -> NoReturn:
     raise InputError(
         "adjoint",
         "supports reverse-mode derivatives only; for jvp, jacfwd and linearize of a run use adjoint=diffrax.ForwardMode()",

@@ -13,6 +13,7 @@ import jax
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError
 from jaxvib.runtime.compat import user_folder
+from jaxvib.runtime.devices import jax_option
 
 _program_folder: list[Path] = []
 """Folder of traced programs as a list of one entry; empty if programs are not stored."""
@@ -56,7 +57,7 @@ def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bo
         raise InputError("folder", f"is '{path}'; it must be a folder that can be written to ({error.strerror})") from error
     for place in (path, programs):
         require_own(place)
-    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
+    if jax_option("jax_compilation_cache_dir") is None:
         jax.config.update("jax_compilation_cache_dir", str(path))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     set_program_folder(programs)
@@ -65,7 +66,7 @@ def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bo
 
 def default_folder() -> Path:
     """Return the folder in which programs are cached by default."""
-    folder_of_jax = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    folder_of_jax = jax_option("jax_compilation_cache_dir")
     return Path(folder_of_jax or user_folder())
 
 
@@ -85,7 +86,7 @@ def compiled_anew() -> Iterator[None]:
 
     Only programs that this process has not used before are compiled; the others are still in memory.
     """
-    folder, enabled = program_folder(), bool(jax.config.jax_enable_compilation_cache)  # pyright: ignore[reportAttributeAccessIssue]
+    folder, enabled = program_folder(), bool(jax_option("jax_enable_compilation_cache"))
     set_program_folder(None)
     jax.config.update("jax_enable_compilation_cache", False)
     try:

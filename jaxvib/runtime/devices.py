@@ -26,19 +26,24 @@ _VISIBILITY_VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VI
 _DEVICE_LOCK = threading.Lock()
 
 
+def jax_option(name: str) -> Any:
+    """Return the value of an option of JAX, which type checkers do not know."""
+    return getattr(jax.config, name)
+
+
 def shared_devices() -> list[object]:
     """Return the accelerators that share this process's work; [None] for a single device, or if the caller chose one.
 
     The CPU counts as a single device, even if XLA divides it into several, because threads share its cores.
     """
     devices = jax.local_devices()
-    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    chosen = jax_option("jax_default_device")
     return list(devices) if chosen is None and len(devices) > 1 and devices[0].platform != "cpu" else [None]
 
 
 def is_processor() -> bool:
     """Return True if JAX computes on the processor at present, False on an accelerator."""
-    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    chosen = jax_option("jax_default_device")
     return (chosen if isinstance(chosen, str) else (chosen or jax.local_devices()[0]).platform) == "cpu"
 
 
@@ -49,7 +54,7 @@ def known(value: ArrayLike) -> Any:
 
 def float_dtype() -> np.dtype:
     """Return the type of the floating-point numbers in which JAX computes at present."""
-    return np.dtype(np.float64 if jax.config.jax_enable_x64 else np.float32)  # pyright: ignore[reportAttributeAccessIssue]
+    return np.dtype(np.float64 if jax_option("jax_enable_x64") else np.float32)
 
 
 def numpy_of(tree: PyTree) -> ModuleType:
@@ -70,7 +75,7 @@ def on_device(tree: PyTree) -> PyTree:
     return structure.unflatten(next(moved) if isinstance(leaf, (np.ndarray, np.generic)) else leaf for leaf in leaves)
 
 
-def arrays_on_device(leaves: Sequence[Any]) -> list[Any]:
+def arrays_on_device(leaves: Sequence[object]) -> list[Any]:
     """Copy NumPy's arrays among the leaves of a tree to JAX's device.
 
     Python's numbers are returned unchanged, because they are constants of programs.

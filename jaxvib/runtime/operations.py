@@ -17,7 +17,7 @@ from jax import Array
 from jaxvib.runtime.compat import HAS_JAXPRS, ClosedJaxpr, jaxpr_as_fun, rewritten
 
 
-def count_operations(function: Callable[..., Any], *arguments: Any) -> int:
+def count_operations(function: Callable[..., object], *arguments: object) -> int:
     """Count the operations of the program of a function.
 
     The operations of a loop body count once, not once for each iteration; those of a called program count once for each call.
@@ -41,7 +41,7 @@ def _walk(jaxpr: Any) -> Iterator[Any]:
             yield equation
 
 
-def _programs(value: Any) -> Iterator[Any]:
+def _programs(value: object) -> Iterator[Any]:
     if hasattr(value, "eqns"):
         yield value
     elif isinstance(value, (list, tuple)):
@@ -91,7 +91,7 @@ def program_digest(program: ClosedJaxpr) -> str:
 
 def _lines(closed: Any, depth: int = 0) -> Iterator[str]:
     jaxpr, constants = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
-    names: dict[Any, str] = {}
+    names: dict[object, str] = {}
 
     def named(atom: Any) -> str:
         if hasattr(atom, "val"):
@@ -103,7 +103,7 @@ def _lines(closed: Any, depth: int = 0) -> Iterator[str]:
         yield f"{indent}{named(variable)} = {_text(value)}"
     yield f"{indent}arguments {' '.join(f'{named(v)}:{v.aval.str_short()}' for v in jaxpr.invars)}"
     for equation in jaxpr.eqns:
-        inner: list[Any] = []
+        inner: list[object] = []
         parameters = sorted((key, value) for key, value in equation.params.items() if key not in _IRRELEVANT_PARAMETERS)
         shown = ", ".join(f"{key}={_text(value, inner)}" for key, value in parameters)
         operands = " ".join(named(atom) for atom in equation.invars)
@@ -114,7 +114,7 @@ def _lines(closed: Any, depth: int = 0) -> Iterator[str]:
     yield f"{indent}results {' '.join(named(atom) for atom in jaxpr.outvars)}"
 
 
-def _text(value: Any, inner: list[Any] | None = None) -> str:
+def _text(value: object, inner: list[object] | None = None) -> str:
     """Return a parameter or constant as text. Programs are appended to `inner`; functions and objects are named by type."""
     if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
         if inner is None:

@@ -84,7 +84,7 @@ class CachedFunction(Generic[P, T]):
         start()
         self.stored.compiled(*jax.tree.flatten((args, kwargs)))
 
-    def _transformed(self, tracers: Sequence[Any], leaves: Sequence[Any], treedef: Any, args: Any, kwargs: Any) -> T:
+    def _transformed(self, tracers: Sequence[object], leaves: Sequence[Any], treedef: Hashable, args: Any, kwargs: Any) -> T:
         """Evaluate the function under a JAX transformation."""
         if CAN_DEFINE_PRIMITIVES and not is_debugging() and all(map(_is_simple, tracers)):
             call = _CallSignature(self, Skeleton.of(leaves, treedef))
@@ -115,7 +115,7 @@ class _CallSignature:
         args, kwargs = self.arguments.filled(arrays)
         return self.function.stored.function(*args, **kwargs)
 
-    def split(self, result: Any) -> list[Array]:
+    def split(self, result: object) -> list[Array]:
         """Return the arrays of a result, and store its structure for the method `result`."""
         leaves, treedef = jax.tree.flatten(result)
         self.outputs[:] = [Skeleton.of(leaves, treedef)]
@@ -179,7 +179,7 @@ def _replaced(active: Sequence[bool], arrays: Sequence[Array], active_arrays: Se
     return [next(others) if is_active else x for is_active, x in zip(active, arrays, strict=True)]
 
 
-def _is_inexact(x: Any) -> bool:
+def _is_inexact(x: Array) -> bool:
     return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
@@ -259,11 +259,11 @@ MAX_PULLBACK_FORMS = 64
 """Largest number of forms of pullbacks in memory, about 1 MB each. A form is needed only while the backward program is traced,
 which follows soon after the trace of the forward program, if at all."""
 
-_pullbacks: collections.OrderedDict[Hashable, tuple[Skeleton, tuple[Any, ...]]] = collections.OrderedDict()
+_pullbacks: collections.OrderedDict[Hashable, tuple[Skeleton, tuple[object, ...]]] = collections.OrderedDict()
 _keeping = threading.Lock()
 
 
-def _traced_pullback(call: _CallSignature, active: tuple[bool, ...], types: _Types) -> tuple[Skeleton, tuple[Any, ...]]:
+def _traced_pullback(call: _CallSignature, active: tuple[bool, ...], types: _Types) -> tuple[Skeleton, tuple[object, ...]]:
     """Return the skeleton of the pullback, without its arrays, and zero cotangents of the floating-point outputs."""
     key = code_state(), call, active, types
     if key not in _pullbacks:  # `_vjp_forward` was read from disk and not traced
@@ -325,7 +325,9 @@ def _differentiate(arrays: Sequence[Array], tangents: Sequence[Any], *, call: _C
     return outputs, [next(inexact_tangents) if _is_inexact(x) else zero_of(x) for x in outputs]
 
 
-def _batch(arrays: Sequence[Array], axes: Sequence[Any], *, call: _CallSignature) -> tuple[list[Array], list[Any]]:
+def _batch(
+    arrays: Sequence[Array], axes: Sequence[int | None], *, call: _CallSignature
+) -> tuple[list[Array], list[int | None]]:
     batched = tuple(axis is not None for axis in axes)
     leading = [x if axis is None or axis == 0 else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes, strict=True)]
     result = _batched_program(call, batched, leading)
@@ -346,7 +348,7 @@ class _LinearizationPoint:
     active: tuple[bool, ...]
     arrays: list[Array]
     residuals: list[Array]
-    types: tuple[Any, ...]
+    types: tuple[object, ...]
 
 
 def _apply_linear_map(*tangents: Array, at: _LinearizationPoint) -> list[Array]:
@@ -358,13 +360,13 @@ def _trace_linear_map(*tangents: Array, at: _LinearizationPoint) -> list[Array]:
 
 
 def _batch_linear_map(
-    tangents: Sequence[Array], axes: Sequence[Any], *, at: _LinearizationPoint
+    tangents: Sequence[Array], axes: Sequence[int | None], *, at: _LinearizationPoint
 ) -> tuple[list[Array], list[int]]:
     outputs = jax.vmap(functools.partial(_apply_linear_map, at=at), in_axes=tuple(axes))(*tangents)
     return outputs, [0] * len(outputs)
 
 
-def _transpose(cotangents: Sequence[Any], *_: Any, at: _LinearizationPoint) -> list[Array]:
+def _transpose(cotangents: Sequence[Any], *_: object, at: _LinearizationPoint) -> list[Array]:
     wanted = tuple(not is_zero(cotangent) for cotangent in cotangents)
     nonzero = [cotangent for is_wanted, cotangent in zip(wanted, cotangents, strict=True) if is_wanted]
     if at.call.function.outputs_from_solution is not None:

@@ -33,7 +33,7 @@ from jaxvib.code_changes import CodeState, clear_derived, code_state, digest_of_
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import evaluating, no_host_checks, without_source_locations
 from jaxvib.runtime.cpu import processor
-from jaxvib.runtime.devices import arrays_on_device
+from jaxvib.runtime.devices import arrays_on_device, jax_option
 from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Skeleton, Slot, Undescribable, describe, leaf_key, rebuild
 
 T = TypeVar("T")
@@ -93,7 +93,7 @@ class StoredFunction(Generic[T]):
         with _functions_lock:
             _functions.add(self)
 
-    def __call__(self, leaves: Sequence[Any], treedef: Any) -> T:
+    def __call__(self, leaves: Sequence[object], treedef: Hashable) -> T:
         """Evaluate the function for arguments (args, kwargs) with these leaves, none of which may be a tracer."""
         if (program := self.compiled(leaves, treedef)) is None:
             return self._jitted(leaves, treedef)
@@ -101,7 +101,7 @@ class StoredFunction(Generic[T]):
         with evaluating():  # inside a transformation JAX would use its slow dispatch, even if no argument is traced
             return program(x for x in leaves if isinstance(x, _ARRAYS))
 
-    def compiled(self, leaves: Sequence[Any], treedef: Any) -> _Program | None:
+    def compiled(self, leaves: Sequence[object], treedef: Hashable) -> _Program | None:
         """Return the compiled program for these arguments, or None if `jitted` has to compile it."""
         call, program = self._look_up(leaves, treedef)
         if program is _UNKNOWN:
@@ -119,11 +119,11 @@ class StoredFunction(Generic[T]):
             _evict_least_recently_used()
         return program
 
-    def is_ready(self, leaves: Sequence[Any], treedef: Any) -> bool:
+    def is_ready(self, leaves: Sequence[object], treedef: Hashable) -> bool:
         """Return True if the program for these arguments is in memory, or if `jitted` has to compile it."""
         return self._look_up(leaves, treedef)[1] is not _UNKNOWN
 
-    def _look_up(self, leaves: Sequence[Any], treedef: Any) -> tuple[Any, _Program | None]:
+    def _look_up(self, leaves: Sequence[object], treedef: Hashable) -> tuple[Any, _Program | None]:
         """Return the key of a call and its program in memory.
 
         The program is `_UNKNOWN` if it is not in memory, and None if `jitted` has to compile it.
@@ -136,7 +136,7 @@ class StoredFunction(Generic[T]):
         except TypeError:  # an argument is not hashable
             return (), None
 
-    def _jitted(self, leaves: Sequence[Any], treedef: Any) -> T:
+    def _jitted(self, leaves: Sequence[object], treedef: Hashable) -> T:
         args, kwargs = jax.tree.unflatten(treedef, arrays_on_device(leaves))
         return self.jitted(*args, **kwargs)
 
@@ -335,7 +335,7 @@ def _sharding_of(leaves: Sequence[object]) -> Sharding:
     for leaf in leaves:
         if isinstance(leaf, jax.Array) and leaf.committed:
             return leaf.sharding
-    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    chosen = jax_option("jax_default_device")
     return SingleDeviceSharding(chosen if isinstance(chosen, jax.Device) else jax.local_devices(backend=chosen)[0])
 
 

@@ -39,13 +39,13 @@ class Skeleton:
     tree: Any
 
     @classmethod
-    def of(cls, leaves: Sequence[object], treedef: Any) -> Skeleton:
+    def of(cls, leaves: Sequence[object], treedef: Hashable) -> Skeleton:
         """Return the skeleton of a tree with these leaves."""
         indices = itertools.count()
         return cls(jax.tree.unflatten(treedef, [Slot(next(indices)) if eqx.is_array(x) else x for x in leaves]))
 
     @functools.cached_property
-    def flat(self) -> tuple[tuple[object, ...], Any]:
+    def flat(self) -> tuple[tuple[object, ...], Hashable]:
         """Leaves and tree structure."""
         leaves, treedef = jax.tree.flatten(self.tree)
         return tuple(leaves), treedef

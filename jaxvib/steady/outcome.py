@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Collection
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -26,6 +26,7 @@ REFUSED = "a traced parameter has a value that is not allowed: call the function
 """Message of the status `refused`."""
 
 SomeResult = TypeVar("SomeResult", bound=Result)
+Tree = TypeVar("Tree")
 
 
 def outcome(
@@ -68,10 +69,10 @@ def unknown_is_positive(number: Array | None) -> Array | None:
     return None if number is None or is_known(number) else jnp.isfinite(number) & (number > 0.0)
 
 
-def without_numbers(allowed: Array, tree: Any) -> Any:
+def without_numbers(allowed: Array, tree: Tree) -> Tree:
     """Return a tree with NaN and False in place of its numbers if `allowed` is False; a scene in the tree is unchanged."""
 
-    def replace(value: Any) -> Any:
+    def replace(value: object) -> object:
         if not isinstance(value, Array):
             return value
         if jnp.issubdtype(value.dtype, jnp.inexact):

@@ -85,7 +85,7 @@ def pair_of(of: Pair | list[int]) -> Pair:
     whole = all(isinstance(part, (int, np.integer)) and not isinstance(part, bool) for part in parts)
     if of is not None and not (whole and len(parts) == (2 if parts is of else 1)):
         raise InputError("of", f"is {quoted(of)}; give a platform or a pair of different platforms")
-    return tuple(of) if isinstance(of, list) else of  # pyright: ignore[reportReturnType]
+    return (of[0], of[1]) if isinstance(of, list) else of
 
 
 @validated

@@ -76,6 +76,7 @@ def rotor_speed_at(model: ExcitedModel, omega: Array, speed: Array | None = None
     of these functions too.
 
     >>> import jaxvib as jv
+    >>> from jaxvib.equations.linear import jammed_model
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
     >>> round(float(rotor_speed_at(jammed_model(form.scene()), 1.0015)), 4)

@@ -12,7 +12,7 @@ carrier, p directions of the mount.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -388,9 +388,16 @@ class _NewtonState(NamedTuple):
     stalled: Array
 
 
+Unknowns = TypeVar("Unknowns", bound=tuple)
+
+
 def newton(
-    linearize: Callable[..., Linearized], move: Callable[[Any, Array, Array], Any], start: Any, change: Array, one: Array
-) -> Any:
+    linearize: Callable[..., Linearized],
+    move: Callable[[Unknowns, Array, Array], Unknowns],
+    start: Unknowns,
+    change: Array,
+    one: Array,
+) -> Unknowns:
     """Return the root of the equations that `linearize` evaluates at the unknowns, or the unknowns with the smallest residuals
     if the iteration does not converge.
 
