@@ -141,10 +141,7 @@ class MachineFit(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the readings of the first run with the fit, and the residuals, onto two axes: `ax`, or those of a new figure.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the readings of the first run with the fit, and the residuals, onto two axes: `ax`, or those of a new figure."""
         from jaxvib.draw.record import fit_chart  # slow import
 
         return fit_chart(self.time[0], self.readings[0], self.fitted[0], self.noise[0], self.channels[0], ax=ax)

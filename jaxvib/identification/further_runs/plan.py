@@ -63,10 +63,7 @@ class RunPlan(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the largest relative error of the numbers after each candidate run.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the largest relative error of the numbers after each candidate run."""
         from jaxvib.draw.results import points_chart  # slow import
 
         largest = np.max(np.where(np.isfinite(self.errors), self.errors, 1.0), axis=1)

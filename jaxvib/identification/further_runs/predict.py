@@ -76,10 +76,7 @@ class RunPrediction(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the readings with the prediction, and the residuals, onto two axes `ax` if given.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the readings with the prediction, and the residuals, onto two axes `ax` if given."""
         from jaxvib.draw.record import fit_chart  # slow import
 
         return fit_chart(self.time, self.readings, self.predicted, self.noise, self.channels, ax=ax)
