@@ -5,11 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from light_jams import jam_rotor_speed
 from plugins.drive import Turbine
 from plugins.effect import SealFriction
 from plugins.load import TorusPoints
-from scenes import machines, published
+from scenes import jam_rotor_speed, machines, published
 
 import jaxvib as jv
 from jaxvib.equations.averaged import averaged_field

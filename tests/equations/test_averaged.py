@@ -6,8 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gyroscopic_rotor import rotor
-from light_jams import jam_rotor_speed, steady_displacement
-from scenes import machines, published, scene
+from scenes import jam_rotor_speed, machines, published, scene, steady_displacement
 
 import jaxvib as jv
 from jaxvib.equations.averaged import Amplitudes, _with_conjugate, amplitudes_of, averaged_field, averaged_model

@@ -6,6 +6,7 @@ import numpy as np
 import jaxvib as jv
 from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_model
+from jaxvib.steady.jams.folds import rotor_speed_at
 
 TWO_MASS = dict(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0)
 BALLS = dict(count=3, mass=0.8, radius=0.12, drag=1.5)
@@ -69,3 +70,11 @@ def some_state(s):
 def assembled(scene):
     """The scene's carrier with its coincident loads, as exact jams take it."""
     return jammed_bodies(jammed_model(scene))
+
+
+def jam_rotor_speed(scene, omega):
+    return rotor_speed_at(jammed_model(scene), omega)
+
+
+def steady_displacement(scene, omega):
+    return jammed_model(scene).displacement(omega)

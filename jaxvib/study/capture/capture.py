@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import get_args
 
 import equinox as eqx
@@ -256,12 +256,7 @@ def capture(
 
     # A threshold close to one of the speeds may be in the interval below or above it, depending on the steps.
     tolerance = 1.001 * max(np.max(np.diff(first_speeds), initial=0.0) if resolution is None else resolution, 1e-12)
-    result, last_change = scan(1), math.nan
-    for doubling in range(1, largest_doublings + 1 if controller is None else 1):
-        coarser, result = result, scan(2**doubling)
-        last_change = _change(coarser.border, result.border)
-        if last_change <= tolerance:
-            break
+    result, last_change = _with_finer_steps(scan, largest_doublings if controller is None else 0, tolerance)
     uncertainty = jnp.fmax(result.uncertainty, last_change) if np.isfinite(result.threshold) else result.uncertainty
     status = CaptureStatus.not_converged if last_change > tolerance else result.status
     return dataclasses.replace(result, last_change=jnp.asarray(last_change), uncertainty=uncertainty, status=status)
@@ -306,6 +301,17 @@ def _threshold_index(captured: np.ndarray) -> int:
     """Return the index of the lowest speed from which on all starts are captured, or the number of speeds if there is none."""
     failing = np.flatnonzero(~np.all(captured, axis=1))
     return 0 if failing.size == 0 else int(failing[-1]) + 1
+
+
+def _with_finer_steps(scan: Callable[[int], Capture], doublings: int, tolerance: float) -> tuple[Capture, float]:
+    """Double the steps until the border changes by at most the tolerance; return the last result and the last change."""
+    result, change = scan(1), math.nan
+    for doubling in range(1, doublings + 1):
+        coarser, result = result, scan(2**doubling)
+        change = _change(coarser.border, result.border)
+        if change <= tolerance:
+            break
+    return result, change
 
 
 def _change(first: float, second: float) -> float:

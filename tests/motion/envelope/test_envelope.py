@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from light_jams import jam_rotor_speed
-from scenes import published
+from scenes import jam_rotor_speed, published
 
 import jaxvib as jv
 from jaxvib.equations.model import assemble

@@ -5,9 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from light_jams import jam_rotor_speed
 from load_speeds import all_load_speeds
-from scenes import published
+from scenes import jam_rotor_speed, published
 
 import jaxvib as jv
 from jaxvib.equations.linear import linear_model

@@ -5,9 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from light_jams import jam_rotor_speed
 from load_speeds import all_load_speeds, complex_response, unbalance_and_drag
-from scenes import loads, machines, published
+from scenes import jam_rotor_speed, loads, machines, published
 
 import jaxvib as jv
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from gyroscopic_rotor import rotor
 from jax.flatten_util import ravel_pytree
-from light_jams import jam_rotor_speed
 from periodic import integrate, monodromy, ordered
-from scenes import assembled, machines, scene
+from scenes import assembled, jam_rotor_speed, machines, scene
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv

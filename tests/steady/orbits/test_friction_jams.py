@@ -6,9 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gyroscopic_rotor import rotor
-from light_jams import jam_rotor_speed
 from periodic import integrate, monodromy, ordered
-from scenes import assembled, machines
+from scenes import assembled, jam_rotor_speed, machines
 
 import jaxvib as jv
 from jaxvib.machine.effects.base import has_half_turn_symmetry

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from light_jams import jam_rotor_speed
 from periodic import integrate
-from scenes import assembled, machines, published
+from scenes import assembled, jam_rotor_speed, machines, published
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from light_jams import jam_rotor_speed, steady_displacement
+from scenes import jam_rotor_speed, steady_displacement
 
 import jaxvib as jv
 from jaxvib.ode import replay
