@@ -228,8 +228,14 @@ def test_sweep_over_the_angle_of_a_support(tmp_path):
 def test_angles_of_a_straight_throw_are_those_of_a_dense_scan():
     space = DesignSpace(stiff_screen(0.0, 0.0), dict.fromkeys(ANGLES, ("-85 deg", "85 deg")))
     best = synthesize(space, straight_at_45(), starts=16, verify=False)
-    bound = np.deg2rad(85.0)
-    z, least = scan((-bound, -bound), (bound, bound), lambda z: turned(z).objective(), points=61, rounds=6)
+    axis = np.deg2rad(np.linspace(-85.0, 85.0, 61))
+    z = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1)
+    around = np.pad(turned(z.reshape(-1, 2)).objective().reshape(61, 61), 1, constant_values=np.inf)
+    lowest = np.min([around[i : 61 + i, j : 61 + j] for i in range(3) for j in range(3)], axis=0)
+    minima = z[around[1:-1, 1:-1] == lowest]  # two of them differ by 0.06 %, less than a grid shows
+    step = axis[1] - axis[0]
+    found = [scan(at - step, at + step, lambda z: turned(z).objective(), points=31, rounds=8) for at in minima]
+    z, least = min(found, key=lambda pair: pair[1])
     assert best.status_name == "done" and least < 0.2 * turned([[0.0, 0.0]]).objective()[0]
     assert least * (1.0 - 1e-5) < best.values.min() <= least * (1.0 + 1e-9)
     np.testing.assert_allclose([support.angle for support in best.scene.machine.supports], z, atol=1e-3)
