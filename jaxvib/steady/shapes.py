@@ -96,7 +96,9 @@ def _mode_shapes(scene: Scene) -> ModeShapes:
     frequency, vectors = model.modes()
     inertia = jnp.diagonal(model.mass)
     tilts = np.array([unit == "rad" for unit in model.carrier.units])
-    lever = jnp.where(tilts, jnp.sqrt(inertia / inertia[0]), 1.0)
+    # The displacements of a body precede its tilts.
+    of_displacement = np.maximum.accumulate(np.where(tilts, 0, np.arange(tilts.size)))
+    lever = jnp.where(tilts, jnp.sqrt(inertia / inertia[of_displacement]), 1.0)
     rows = vectors.T * lever[None, :]
     # The largest amplitude is 1; if several are equal, the first one counts.
     size = jnp.abs(rows)

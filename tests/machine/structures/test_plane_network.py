@@ -171,3 +171,15 @@ def one(**more):
 def test_wrong_input_ends_in_one_sentence(make, says):
     with pytest.raises(jv.InputError, match=says):
         make()
+
+
+def test_levers_are_radii_of_gyration_of_each_body():
+    bodies = [jv.body(mass=2000.0, inertia=600.0), jv.body(mass=900.0, inertia=400.0)]
+    scene = jv.Scene(jv.plane_network(bodies, SUPPORTS), exciters=[jv.Exciter(drive=jv.ConstantSpeed(60.0), unbalance=0.1)])
+    radii = np.sqrt([600.0 / 2000.0, 400.0 / 900.0])
+    found = jv.mode_shapes(scene)
+    np.testing.assert_allclose(found.lever, [1.0, 1.0, radii[0], 1.0, 1.0, radii[1]], rtol=1e-12)
+    stiffness, mass = np.asarray(scene.machine.carrier().stiffness), np.asarray(scene.machine.carrier().mass)
+    amplitude = (np.asarray(found.shape) / np.asarray(found.lever)).T  # each column is a mode of K x = w^2 M x
+    residual = stiffness @ amplitude - mass @ amplitude * np.asarray(found.frequency) ** 2
+    np.testing.assert_allclose(residual, 0.0, atol=1e-9 * np.max(stiffness))
