@@ -32,8 +32,11 @@ from jaxvib.units.known import when_known
 STANDARD_GRAVITY = 9.80665
 """Acceleration 1 g, m/s^2."""
 
-_MIN_AXES_DIFFERENCE = 1e-12
-"""Relative difference of the semi-axes below which the path counts as a circle, whose long axis has no direction."""
+
+def _rounding(semi_axis: Array) -> float:
+    """Return the relative size below which a semi-axis, or a difference of both, is a rounding error: a path is then a straight
+    line, or a circle, whose long axis has no direction."""
+    return max(1e-12, 8.0 * float(jnp.finfo(semi_axis.dtype).eps))
 
 
 class Ellipse(Readable):
@@ -67,12 +70,13 @@ class Ellipse(Readable):
     @property
     def is_circle(self) -> Array:
         """True if the semi-axes are equal to rounding; `direction` is then 0 and has no meaning."""
-        return self.semi_major - jnp.abs(self.semi_minor) <= _MIN_AXES_DIFFERENCE * self.semi_major
+        return self.semi_major - jnp.abs(self.semi_minor) <= _rounding(self.semi_major) * self.semi_major
 
     @property
     def sense(self) -> Array:
         """Sense of rotation: 1 anticlockwise, -1 clockwise, 0 on a straight line (to rounding)."""
-        return jnp.where(jnp.abs(self.semi_minor) > _MIN_AXES_DIFFERENCE * self.semi_major, jnp.sign(self.semi_minor), 0.0)
+        turns = jnp.abs(self.semi_minor) > _rounding(self.semi_major) * self.semi_major
+        return jnp.where(turns, jnp.sign(self.semi_minor), 0.0)
 
     def summary(self) -> str:
         """Return the ellipse as a line of text."""
@@ -94,7 +98,7 @@ def ellipse_of(amplitude: Array | complex, speed: Number, *, slope: Number = 0.0
     **Arguments**
 
     - `amplitude` U (2,), m, complex
-    - `speed` w, rad/s; typical: 75 to 160
+    - `speed` w, rad/s; typical: 75 to 160; a negative speed reverses the sense of rotation
     - `slope` of the deck, rad from x anticlockwise; typical: 0 to -0.4
     - `remainder` of the motion, see `Ellipse`
 
@@ -124,11 +128,11 @@ def _require_finite(amplitude: np.ndarray) -> None:
 
 def ellipse_at(amplitude: Array, speed: Array, slope: Array, remainder: Array) -> Ellipse:
     """Return `ellipse_of` for validated values."""
-    x, y = amplitude[0], amplitude[1]
+    (x, y), speed = at_positive_speed(amplitude, speed)
     forward, backward = (x + 1j * y) / 2.0, jnp.conj(x - 1j * y) / 2.0
     forward_radius, backward_radius = magnitude(forward), magnitude(backward)
     long, short = forward_radius + backward_radius, forward_radius - backward_radius
-    is_circle = 2.0 * jnp.minimum(forward_radius, backward_radius) <= _MIN_AXES_DIFFERENCE * long
+    is_circle = 2.0 * jnp.minimum(forward_radius, backward_radius) <= _rounding(long) * long
     product = jnp.where(is_circle, 1.0, forward * backward)
     normal = magnitude(-jnp.sin(slope) * x + jnp.cos(slope) * y)
     factor = speed**2 / STANDARD_GRAVITY
@@ -142,6 +146,11 @@ def ellipse_at(amplitude: Array, speed: Array, slope: Array, remainder: Array) -
     )
 
 
+def at_positive_speed(amplitude: Array, speed: Array) -> tuple[Array, Array]:
+    """Return the amplitudes and the speed of Re(U e^{i w t}) for w >= 0: conj(U) and -w for a negative w."""
+    return jnp.where(speed < 0.0, jnp.conj(amplitude), amplitude), jnp.abs(speed)
+
+
 class Deck(Result):
     """Motion of several points of a body, such as those of a screening deck.
 
@@ -153,7 +162,7 @@ class Deck(Result):
     - `amplitude` U (n, 2), m: complex amplitudes, horizontal and up
     - `ellipses`: an `Ellipse` whose arrays are (n,)
     - `motion_spread`: root mean square over the points of |U_p - mean| divided by |mean|; 0 if all points have the same
-      motion; typical: 0.01 to 0.3
+      motion; inf if the mean is 0, as for a deck that only turns about its middle; typical: 0.01 to 0.3
     """
 
     status = Computed.done
@@ -228,7 +237,7 @@ class PathsOfPoints(eqx.Module):
         **Arguments**
 
         - `at`: the place on the machine, see `Exciter`: (x, y) of a body, m, the number of a platform, or a distance along a
-          rotor's axis, m; default: the centre of mass
+          rotor's axis, m; default: the centre of mass, platform 1, or the common station of a rotor's loads
         - `body`: number of the body from 0, on machines with several; typical: 0 (the default)
         - `slope` of the deck, rad or text from x anticlockwise, for the throw number; typical: "-15 deg" to 0 (the default)
 
@@ -285,11 +294,14 @@ def _deck(motion: Harmonic, points: Array, slope: Array, body: int) -> Deck:
     rows = jnp.stack([rows_in_plane(motion.machine, on_body(point, body), "points") for point in points])
     amplitude, ellipses = jax.vmap(lambda each: _at_rows(motion, each, slope))(rows)
     mean = jnp.mean(amplitude, axis=0, keepdims=True)
-    variance = jnp.mean(jnp.sum(jnp.abs(amplitude - mean) ** 2, axis=1)) / jnp.sum(jnp.abs(mean) ** 2)
-    # The root has no derivative at 0, where all points have the same motion; the derivative is set to 0 there.
-    is_equal = variance == 0.0
-    spread = jnp.where(is_equal, 0.0, jnp.sqrt(jnp.where(is_equal, 1.0, variance)))
-    return Deck(points, amplitude, ellipses, spread)
+    variance = jnp.mean(jnp.sum(jnp.abs(amplitude - mean) ** 2, axis=1))
+    return Deck(points, amplitude, ellipses, _root_of_ratio(variance, jnp.sum(jnp.abs(mean) ** 2)))
+
+
+def _root_of_ratio(part: Array, whole: Array) -> Array:
+    """Return sqrt(part/whole): 0 with the derivative 0 for a part of 0, otherwise inf for a whole of 0."""
+    is_zero = part == 0.0
+    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, part) / jnp.where(is_zero, 1.0, whole)))
 
 
 def _at_rows(motion: Harmonic, rows: Array, slope: Array) -> tuple[Array, Ellipse]:
@@ -297,4 +309,4 @@ def _at_rows(motion: Harmonic, rows: Array, slope: Array) -> tuple[Array, Ellips
     amplitude = rows @ motion.amplitude
     on_ellipse = 0.5 * jnp.sum(jnp.abs(amplitude) ** 2)
     off_ellipse = jnp.zeros_like(on_ellipse) if motion.rest is None else jnp.sum((rows @ motion.rest) * rows)
-    return amplitude, ellipse_at(amplitude, motion.speed, slope, jnp.sqrt(off_ellipse / on_ellipse))
+    return amplitude, ellipse_at(amplitude, motion.speed, slope, _root_of_ratio(off_ellipse, on_ellipse))

@@ -76,6 +76,34 @@ def test_throw_number_is_normal_to_the_deck():
         np.testing.assert_allclose(jv.ellipse_of(amplitude, SPEED, slope=slope).throw_number, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("sense", [1, -1])
+def test_negative_speed_reverses_the_sense(sense):
+    found = jv.ellipse_of(turned(4e-3, 1e-3, 0.7, 0.9, sense), -SPEED, slope=-0.2)
+    forward = jv.ellipse_of(turned(4e-3, 1e-3, 0.7, -0.9, -sense), SPEED, slope=-0.2)
+    assert float(found.sense) == -sense
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(forward), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+def test_straight_path_has_no_sense_in_single_precision():
+    angle, phase = np.random.default_rng(3).uniform(-1.5, 1.5, (2, 60))
+    lines = 4e-3 * np.stack([np.cos(angle), np.sin(angle)], 1) * np.exp(1j * phase)[:, None]
+    found = [jv.ellipse_of(jnp.asarray(line, jnp.complex64), jnp.float32(SPEED)) for line in lines]
+    assert all(float(each.sense) == 0.0 and each.semi_minor.dtype == jnp.float32 for each in found)
+
+
+def test_point_at_rest_and_deck_that_only_turns():
+    class Turning(PathsOfPoints):
+        def harmonic(self):
+            return Harmonic(SCREEN, jnp.asarray(SPEED), jnp.array([0.0, 0.0, 1e-3j]))
+
+    turning = Turning()
+    still, moving = turning.ellipse(), turning.ellipse((1.0, 0.0))
+    assert float(still.remainder) == float(moving.remainder) == float(still.semi_major) == 0.0
+    assert np.isposinf(turning.deck([(-1.0, 0.0), (1.0, 0.0)]).motion_spread)
+    assert float(turning.deck([(0.0, 0.0), (0.0, 0.0)]).motion_spread) == 0.0
+
+
 SPRINGS = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e4, 4e4)) for x in (-1.2, 1.2)]
 SCREEN = jv.plane_body(mass=2000.0, inertia=600.0, supports=SPRINGS)
 
