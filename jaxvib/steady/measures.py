@@ -22,6 +22,8 @@ from jaxvib.machine.carrier import BodyPoint, Place, on_body, read_place
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.matrices import MatrixMachine
+from jaxvib.machine.structures.plane_body import PlaneNetwork
 from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import magnitude
@@ -32,8 +34,9 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import Jam
 from jaxvib.steady.jams.phases import PhaseJam
 from jaxvib.steady.orbits.describe import Orbit
-from jaxvib.steady.points import STANDARD_GRAVITY, ellipse_at, require_amplitudes, rows_in_plane
+from jaxvib.steady.points import STANDARD_GRAVITY, at_positive_speed, ellipse_at, require_amplitudes, rows_in_plane
 from jaxvib.units import Number, known_number, number, numbers
+from jaxvib.units.known import when_known
 
 ZONE_LIMITS = {
     ("large", "rigid"): (2.3e-3, 4.5e-3, 7.1e-3),
@@ -148,11 +151,15 @@ class VibrationMeasures(Readable):
     - `acceleration` (nt,), amplitude in g; typical: 2 to 6 for screens
     - `velocity` (nt,), m/s root mean square; typical: 50 to 300 mm/s
     - `exciter_force`, N zero to peak: resultant of the centrifugal forces
-    - `transmissibility`: foundation force divided by `exciter_force`
+    - `transmissibility`: foundation force divided by `exciter_force`; inf if the centrifugal forces cancel, NaN if one of both
+      forces is unknown
     - `foundation_load` (directions,), N zero to peak: force on the foundation in each direction, across and up for a body in a
       plane or a rotor
-    - `static_load` (ns,), N: weight that each support carries; NaN if the directions of the coordinates are unknown
-    - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on each support
+    - `static_load` (ns,), N: weight that each support carries, negative if a support on the foundation is pulled up; NaN if the
+      supports cannot carry the weight, and if the directions of the coordinates are unknown
+    - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on a support.
+      They are NaN, as is `foundation_load` in two directions, for a scene with supports that are effects (`CubicSupport`,
+      `Stop`), and for matrices without a foundation
     - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive
     - `point` (2,) of a body in a plane, its `point_stroke`, m peak to peak along the long axis of its path, its
       `point_acceleration`, g, `throw_angle`, rad, and `throw_number`, see `Ellipse`, and `conveying_speed`, m/s, the estimate
@@ -221,9 +228,10 @@ class VibrationMeasures(Readable):
         loads = np.stack([np.asarray(each) for each in (self.static_load, self.dynamic_load, self.side_load)], axis=1)
         for k, each in enumerate(loads):
             named = zip(each, ("static", "dynamic", "to the sides"), strict=True)
-            parts = [f"{load:.4g} N {word}" for load, word in named if load > _NEGLIGIBLE * np.nanmax(each)]
-            lines += [f"support {k + 1}: {', '.join(parts)}"] if np.nansum(each) > 0.0 else []
-        if len(self.directions) > 1:
+            largest = np.max(np.abs(each), initial=0.0, where=~np.isnan(each))
+            parts = [f"{load:.4g} N {word}" for load, word in named if abs(load) > _NEGLIGIBLE * largest]
+            lines += [f"support {k + 1}: {', '.join(parts)}"] if parts else []
+        if len(self.directions) > 1 and not np.any(np.isnan(self.foundation_load)):
             forces = zip(self.foundation_load, self.directions, strict=True)
             lines.append(f"foundation: {', '.join(f'{float(force):.4g} N {name}' for force, name in forces)} (dynamic)")
         ratio = float(self.transmissibility)
@@ -282,7 +290,8 @@ def vibration_measures(
       both ends of the deck
     - `slope` of the deck, rad or text from x anticlockwise; typical: "-15 deg" to 0 (the default)
 
-    **Returns** `VibrationMeasures`, with derivatives. **Raises** `InputError` for a point that the machine does not have.
+    **Returns** `VibrationMeasures`, with derivatives. **Raises** `InputError` for a point that the machine does not have, and
+    for `at` or `slope` with a machine that is not a body in a plane.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0),
@@ -294,6 +303,11 @@ def vibration_measures(
     shaft: 0.2969 N m, 12.43 W
     """
     scene = validate_scene(scene)
+    along, kind = known_number(slope, "rad", "slope"), scene.machine.kind
+    for name, given, is_given in (("at", at, at is not None), ("slope", slope, when_known(lambda tilt: tilt != 0.0, along))):
+        if is_given and scene.machine.places != "plane":
+            problem = f"is {quoted(given)}; it is for bodies in a plane, not for a machine of kind {quoted(kind)}; leave it out"
+            raise InputError(name, problem)
     deck = scene.machine.require_body(body)
     has_list = isinstance(at, (list, tuple)) and len(at) > 0 and all(isinstance(each, (list, tuple)) for each in at)
     points = cast("Sequence[Sequence[Number]]", at) if has_list else [cast("Sequence[Number] | None", at)]
@@ -303,13 +317,12 @@ def vibration_measures(
     elif isinstance(motion, PhaseJam):
         power = -motion.rotor_speed * jnp.sum(motion.torque)
         vibration = (motion.displacement, motion.amplitude, motion.foundation_force)
-        motion = _vibration_at_phases(scene, motion.omega, motion.phase, *vibration, power)
+        motion = _vibration_at_phases(scene, motion.rotor_speed, motion.omega, motion.phase, *vibration, power)
     elif isinstance(motion, Orbit):
-        turning = eqx.tree_at(lambda s: s.drive.speed, scene, motion.rotor_speed)
         first = motion.displacement_harmonics[:, motion.orders.index(1)]
         vibration = (first, motion.amplitude, motion.foundation_force)
-        motion = _vibration_at_phases(turning, motion.omega, motion.offsets, *vibration, motion.power)
-    return _measures(scene, motion, places if has_list else places[0], known_number(slope, "rad", "slope"))
+        motion = _vibration_at_phases(scene, motion.rotor_speed, motion.omega, motion.offsets, *vibration, motion.power)
+    return _measures(scene, motion, places if has_list else places[0], along)
 
 
 @cached
@@ -323,11 +336,12 @@ def _vibration_of(scene: Scene, omega: Array, displacement: Array, force: Array)
 
 @cached
 def _vibration_at_phases(
-    scene: Scene, omega: Array, phase: Array, displacement: Array, amplitude: Array, force: Array, power: Array
+    scene: Scene, speed: Array, omega: Array, phase: Array, displacement: Array, amplitude: Array, force: Array, power: Array
 ) -> Vibration:
-    """Return the vibration in a jam whose loads have the phases (count,), rad, and take a mean `power`, W, from the rotor."""
+    """Return the vibration in a jam whose loads have the phases (count,), rad, and take a mean `power`, W, from a rotor of this
+    `speed`, rad/s."""
     exciting = peak_force(omega**2 * resultant_of(linear_model(scene), jnp.exp(1j * phase)))
-    torque = (power / scene.drive.speed)[None]
+    torque = (power / speed)[None]
     return Vibration(omega, displacement, amplitude, force, exciting, torque, power[None])
 
 
@@ -341,10 +355,14 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
     model = linear_model(scene)
     carrier = model.carrier
     lengths = np.flatnonzero(np.asarray(carrier.units) == "m")
-    amplitude, w = motion.amplitude[lengths], jnp.abs(motion.speed)
-    static, dynamic, side = support_loads(model, w, motion.displacement)
-    forced = motion.exciter_force > 0.0
-    ratio = jnp.where(forced, motion.foundation_force / jnp.where(forced, motion.exciter_force, 1.0), jnp.inf)
+    amplitude, (displacement, w) = motion.amplitude[lengths], at_positive_speed(motion.displacement, motion.speed)
+    static, dynamic, side = support_loads(model, w, displacement)
+    forced = motion.exciter_force != 0.0  # True for NaN
+    force = jnp.nan * motion.foundation_force if _lacks_foundation(scene) else motion.foundation_force
+    ratio = jnp.where(forced, force / jnp.where(forced, motion.exciter_force, 1.0), jnp.inf)
+    each_direction = magnitude((carrier.foundation_stiffness + 1j * w * carrier.foundation_damping) @ displacement)
+    if model.supports or _lacks_foundation(scene):
+        each_direction = force[None] if each_direction.shape == (1,) else jnp.full_like(each_direction, jnp.nan)
     measures = VibrationMeasures(
         speed=motion.speed,
         stroke=2.0 * amplitude,
@@ -352,7 +370,7 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
         velocity=rms_velocity_of(amplitude, w),
         exciter_force=motion.exciter_force,
         transmissibility=ratio,
-        foundation_load=magnitude((carrier.foundation_stiffness + 1j * w * carrier.foundation_damping) @ motion.displacement),
+        foundation_load=each_direction,
         static_load=static,
         dynamic_load=dynamic,
         side_load=side,
@@ -370,8 +388,8 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
 
 def _measures_at(scene: Scene, motion: Vibration, place: Place, slope: Array) -> dict[str, Array]:
     """Return the measures of a point of a body in a plane by the names of their fields."""
-    w = jnp.abs(motion.speed)
-    amplitude = rows_in_plane(scene.machine, place) @ motion.displacement
+    displacement, w = at_positive_speed(motion.displacement, motion.speed)
+    amplitude = rows_in_plane(scene.machine, place) @ displacement
     path = ellipse_at(amplitude, w, slope, jnp.zeros_like(w))
     at = place.at if isinstance(place, BodyPoint) else place
     return {
@@ -411,23 +429,34 @@ def shaft_torque(model: JammedModel, omega: Array, displacement: Array) -> Array
 def support_loads(model: LinearModel, omega: Array, displacement: Array) -> tuple[Array, Array, Array]:
     """Return the static, the vertical dynamic and the horizontal dynamic force on each support, (ns,) N each.
 
-    Dynamic forces are zero to peak. The static force is NaN if the directions of the coordinates are unknown. Supports that are
-    effects are not included.
+    Dynamic forces are zero to peak, NaN for a scene with supports that are effects. The static force is NaN if the supports
+    cannot carry the weight, and if the directions of the coordinates are unknown.
     """
     machine = model.scene.machine
     stiffness, damping = machine.support_rows()
     forces = magnitude((stiffness + 1j * omega * damping) @ displacement)
+    if model.supports or _lacks_foundation(model.scene):
+        forces = jnp.full_like(forces, jnp.nan)
     sag = weight_deflection(model)
     static = jnp.full(forces.shape[0], jnp.nan) if sag is None else stiffness[:, -1] @ sag
+    if isinstance(machine, PlaneNetwork):  # the order of the ends of a support between two bodies has no meaning
+        between_bodies = np.array([each.to is not None for each in machine.supports])
+        static = jnp.where(between_bodies, jnp.abs(static), static)
     side = jnp.zeros_like(forces[:, 0]) if forces.shape[1] == 1 else forces[:, 0]
     return static, forces[:, -1], side
+
+
+def _lacks_foundation(scene: Scene) -> bool:
+    """Return True for a machine from matrices without a foundation, whose forces on it are unknown."""
+    return isinstance(scene.machine, MatrixMachine) and scene.machine.foundation is None
 
 
 def weight_deflection(model: LinearModel) -> Array | None:
     """Return the static displacements (nd,) of the coordinates under the weight of the machine and its loads, with the
     opposite sign, m (rad for tilts): positive if the coordinate moves downward.
 
-    It is 0 for a platform that no support carries, and None if the directions of the coordinates are unknown.
+    It is 0 for a platform that no support carries, NaN for other machines whose supports cannot carry the weight, and None if
+    the directions of the coordinates are unknown. Motions that no spring resists, and no weight causes, are left out.
     """
     machine = model.scene.machine
     up = machine.upward()
@@ -435,7 +464,12 @@ def weight_deflection(model: LinearModel) -> Array | None:
         return None
     stiffness, weight = model.carrier.stiffness, STANDARD_GRAVITY * (model.mass @ jnp.asarray(up, model.mass.dtype))
     if not isinstance(machine, Platforms):
-        return jnp.linalg.solve(stiffness, weight)
+        frequencies, shapes = jax.lax.stop_gradient(model).modes()
+        free = jnp.where(frequencies == 0.0, shapes, 0.0)
+        directions = model.mass @ free  # springs along them keep the free motions at 0
+        sag = jnp.linalg.solve(stiffness + jnp.max(frequencies) ** 2 * directions @ directions.T, weight)
+        falls = jnp.abs(free.T @ weight) > jnp.sqrt(jnp.finfo(weight.dtype).eps) * jnp.max(jnp.abs(shapes.T @ weight))
+        return jnp.where(jnp.any(falls), jnp.nan, sag)
     # The stiffness matrix of platforms without supports is singular up to rounding.
     # Such platforms get a spring to the ground here.
     carried = has_support(machine)
@@ -467,7 +501,9 @@ def has_support(machine: Platforms) -> Array:
 
 @validated
 def conveying_speed(amplitude: Array | complex, speed: Number, *, slope: Number = 0.0) -> Array:
-    """Return an estimate of the mean speed of material along a deck that throws it, m/s, positive up the deck.
+    """Return an estimate of the mean speed of material along a deck that throws it, m/s, positive in the direction of x.
+
+    A deck with a negative slope falls in this direction: its material moves down at a positive speed.
 
         G (cos(p + f) - cos p) = -G sin(p) f - f^2/2,    cos p = 1/G, p < 0;
         v = w/(2 pi) [ x'(p) f/w - (x(p + f) - x(p)) - g sin(slope) (f/w)^2 / 2 ]

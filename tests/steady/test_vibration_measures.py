@@ -10,6 +10,7 @@ from scenes import scene
 
 import jaxvib as jv
 import optimize
+from jaxvib.steady.measures import Vibration
 
 G = 9.80665
 
@@ -294,3 +295,86 @@ def test_accelerations_above_8_g_have_notes(unbalance, notes):
     y = unbalance * 1e4 / abs(2e4 - 200.0 * 1e4 + 1e4j)  # closed form
     np.testing.assert_allclose(measures.throw_number, 1e4 * y / G, rtol=1e-9)
     assert [each[: len(start)] for each, start in zip(measures.notes(), notes, strict=True)] == notes
+
+
+EXCITER = jv.Exciter(drive=jv.ConstantSpeed(40.0), unbalance=0.1)
+JOINT = {"stiffness": (2e5, 4e5), "damping": (800, 900)}
+
+
+def of_values(scene, *, speed=40.0, force=450.0, exciting=100.0, displacement=(5e-3,)):
+    """Measures of a vibration with these values."""
+    z = jnp.asarray(displacement, complex)
+    values = (jnp.asarray(each) for each in (force, exciting))
+    return jv.vibration_measures(scene, Vibration(jnp.asarray(speed), z, jnp.abs(z), *values, jnp.ones(1), jnp.ones(1)))
+
+
+def test_loads_include_or_deny_supports_that_are_effects():
+    loads, drive = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(40.0)
+    stiff = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=0.0), loads, drive, (jv.CubicSupport(2e9),))
+    measures = of_values(stiff)  # 450 N = k y + k3 y^3
+    np.testing.assert_allclose(measures.foundation_load, [450.0], rtol=1e-12)
+    np.testing.assert_allclose(measures.static_load, [51.0 * G], rtol=1e-12)
+    assert np.all(np.isnan(measures.dynamic_load))
+    assert "support 1: 500.1 N static\nof the exciter's 100 N, 450 % reach" in measures.summary()
+    rotor = jv.Scene(jv.planar_rotor(mass=50.0, stiffness=4e4, damping=0.0), loads, drive, (jv.Stop(1e6, gap=1e-3),))
+    assert np.all(np.isnan(of_values(rotor, displacement=(5e-3, 5e-3j)).foundation_load))
+
+
+def test_unknown_forces_are_nan():
+    table = jv.one_mass(mass=50.0, stiffness=4e4, damping=0.0)
+    for exciting, ratio in ((np.nan, np.nan), (0.0, np.inf), (900.0, 0.5)):
+        measures = of_values(jv.Scene(table, exciters=[EXCITER]), exciting=exciting)
+        np.testing.assert_equal(float(measures.transmissibility), ratio)
+    matrices = jv.from_matrices(50.0, 0.0, 4e4, places=[[0]])
+    measures = of_values(jv.Scene(matrices, exciters=[EXCITER]), force=0.0)
+    loads = (measures.foundation_load, measures.dynamic_load, measures.static_load)
+    assert np.all(np.isnan([measures.transmissibility, *np.concatenate(loads)]))
+    assert "isolation" not in measures.summary() and "support" not in measures.summary()
+    known = jv.from_matrices(50.0, 0.0, 4e4, places=[[0]], foundation=([[4e4]], [[0.0]]))
+    np.testing.assert_allclose(of_values(jv.Scene(known, exciters=[EXCITER])).dynamic_load, [200.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3])
+def test_weight_rests_on_springs_of_one_direction(angle):
+    """Springs along one direction carry the weight if it acts in this direction, and nothing carries it otherwise."""
+    springs = [jv.support(at=(x, -0.2), stiffness=(0.0, 1e5), damping=(10.0, 50.0), angle=angle) for x in (-1.0, 1.0)]
+    body = jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
+    measures = of_values(jv.Scene(body, exciters=[EXCITER]), displacement=(1e-3, 1e-3, 0.0))
+    np.testing.assert_allclose(measures.static_load, [150.0 * G if angle == 0.0 else np.nan] * 2, rtol=1e-12)
+
+
+def test_static_load_does_not_depend_on_the_order_of_ends():
+    frame = [jv.support(at=(x, -0.2), stiffness=(1e5, 2e5), damping=(500, 900), body=1) for x in (-1.5, 1.5)]
+    joints = {
+        "from above": [jv.support(at=(x, -0.3), to=1, at_other=(x, 0.2), **JOINT) for x in (-1, 1)],
+        "from below": [jv.support(at=(x, 0.2), body=1, to=0, at_other=(x, -0.3), **JOINT) for x in (-1, 1)],
+    }
+    for each in joints.values():
+        machine = jv.plane_network([jv.body(mass=2000, inertia=600), jv.body(mass=900, inertia=400)], frame + each)
+        measures = of_values(jv.Scene(machine, exciters=[EXCITER]), displacement=(0.0, 1e-3, 0.0, 0.0, 1e-3, 0.0))
+        np.testing.assert_allclose(measures.static_load, [1450.0 * G] * 2 + [1000.0 * G] * 2, rtol=1e-9)
+        assert "support 4: 9807 N static" in measures.summary()
+
+
+def test_points_are_refused_except_on_bodies_in_a_plane(jam):
+    shaken, found = jam
+    for given in ({"at": 7}, {"at": (3.0, 1.0)}, {"at": [(3.0, 1.0)]}, {"slope": "-10 deg"}, {"body": 1}):
+        with pytest.raises(jv.InputError, match=rf"^{next(iter(given))} is .*(leave it out|number 0)"):
+            jv.vibration_measures(shaken, found, **given)
+
+
+def test_exact_jam_under_a_speed_profile_has_measures():
+    table = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
+    loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
+    drives = jv.SpeedProfile([0.0, 5.0], [0.0, 41.9]), jv.ConstantSpeed(41.9)
+    scenes = [jv.Scene(table, loads, drive) for drive in drives]
+    one, other = (jv.vibration_measures(each, jv.jam_orbit(each, mode=1)) for each in scenes)
+    np.testing.assert_allclose([*one.torque, *one.power], [*other.torque, *other.power], rtol=1e-9)
+
+
+def test_negative_speed_is_the_reversed_vibration(screen):
+    z = np.array([2e-3 + 1e-3j, 3e-3j, 1e-3])
+    one, other = (of_values(screen, speed=w, displacement=y) for w, y in ((90.0, z), (-90.0, np.conj(z))))
+    for name, value in one.document().items():
+        if name not in ("speed", "coordinates", "directions"):
+            np.testing.assert_allclose(getattr(other, name), value, rtol=1e-12, err_msg=name)

@@ -28,7 +28,7 @@ class MatrixMachine(Machine):
 
     - `mass`, `damping`, `stiffness` and `gyroscopic` (or None), (nd, nd)
     - `places_rows` (number of places, directions of a place, nd): displacement of each place = rows times q, see `Mount`
-    - `foundation` (2, nb, nd): stiffness and damping of the force on the foundation in its nb directions
+    - `foundation` (2, nb, nd): stiffness and damping of the force on the foundation in its nb directions; None if unknown
     """
 
     mass: Array = eqx.field(metadata=unit("", words="mass matrix"))
@@ -36,14 +36,15 @@ class MatrixMachine(Machine):
     stiffness: Array = eqx.field(metadata=unit("", words="stiffness matrix"))
     gyroscopic: Array | None = eqx.field(metadata=unit("", words="gyroscopic matrix"))
     places_rows: Array = eqx.field(metadata=unit("", words="rows of the places"))
-    foundation: Array = eqx.field(metadata=unit("", words="rows of the force on the foundation"))
+    foundation: Array | None = eqx.field(metadata=unit("", words="rows of the force on the foundation"))
     kind: str = eqx.field(static=True)
     places = "number"
 
     def carrier(self) -> Carrier:
         """Return the matrices."""
         names = tuple(f"q{k + 1}" for k in range(self.mass.shape[0]))
-        return Carrier(self.mass, self.damping, self.stiffness, self.foundation[0], self.foundation[1], names)
+        force = jnp.zeros((2, 1, len(names)), self.mass.dtype) if self.foundation is None else self.foundation
+        return Carrier(self.mass, self.damping, self.stiffness, force[0], force[1], names)
 
     def mount(self, at: Place = None) -> Mount:
         """Return the mount of an exciter at the place with the number `at`."""
@@ -90,7 +91,7 @@ def from_matrices(
       indices of its coordinates, [up], [horizontal, up] or [horizontal, up, rotation], or a matrix (1 to 3, nd) that gives its
       displacement from q; all places have the same number of directions
     - `foundation`: (T_K, T_C), two arrays (nb, nd): the force on the foundation is T_K q + T_C q', up (nb = 1) or horizontal
-      and up (nb = 2); default: the force is unknown, and results state 0
+      and up (nb = 2); default: the force is unknown, results state 0, and transmissibility and loads of supports are NaN
     - `reduce`: largest number of coordinates; typical: 6 to 20 (default: 12); None keeps all
 
     **Returns** `MatrixMachine`.
@@ -111,14 +112,14 @@ def from_matrices(
     c, k = _matrix(damping, "machine.damping", (size, size)), _matrix(stiffness, "machine.stiffness", (size, size))
     g = None if gyroscopic is None else _matrix(gyroscopic, "machine.gyroscopic", (size, size))
     rows = _read_places(places, size)
-    force = jnp.zeros((2, 1, size), m.dtype) if foundation is None else _read_foundation(foundation, size)
+    force = None if foundation is None else _read_foundation(foundation, size)
     for name, matrix in (("machine.mass", m), ("machine.stiffness", k)):
         when_known(lambda matrix, name=name: require_definite(matrix, name, positive=name == "machine.mass"), matrix)
     limit = size if reduce is None else count(reduce, "machine.reduce")
     if size > limit:
         modes = _lowest_modes(m, k, limit)
         m, c, k, g = (None if x is None else modes.T @ x @ modes for x in (m, c, k, g))
-        rows, force = rows @ modes, force @ modes
+        rows, force = rows @ modes, None if force is None else force @ modes
     parts = {"mass": m, "damping": c, "stiffness": k, "gyroscopic": g, "places_rows": rows, "foundation": force}
     return MatrixMachine(**parts, kind="matrices")  # pyright: ignore[reportArgumentType]
 
