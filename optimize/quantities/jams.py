@@ -12,6 +12,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.linear import peak_force
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.steady.measures import shaft_torque
@@ -33,15 +34,15 @@ __all__ = [
 
 
 def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
-    """Return the platform, or the pair of platforms, whose amplitude is computed.
+    """Return the platform, or the pair of platforms, whose amplitude is computed; of other machines the number of a coordinate.
 
-    This is `of`; for None it is platform 1 relative to platform 2, or the only platform.
+    This is `of`; for None it is platform 1 relative to platform 2, or the only platform, or the first coordinate.
 
     **Raises** `InputError` for a platform that the machine does not have.
     """
     n = scene.machine.structure().mass.shape[0]
     if of is None:
-        return (1, 2) if n > 1 else 1
+        return (1, 2) if n > 1 and isinstance(scene.machine, Platforms) else 1
     platforms = tuple(of) if isinstance(of, (tuple, list)) else (of,)
     whole = all(isinstance(p, (int, np.integer)) and not isinstance(p, bool) and 1 <= p <= n for p in platforms)
     if whole and len(platforms) == 1:
@@ -96,7 +97,8 @@ def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity
 
     - `mode`: number of the jam mode, 1 to 2 nd + 1; typical: 1, 3, 5, which are stable for light loads
     - `of`: a platform, or a pair of them for a relative amplitude; typical: 1 to 3; default: platform 1 relative to 2, or the
-      only one
+      only one. Of a machine without platforms, the number of a coordinate that is a displacement (default: 1, which is
+      horizontal)
     - `tier`: "leading" (light loads, by algebra; the default), "exact" (the exact periodic motion), or "time" (the full
       equations, integrated from the jam for 60 periods of the lowest natural frequency); typical computing times for a machine:
       0.2 ms, 0.3 ms, 5 to 100 ms
@@ -114,6 +116,11 @@ def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity
 
 def jam_amplitude(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
     chosen = between(evaluation.scene, of)
+    structure = evaluation.scene.machine.structure()
+    for number in np.ravel(chosen):
+        if structure.units[number - 1] != "m":
+            problem = f"is {quoted(of)}; coordinate {number}, {structure.coordinates[number - 1]}, is a rotation"
+            raise InputError("of", f"{problem}; give the number of a displacement")
     if tier == "leading":
         jam = evaluation.jam(mode)
         if isinstance(chosen, int):

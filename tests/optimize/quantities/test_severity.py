@@ -143,3 +143,18 @@ def test_support_carries_weight_and_force_of_the_vibration(jam):
         np.testing.assert_allclose(support_load(mode=3, of=k).read(jam), (static + moving)[k - 1], rtol=1e-9)
     with pytest.raises(jv.InputError, match="supports 1 to 2"):
         support_load(mode=3, of=3).read(jam)
+
+
+def test_machines_without_platforms_have_the_first_coordinate():
+    """The two coordinates of a planar rotor are at right angles: their difference has no meaning."""
+    loads, drive = jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0)
+    disk = jv.Scene(jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0), loads, drive)
+    for mode in (1, 5):
+        found = jv.jam_modes(disk).select(mode)
+        for quantity, value in ((amplitude, found.amplitude[0]), (stroke, 2.0 * found.amplitude[0])):
+            np.testing.assert_allclose(quantity(mode=mode)(disk), value, rtol=1e-10)
+    springs = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(100.0, 100.0)) for x in (-1.0, 1.0)]
+    body = jv.Scene(jv.plane_body(mass=200.0, inertia=60.0, supports=springs), loads, drive)
+    for of in (3, (1, 3)):
+        with pytest.raises(jv.InputError, match="coordinate 3, psi, is a rotation; give the number of a displacement"):
+            amplitude(mode=1, of=of)(body)
