@@ -17,7 +17,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate
-from jaxvib.runtime.devices import known
+from jaxvib.runtime.devices import known, numpy_of
 from jaxvib.steady.jams.follow import follow_fold, follow_jam
 from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes
 from jaxvib.steady.orbits.describe import Orbit
@@ -196,9 +196,9 @@ class Evaluation:
         return self._run("working", integrate)
 
     def _sixty_periods(self) -> Array:
-        """Return the length of 60 periods of the lowest natural frequency, s."""
-        frequencies = known(jax.lax.stop_gradient(natural_frequencies(self.scene)))
-        return 60.0 * 2.0 * np.pi / frequencies.min()
+        """Return the length of 60 periods of the lowest natural frequency, s; a frequency of 0 counts as the rotor speed."""
+        frequencies, speed = map(known, jax.lax.stop_gradient((natural_frequencies(self.scene), self.scene.top_speed)))
+        return 60.0 * 2.0 * np.pi / numpy_of(frequencies).where(frequencies > 0.0, frequencies, speed).min()
 
     def keep_run(self, motion: int | Literal["working"], run: Run) -> None:
         """Store a run that has settled in a jam mode or in the working regime; quantities then use it and integrate no

@@ -18,6 +18,22 @@ from optimize.quantities.user_inputs import count_required_arguments, same_unit
 SCENE = scene("two_mass")
 
 
+FREE = jv.network(
+    mass=[200.0, 100.0], stiffness=[0.0, 0.0], damping=[0.0, 0.0], links=[(1, 2)], link_stiffness=[5e4], link_damping=[50.0],
+    exciter=1,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("speed", "slowest"), [(60.0, np.sqrt(5e4 * 1.5 / 100.0)), (20.0, 20.0)])
+def test_runs_of_a_machine_that_drifts_have_an_end(monkeypatch, speed, slowest):
+    """The frequency 0 of the drift counts as the rotor speed."""
+    ends = []
+    monkeypatch.setattr(answers_module, "simulate", lambda scene, until, **more: ends.append(float(until)))
+    drive, loads = jv.ConstantSpeed(speed), jv.balls(count=1, mass=1e-6, radius=0.1, drag=1.0)
+    Evaluation(jv.Scene(FREE, loads, drive)).jam_run(1)
+    np.testing.assert_allclose(ends, [60.0 * 2.0 * np.pi / slowest], rtol=1e-6)
+
+
 @pytest.fixture(scope="module")
 def modes():
     return jv.jam_modes(SCENE)
