@@ -20,7 +20,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.steady.measures import conveying_speed_at
-from jaxvib.steady.points import Ellipse
+from jaxvib.steady.points import Ellipse, at_positive_speed
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier, walk
@@ -142,8 +142,8 @@ def _throw_number(evaluation: Evaluation, tier: Tier, at: Point, body: int, slop
 def conveying_speed(
     *, at: Sequence[Number] = (0.0, 0.0), slope: Number = 0.0, body: int = 0, tier: Tier = "leading"
 ) -> Quantity:
-    """Return the estimated mean speed of material at a point of a deck, m/s, positive up the deck, see
-    `jaxvib.conveying_speed`.
+    """Return the estimated mean speed of material at a point of a deck, m/s, positive in the direction of x (down a deck with a
+    negative slope), see `jaxvib.conveying_speed`.
 
     Its value is 0 for throw numbers of at most 1, and NaN above 3.297.
 
@@ -162,7 +162,8 @@ def conveying_speed(
 
 def _conveying_speed(evaluation: Evaluation, tier: Tier, at: Point, body: int, slope: float) -> Array:
     motion = evaluation.working(tier)
-    return conveying_speed_at(motion.deck([at], body).amplitude[0], jnp.abs(motion.harmonic().speed), jnp.asarray(slope))
+    moved, speed = at_positive_speed(motion.deck([at], body).amplitude[0], motion.harmonic().speed)
+    return conveying_speed_at(moved, speed, jnp.asarray(slope))
 
 
 @validated

@@ -66,7 +66,7 @@ def peak_displacement(
 
     - `until` and `spin_up`: as for `peak_force`
     - `at`: number of a platform, or a point (x, y) of a body, m or text, from its centre of mass; default: the centre of mass,
-      the platform of the exciter, or the axis of a rotor; typical: (1.5, 0.1)
+      platform 1, or the common station of a rotor's loads; typical: (1.5, 0.1)
     - `body`: number of the body from 0; typical: 0 (the default)
 
     **Returns** `Quantity`; its derivatives exist in forward mode only; typical: 5 to 30 mm, two to four times the amplitude at
