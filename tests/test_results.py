@@ -194,7 +194,7 @@ RESULTS = {
         np.array([-0.5, -0.2]), np.array([[False] * 3, [True] * 3]), np.ones((2, 3), bool), np.eye(2, 3, dtype=bool), 150, 7200
     ),
     "ThresholdCurve": lambda: ThresholdCurve(
-        *np.array([[1.0, 2.0], [-0.6, np.nan], [1e-3, np.nan], [-0.7, -0.2], [0.0, np.inf]]), turns=np.asarray(2000)
+        *np.array([[1.0, 2.0], [-0.6, np.nan], [1e-3, np.nan], [-0.7, -0.2], [0.0, np.inf], [1.0, 0.0]]), turns=np.asarray(2000)
     ),
     "Growth": lambda: Growth(member(GrowthStatus, "chaotic"), 0.1, 0.02, 360.0, np.array([0.2, 0.0, 0.1, 0.1]), np.arange(4.0)),
     "Tiers": tiers,

@@ -82,10 +82,14 @@ class StateSpace(NamedTuple):
 
         **Arguments**: `omega`: frequencies w, rad/s or text.
 
-        **Returns** an array (frequencies, ny, nu).
+        **Returns** an array (frequencies, ny, nu). **Raises** `InputError` for a frequency at which the response is infinite.
         """
         frequencies = np.ravel(np.asarray(numbers(omega, "rad/s", "omega", None), float))[:, None, None]
-        inner = np.linalg.solve(1j * frequencies * np.eye(len(self.A)) - self.A, self.B.astype(complex))
+        try:
+            inner = np.linalg.solve(1j * frequencies * np.eye(len(self.A)) - self.A, self.B.astype(complex))
+        except np.linalg.LinAlgError:
+            problem = "contains an undamped natural frequency, such as 0 for a free machine; leave out this frequency"
+            raise InputError("omega", problem) from None
         return self.C @ inner + self.D
 
     def scipy(self) -> scipy.signal.StateSpace:

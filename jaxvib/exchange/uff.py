@@ -264,7 +264,7 @@ def _even_frequencies(scene: Scene, frequencies: Numbers | None) -> np.ndarray:
     if frequencies is None:
         step = _HIGHEST_FREQUENCY_RATIO * float(np.max(np.asarray(estimated_frequencies(scene)))) / (2.0 * np.pi * _LINES)
         return float(f"{step:.{_DIGITS - 1}e}") * np.arange(1, _LINES + 1)
-    x = np.asarray(numbers(frequencies, "Hz", "frequencies", None, low=0.0), float)
+    x = np.asarray(numbers(frequencies, "Hz", "frequencies", None, low=0.0, open_low=True), float)
     if x.ndim != 1 or x.size < 2:
         raise InputError("frequencies", f"are {quoted(frequencies)}; at least 2 evenly spaced frequencies are needed")
     _require_even(x, "frequencies")

@@ -32,6 +32,9 @@ _CASES_PER_CHUNK = {"leading": 16384, "exact": 512, "time": 1024}
 
 _RESERVED = ("status", "error")
 
+_LABELS = ("regime", "mode")
+"""Names of the measures by which figures label cases."""
+
 _MAX_CASES = 10**9
 """Maximum number of cases of a study, because the list of all chunks is in memory."""
 
@@ -57,7 +60,7 @@ def study(
         scene, start = with_spin_up_drive(scene, number(until, "s", "until", low=0.0, open_low=True), start, None), "rest"
     grid = _grid(scene, axes, samples, sampling, seed)
     names, measures = _name_measures(measure)
-    _require_free_names(names, [axis.name for axis in grid.axes])
+    _require_free_names(names, measures, [axis.name for axis in grid.axes])
     has_runs = any(isinstance(m, RunMeasure) for m in measures)
     chosen = tier or ("time" if has_runs else "leading")
     require_one_of(chosen, TIERS, "tier")
@@ -91,10 +94,13 @@ def _grid(scene: Scene, axes: Mapping[str, AxisSpec], samples: int, sampling: st
     return grid
 
 
-def _require_free_names(names: Sequence[str], axes: Sequence[str]) -> None:
+def _require_free_names(names: Sequence[str], measures: Sequence[Measure], axes: Sequence[str]) -> None:
     """**Raises** `InputError` for names of measures that cannot be used for arrays of a store, or that are used already."""
-    for name in names:
-        if name in (*_RESERVED, *axes, "sample"):
+    dimensions = [measure.axis for measure in measures if isinstance(measure, RunMeasure)]
+    for name, measure in zip(names, measures, strict=True):
+        if name in _LABELS and measure != measure_of(f"run.{name}", f"measure.{name}"):
+            raise InputError(f"measure.{name}", f"is the name of the measure run.{name}; choose another one")
+        if name in (*_RESERVED, *axes, *dimensions, "sample"):
             raise InputError(f"measure.{name}", "is a name that is used already; choose another one")
         if not _is_name(name):
             problem = "is not a valid name of an array: up to 200 printable characters without /, \\ and $"
@@ -151,8 +157,13 @@ def _is_name(name: str) -> bool:
 
 def _plain(spec: AxisSpec) -> Plain:
     if isinstance(spec, Mapping):
-        return {key: v if isinstance(v, (str, int)) else float(cast(float, v)) for key, v in spec.items()}
-    return [v if isinstance(v, str) else float(cast(float, v)) for v in spec]
+        return {key: v if isinstance(v, int) else _plain_number(v) for key, v in spec.items()}
+    return [_plain_number(v) for v in spec]
+
+
+def _plain_number(value: Number | str) -> str | float:
+    """Return a number as plain data; a quantity with a unit is written as text."""
+    return str(value) if isinstance(value, str) or hasattr(value, "m_as") else float(cast(float, value))
 
 
 def _name_measures(measure: Measures) -> tuple[tuple[str, ...], tuple[Measure, ...]]:

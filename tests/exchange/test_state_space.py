@@ -204,3 +204,11 @@ def test_residual_of_a_jam_is_relative_to_its_drag():
         jv.state_space(scene(), moved)
     small = eqx.tree_at(lambda j: j.displacement, jam, (1.0 + 0.5e-6 * 1e-3 / residual) * jam.displacement)
     assert jv.state_space(scene(), small).A.shape == (13, 13)
+
+
+def test_infinite_response_of_a_free_machine_is_refused():
+    free = jv.Scene(jv.one_mass(mass=50.0, stiffness=0.0, damping=0.0), jv.balls(**BALLS), jv.ConstantSpeed(60.0))
+    model = jv.state_space(free)
+    assert np.all(np.isfinite(model.frequency_response([1.0])))
+    with pytest.raises(jv.InputError, match="omega contains an undamped natural frequency, such as 0"):
+        model.frequency_response([1.0, 0.0])

@@ -247,6 +247,7 @@ def test_sdypy_finds_the_poles_of_an_exported_response(home):
         (dict(quantity="jerk"), "quantity is 'jerk'; "),
         (dict(frequencies=[1.0, 2.0, 4.0]), "frequencies are not evenly spaced (steps of 1 to 2); give even ones"),
         (dict(frequencies=[1.0]), "frequencies are [1.0]; at least 2"),
+        (dict(frequencies=[0.0, 1.0]), "frequencies[0] is 0"),
         (dict(frequencies=[2.0, 1.0]), "frequencies are not evenly spaced"),
         (dict(source=3), "source is 3; "),
     ],

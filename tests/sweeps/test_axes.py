@@ -2,9 +2,11 @@
 
 import dataclasses
 import itertools
+import json
 
 import jax.numpy as jnp
 import numpy as np
+import pint
 import pytest
 from scenes import scene
 
@@ -41,6 +43,18 @@ def test_low_discrepancy_is_low_and_keeps_its_digits():
     far, golden = 10**12, int(((5**0.5 + 1) / 2) ** -1.0 * 2.0**64)
     begin = int(np.random.Philox(key=0).random_raw(1)[0])
     assert samples(far, far + 1, 1, 0, "low_discrepancy")[0, 0] == ((begin + far * golden) % 2**64 >> 11) * 2.0**-53
+
+
+def test_axes_of_quantities_with_units_equal_those_of_texts():
+    hertz = pint.get_application_registry().hertz
+    pairs = [
+        ([9.0 * hertz, 12.0], ["9 Hz", 12.0]),
+        ({"from": 9.0 * hertz, "to": 12.0 * hertz, "count": 3}, {"from": "9 Hz", "to": "12 Hz", "count": 3}),
+    ]
+    for given, text in pairs:
+        found, expected = asked({"drive.speed": given}), asked({"drive.speed": text})
+        np.testing.assert_allclose(found.grid.values(0), expected.grid.values(0), rtol=1e-15)
+        assert "9.0 hertz" in json.dumps(found.record)
 
 
 def test_every_case_is_in_one_chunk_with_its_numbers():
@@ -118,6 +132,12 @@ RUN = ["run.mode"]
         (dict(measure=[]), r"measure is \[\]; give a list"),
         (dict(measure=["run.foundationforce"]), "did you mean 'run.foundation_force'"),
         (dict(measure={"status": jam_frequency(mode=1)}), "is a name that is used already"),
+        (dict(measure={"regime": "run.relative_rotation"}, until=1.0), "is the name of the measure run.regime"),
+        (dict(measure={"mode": jam_frequency(mode=1)}), "is the name of the measure run.mode"),
+        (
+            dict(measure={"coordinate": jam_frequency(mode=1), "a": "run.amplitude"}, until=1.0),
+            "measure.coordinate is a name that is used already",
+        ),
         (dict(measure=[jam_frequency(mode=1)] * 2), "has several jam_frequency"),
         (dict(measure=RUN), "until is missing; run.mode is measured in a run"),
         (dict(until=1.0), "until applies to runs, but no quantity is measured in a run"),

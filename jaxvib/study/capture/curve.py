@@ -36,6 +36,7 @@ class ThresholdCurve(Result):
     - `least` (V,): the lowest speed at which a start was captured, NaN if there is none. Between this speed and the threshold,
       captures and failures alternate
     - `last_change` (V,): change of the threshold by the last doubling of the steps
+    - `converged` (V,): False if this change was larger than the spacing of the computed speeds
     - `turns` of the rotor of each run
     """
 
@@ -46,6 +47,7 @@ class ThresholdCurve(Result):
     uncertainty: np.ndarray = eqx.field(metadata=in_unit("", "value"))
     least: np.ndarray = eqx.field(metadata=in_unit("", "value"))
     last_change: np.ndarray = eqx.field(metadata=in_unit("", "value"))
+    converged: np.ndarray = eqx.field(metadata=in_unit("", "value"))
     turns: Array = eqx.field(metadata=in_unit(""))
 
     def summary(self) -> str:
@@ -54,9 +56,10 @@ class ThresholdCurve(Result):
             f"captured in {int(self.turns)} turns: threshold of the initial speed, and the lowest captured "
             "initial speed, relative to the rotor speed"
         ]
-        for row in zip(self.value, self.threshold, self.uncertainty, self.least, strict=True):
-            value, threshold, uncertainty, least = map(float, row)
+        for row in zip(self.value, self.threshold, self.uncertainty, self.least, self.converged, strict=True):
+            value, threshold, uncertainty, least, converged = map(float, row)
             threshold_text = "not every start" if np.isnan(threshold) else f"{threshold:.4f} +- {uncertainty:.1e}"
+            threshold_text += "" if converged else " (not converged)"
             lines.append(f"  {value:10.6g}  {threshold_text}" + ("" if np.isnan(least) else f"; lowest {least:.4f}"))
         return "\n".join(lines)
 
@@ -124,11 +127,19 @@ def threshold_curve(
     return ThresholdCurve(
         value=numbers,
         threshold=np.array([result.border for result in captures]),
-        uncertainty=np.array([0.0 if result.border == -1.0 else float(result.uncertainty) for result in captures]),
+        uncertainty=np.array([_uncertainty(result) for result in captures]),
         least=np.array([_lowest_captured_speed(result) for result in captures]),
         last_change=np.array([float(result.last_change) for result in captures]),
+        converged=np.array([result.status_name != "not_converged" for result in captures]),
         turns=jnp.asarray(turns),
     )
+
+
+def _uncertainty(result: Capture) -> float:
+    """Return the uncertainty of the border, which is the `last_change` alone if every start was captured."""
+    if result.border == -1.0:
+        return 0.0 if np.isnan(result.last_change) else float(result.last_change)
+    return float(result.uncertainty)
 
 
 def _lowest_captured_speed(result: Capture) -> float:

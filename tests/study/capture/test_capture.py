@@ -1,5 +1,6 @@
 """Captures of balls in a torus: success from an initial speed, thresholds, derivatives of the outcome."""
 
+import dataclasses
 import json
 from types import SimpleNamespace
 
@@ -16,7 +17,14 @@ from papers.step_doubling import refine
 import jaxvib as jv
 from jaxvib.cli.app import run as command
 from jaxvib.draw.capture import torus_paths
-from jaxvib.study.capture.capture import capture_time, moving_state, steps_per_second
+from jaxvib.study.capture import curve
+from jaxvib.study.capture.capture import (
+    CaptureStatus,
+    _summarize_captures,
+    capture_time,
+    moving_state,
+    steps_per_second,
+)
 
 
 def test_a_threshold_is_bracketed_ever_finer():
@@ -63,6 +71,16 @@ def test_a_threshold_curve_is_captures_beside_each_other():
     assert len(curve.plot().axes) == 1
     with pytest.raises(jv.InputError, match=r"values is \[\]; it must be a list"):
         jv.threshold_curve(published_torus, [])
+
+
+def test_threshold_that_did_not_converge_is_shown(monkeypatch):
+    found = _summarize_captures(np.array([-1.0, -0.5]), *[np.ones((2, 1), bool)] * 2, np.zeros((2, 1), bool), 60, 1000)
+    lost = dataclasses.replace(found, last_change=jnp.asarray(np.inf), status=CaptureStatus.not_converged)
+    results = iter([found, lost])
+    monkeypatch.setattr(curve, "capture", lambda *_, **__: next(results))
+    shown = jv.threshold_curve(published_torus, [2.5, 3.5])
+    assert shown.uncertainty.tolist() == [0.0, np.inf] and shown.converged.tolist() == [True, False]
+    assert ["+- inf (not converged)" in line for line in shown.summary().splitlines()] == [False, False, True]
 
 
 @pytest.mark.slow
