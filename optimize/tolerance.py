@@ -15,7 +15,7 @@ from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.units import number, random_numbers
-from optimize.quantities.cases import Sampled
+from optimize.quantities.cases import Sampled, require_single_tolerances
 from optimize.quantities.quantity import Demand, Quantity
 
 _SHORT_NAMES = {
@@ -86,8 +86,8 @@ def tolerance_ranges(
     - `samples`: number of machines; typical: 64 to 1000 (default 128)
     - `seed` of the random deviations
 
-    **Returns** a list of `ToleranceRange`, one for each of the `quantities`. **Raises** `InputError` for a text of another form
-    and for an unknown name.
+    **Returns** a list of `ToleranceRange`, one for each of the `quantities`. **Raises** `InputError` for a text of another
+    form, an unknown name, and a number that is named twice, also by a short name.
 
     >>> import jaxvib as jv
     >>> from optimize import jam_frequency
@@ -136,8 +136,8 @@ class Tolerances(NamedTuple):
 
 
 def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
-    """Return tolerances from texts, see `tolerance_ranges`. **Raises** `InputError` for a text of another form or an unknown
-    name."""
+    """Return tolerances from texts, see `tolerance_ranges`. **Raises** `InputError` for a text of another form, an unknown
+    name, or a number that is named twice."""
     errors: list[tuple[str, float]] = []
     ranges: list[_NumberRange] = []
     present = numbers_of(scene)
@@ -156,6 +156,9 @@ def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
             ranges.append(_range(scene, name, ends[1], ends[2]))
         else:
             raise InputError("tolerances", f"is {quoted(text)}; write NAME=SHARE or NAME=LOW..HIGH, such as stiffness=5%")
+    # Material is added to a mass, which may have a tolerance of its own.
+    changed = (each.number for each in ranges if not each.is_added)
+    require_single_tolerances([*(find_number(scene, name, "tolerances") for name, _ in errors), *changed])
     return Tolerances(tuple(errors), tuple(ranges))
 
 

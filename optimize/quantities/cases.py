@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -38,6 +38,15 @@ class Changed:
         return scene
 
 
+def require_single_tolerances(numbers: Iterable[NamedNumber]) -> None:
+    """**Raises** `InputError` if two of the `numbers` contain the same parameter."""
+    used: set = set()
+    for each in numbers:
+        if each.entries & used:
+            raise InputError("tolerances", f"name a number of {each.name} twice; give one tolerance for each number")
+        used |= each.entries
+
+
 @dataclass(frozen=True)
 class Sampled:
     """Case of many scenes whose parameters have random relative errors. The seed fixes the samples."""
@@ -63,6 +72,7 @@ class Sampled:
             deviation = np.stack([random.permutation(deviations) for _ in range(entry.size)], axis=1)
             # The tolerance is two standard deviations: 95 of 100 machines are within it.
             out.append((entry, np.maximum(1.0 + 0.5 * error * deviation, 0.05)))
+        require_single_tolerances([entry for entry, _ in out])
         return out
 
     def scenes(self, scene: Scene) -> Scene:

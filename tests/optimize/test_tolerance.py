@@ -5,7 +5,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.machine.files import SCREENS, scene_from_toml
-from optimize import jam_frequency, static_deflection, tolerance_ranges
+from optimize import expected, jam_frequency, static_deflection, tolerance_ranges
 from optimize.tolerance import read_tolerances
 
 
@@ -47,6 +47,23 @@ def test_modes_that_vanish_lower_the_share(scene):
 def test_wrong_tolerances_are_refused(scene, text):
     with pytest.raises(jv.InputError, match="tolerance"):
         tolerance_ranges(scene, [static_deflection()], [text], samples=4)
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [
+        ["stiffness=5%", "machine.stiffness[0]=2%"],
+        ["machine.stiffness=30..50 N/mm", "stiffness=5%"],
+        ["mass=1%", "mass=2%"],
+        ["machine.mass=50..60 kg", "machine.mass=55..65 kg"],
+    ],
+)
+def test_number_with_two_tolerances_is_refused(scene, texts):
+    with pytest.raises(jv.InputError, match=r"tolerances name a number of .* twice; give one tolerance"):
+        read_tolerances(scene, texts)
+    with pytest.raises(jv.InputError, match="twice"):
+        expected(static_deflection(), {"machine.stiffness": 0.05, "machine.stiffness[0]": 0.02})(scene)
+    assert len(read_tolerances(scene, ["mass=1%", "load=0..20kg"]).ranges) == 1
 
 
 def test_short_names_of_a_body_are_all_its_springs():
