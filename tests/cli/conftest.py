@@ -1,15 +1,19 @@
 """Commands as a user types them."""
 
+import math
+
 import pytest
 from scenes import scene
 
 import jaxvib as jv
+from jaxvib.cli import output
 from jaxvib.cli.app import run
 
 
 @pytest.fixture
-def type_(capsys):
-    """Runs a command line; gives exit code, stdout, stderr."""
+def type_(capsys, monkeypatch):
+    """Runs a command line without lines of progress; gives exit code, stdout, stderr."""
+    monkeypatch.setattr(output, "SECONDS_BETWEEN_LINES", math.inf)
 
     def typed(*words):
         code = run(list(words))
