@@ -177,8 +177,8 @@ def regime_readings(scene: Scene) -> str:
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import SCREENS
-    >>> print(regime_readings(jv.scene_from_toml(SCREENS["circular_screen"])).splitlines()[0][:32])
-    Omega 860.484 rpm, stable (-2.1
+    >>> print(regime_readings(jv.scene_from_toml(SCREENS["circular_screen"])).splitlines()[0][:25])
+    Omega 896.083 rpm, stable
     """
     regimes = regimes_of(scene)
     if not regimes:
