@@ -28,7 +28,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.branch_plot import branch_summary, plot_branch
 from jaxvib.steady.jams.folds import fold_points, light_rotor_speed
 from jaxvib.steady.orbits.describe import OrbitStatus, orbits
-from jaxvib.steady.orbits.solve import collocation_points
+from jaxvib.steady.orbits.jam_orbit import collocation_points
 from jaxvib.steady.orbits.stability import Floquet, is_stiff, steps_for
 from jaxvib.units import Number, count, number
 

@@ -21,6 +21,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
 from jaxvib.errors import InputError
+from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.fourier import grid_of
@@ -31,7 +32,7 @@ from jaxvib.steady.jams.folds import light_rotor_speed
 from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.describe import Orbit, OrbitStatus, differentiable_fields, orbits
 from jaxvib.steady.orbits.search import exact_mode_speeds
-from jaxvib.steady.orbits.solve import Parameter, collocation_points, periodic_motion
+from jaxvib.steady.orbits.solve import Parameter, periodic_motion
 from jaxvib.steady.orbits.stability import is_stiff, steps_for
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, count, number, validate_tolerance
@@ -216,6 +217,12 @@ def _mode_start(scene: Scene, mode: int) -> tuple[Array, Array, Array]:
 @cached
 def _light_rotor_speed(scene: Scene, omega: Array) -> Array:
     return light_rotor_speed(jammed_model(scene), omega)
+
+
+def collocation_points(scene: Scene, points: int) -> int:
+    """Return the number of collocation points: `points` on half a period for a scene with half-turn symmetry, otherwise
+    2 `points` + 1 on the whole period."""
+    return points if has_half_turn_symmetry(scene.all_effects) else 2 * points + 1
 
 
 @cached

@@ -21,18 +21,10 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.jammed_bodies import JammedBodies
-from jaxvib.machine.effects.base import has_half_turn_symmetry
-from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of, resampling, synthesized
 from jaxvib.numerics.linalg import small_solve, solve_in_turn
 
 Parameter = Literal["omega", "rotor_speed"]
-
-
-def collocation_points(scene: Scene, points: int) -> int:
-    """Return the number of collocation points: `points` on half a period for a scene with half-turn symmetry, otherwise
-    2 `points` + 1 on the whole period."""
-    return points if has_half_turn_symmetry(scene.all_effects) else 2 * points + 1
 
 
 def unbalance_response(model: JammedBodies, omega: Array, speed: Array, orders: np.ndarray) -> Array:

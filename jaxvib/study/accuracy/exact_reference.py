@@ -12,8 +12,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.describe import Orbit
-from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.steady.orbits.solve import collocation_points
+from jaxvib.steady.orbits.jam_orbit import collocation_points, jam_orbit
 
 WINDOW_PERIODS, MAX_RUN_PERIODS = 20.0, 2000.0
 """Measuring window at the end of a run, and longest run, in slow periods (see `slow_period`)."""

@@ -18,8 +18,7 @@ from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.plan import Tolerance, enough_steps
 from jaxvib.motion.simulate import simulate
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
-from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.steady.orbits.solve import collocation_points
+from jaxvib.steady.orbits.jam_orbit import collocation_points, jam_orbit
 from jaxvib.study.accuracy.cost import Cost, relative, row_of
 from jaxvib.study.accuracy.exact_reference import ExactJam, unstable_reason
 

@@ -28,8 +28,7 @@ from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state
 from jaxvib.results.result import Result
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
-from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.steady.orbits.solve import collocation_points
+from jaxvib.steady.orbits.jam_orbit import collocation_points, jam_orbit
 from jaxvib.study.accuracy.cost import Cost, CostRow, relative, row_of
 from jaxvib.study.accuracy.exact_reference import (
     WINDOW_PERIODS,
