@@ -159,8 +159,8 @@ def largest_by_unit(values: ArrayLike, units: Sequence[str]) -> np.ndarray:
     >>> largest_by_unit([1e-3, 2e-3, 0.1], ["m", "m", "rad"]).tolist()
     [0.002, 0.002, 0.1]
     """
-    values, units = np.asarray(values, float), np.asarray(units)
-    return np.array([np.max(values[units == unit]) for unit in units])
+    numbers, names = np.asarray(values, float), np.asarray(units)
+    return np.array([np.max(numbers[names == unit]) for unit in names])
 
 
 def row_of(
