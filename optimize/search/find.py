@@ -217,19 +217,20 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
     design is divided next. The search ends when the best design of such a problem has catalogue values only. Since each search
     is local, the global optimum is not guaranteed. An interrupt (KeyboardInterrupt) ends the search with the nearest choice.
 
-    **Returns** None if no choice meets all demands.
+    **Returns** a choice with a violation if no choice meets all demands, a choice that has not converged after the largest
+    number of nodes, and None if the objective does not exist.
     """
     root = find(problem, options, lambda what, share: report(what, 0.5 * share))
     choices = problem.space.choices
     if root is None or not choices:
         return root
     if root.interrupted:
-        return _nearest_choice(problem, root)
+        return _interrupted(problem, root)
     if root.violation[root.best] > 10.0 * FEASIBILITY_TOLERANCE:
         return root
     order = itertools.count()
     queue = [(float(root.point.values[root.best, 0]), next(order), root, problem.space.numbers(_best_distinct(root)))]
-    nodes = 0
+    nodes, nearest = 0, root
     try:
         while queue and nodes < _MAX_NODES:
             _, _, node, initial = heapq.heappop(queue)
@@ -242,14 +243,22 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
                 nodes += 1
                 starts = np.concatenate([numbers[None], initial])[:_STARTS_PER_BOUND]
                 child = _solve_in_bounds(problem, low, high, starts, max(options.polishing, 20))
-                if child is None or child.violation[child.best] > 10.0 * FEASIBILITY_TOLERANCE:
+                if child is None:
+                    continue
+                if child.violation[child.best] > 10.0 * FEASIBILITY_TOLERANCE:
+                    if nearest is root or child.violation[child.best] < nearest.violation[nearest.best]:
+                        nearest = child
                     continue
                 value = float(child.point.values[child.best, 0])
                 report("choosing", 0.5 + 0.4 * nodes / (nodes + 20.0))
                 heapq.heappush(queue, (value, next(order), child, initial))
+        result = _nearest_choice(problem, queue[0][2] if queue else nearest)
+        if result is None:
+            return None
+        remaining = np.full_like(result.remaining_decrease, np.inf) if queue else result.remaining_decrease
+        return result._replace(drawn=root.drawn, existing=root.existing, nodes=nodes, remaining_decrease=remaining)
     except KeyboardInterrupt:
-        return _nearest_choice(problem, root)._replace(nodes=nodes)
-    return None
+        return _interrupted(problem, root)._replace(nodes=nodes)
 
 
 def _split_bounds(node: SearchResult, choice: Choice, numbers: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -267,20 +276,25 @@ def _split_bounds(node: SearchResult, choice: Choice, numbers: np.ndarray) -> It
             yield low, high
 
 
-def _nearest_choice(problem: Problem, root: SearchResult) -> SearchResult:
-    """Return the best design of an interrupted search, with each chosen parameter rounded to the nearest value of its
-    catalogue.
+def _interrupted(problem: Problem, root: SearchResult) -> SearchResult:
+    """Return the nearest choice to the best design of an interrupted search.
 
-    **Raises** `KeyboardInterrupt` if the objective does not exist for the rounded design.
+    **Raises** `KeyboardInterrupt` if the objective does not exist for this choice.
     """
-    numbers = problem.space.within(*root.bounds).numbers(root.point.z[root.best])
-    low, high = (b.copy() for b in root.bounds)
-    for choice in problem.space.choices:
-        low[choice.start] = high[choice.start] = min(choice.values, key=lambda v: abs(v - numbers[choice.start]))
-    result = _solve_in_bounds(problem, low, high, numbers[None], 0)
+    result = _nearest_choice(problem, root)
     if result is None:
         raise KeyboardInterrupt
     return result._replace(drawn=root.drawn, existing=root.existing, interrupted=True)
+
+
+def _nearest_choice(problem: Problem, node: SearchResult) -> SearchResult | None:
+    """Return the best design of a node with each chosen parameter rounded to the nearest value of its catalogue, or None if the
+    objective does not exist there."""
+    numbers = problem.space.within(*node.bounds).numbers(node.point.z[node.best])
+    low, high = (b.copy() for b in node.bounds)
+    for choice in problem.space.choices:
+        low[choice.start] = high[choice.start] = min(choice.values, key=lambda v: abs(v - numbers[choice.start]))
+    return _solve_in_bounds(problem, low, high, numbers[None], 0)
 
 
 def _distance_to_catalogue(values: tuple[float, ...], x: float) -> float:

@@ -157,6 +157,14 @@ def test_chosen_rows_of_a_catalogue_are_the_best_of_all():
     np.testing.assert_allclose(found.point.values[found.best, 0], bent(least[0] / 1e4, least[1] / 1e4), rtol=1e-9)
 
 
+def test_catalogue_that_meets_no_demand_gives_a_violation():
+    first = plain("first", lambda x, y: x)
+    problem, found = chosen([first > 1.6, first < 2.1])
+    numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])
+    assert set(numbers.tolist()) <= set(CATALOGUE) and numbers[0] in (1.5e4, 2.2e4)
+    assert found.violation[found.best] > 0.01 and not found.interrupted and found.nodes > 0 and found.drawn == 4
+
+
 def test_optimum_in_the_catalogue_needs_no_branching():
     _, found = chosen(wish=lambda x, y: (x - 1.5) ** 2 + (y - 4.7) ** 2 + 1.0)
     assert found.nodes == 0
@@ -223,15 +231,18 @@ def test_interrupted_choice_is_in_its_catalogue(stage):
     assert found.interrupted and set(np.round(numbers, 6)) <= set(CATALOGUE) and len(after) == 1
 
 
-def test_choices_meet_demands_or_none_is_returned(monkeypatch):
+def test_choices_meet_demands_or_have_a_violation(monkeypatch):
     product = plain("product", lambda x, y: x * y)
     problem, found = chosen([product > 9.0])
     tried = {pair: bent(*(np.array(pair) / 1e4)) for pair in itertools.product(CATALOGUE, CATALOGUE) if np.prod(pair) > 9e8}
     numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])
     np.testing.assert_allclose(numbers, min(tried, key=tried.get), rtol=1e-9)
-    assert chosen([product > 8.9, product < 9.0], [1e4, 2e4, 7e4])[1] is None  # machines between, but no choice
+    _, none = chosen([product > 8.9, product < 9.0], [1e4, 2e4, 7e4])  # machines between, but no choice
+    assert none.violation[none.best] > 0.1
     monkeypatch.setattr(find_module, "_MAX_NODES", 0)
-    assert chosen()[1] is None
+    _, limited = chosen()
+    assert limited.violation[limited.best] == 0.0 and limited.remaining_decrease[limited.best] == np.inf
+    assert {low for low, _ in zip(*limited.bounds, strict=True)} <= set(CATALOGUE)
 
 
 @pytest.mark.parametrize("bounds", [((1e4, 4e4), (2e4, 4e4)), ((7e4, 7e4), (7e4, 9e4))])
