@@ -109,8 +109,10 @@ class Problem(eqx.Module):
         kept_demands = [k for k, d in enumerate(demands) if not (_needs_other_tier(d.quantity) or _needs_other_tier(d.limit))]
         space = eqx.tree_at(lambda s: s.held, self.space, held)
         forms, index = tuple(demands[k] for k in kept_demands), np.asarray(kept_demands, int)
-        keys, *traced = _targets_of_search(space, objective, forms)
-        return Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.batch_size, *traced)
+        keys, parts, program = _targets_of_search(space, objective, forms)
+        return Problem(
+            space, objective, forms, keys, self.constants[index], self.scales[index], self.batch_size, parts, program
+        )
 
     @property
     def forward_only(self) -> bool:
@@ -187,13 +189,13 @@ def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand
     quantity and limit for the initial design, or 1 if both are 0 within rounding.
     """
     forms = tuple(demand.form() for demand in demands)
-    keys, *traced = _targets_of_search(space, objective, forms)
+    keys, parts, program = _targets_of_search(space, objective, forms)
     constants = np.asarray([demand.constant or 0.0 for demand in demands], float)
     scales = np.abs(constants)
     if np.any(scales == 0.0):
         sizes = _sizes(space, tuple(q for d in demands for q in (d.quantity, d.limit))).reshape(-1, 2).max(axis=1)
         scales = np.where(scales > 0.0, scales, np.where(np.isfinite(sizes) & (sizes > 0.0), sizes, 1.0))
-    return Problem(space, objective, forms, keys, constants, scales, _batch_size(starts), *traced)
+    return Problem(space, objective, forms, keys, constants, scales, _batch_size(starts), parts, program)
 
 
 def _sizes(space: DesignSpace, quantities: tuple[Quantity, ...]) -> np.ndarray:
