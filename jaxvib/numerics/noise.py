@@ -16,6 +16,12 @@ import numpy as np
 _MAX_ORDER = 40
 """Largest order of an autoregressive model."""
 
+_COLOUR_GAIN = 10.0
+"""Difference of the information criteria of white and coloured noise above which noise counts as coloured. A fit takes up part
+of the noise at the natural frequencies of its model. This gap in the spectrum of short residuals looks like colour, and a
+filter for it makes standard errors too small. With 400 white residuals of a fit with 17 unknowns, the difference is larger in 1
+of 1000 cases."""
+
 _EXPECTATIONS = 40
 """Number of iterations of expectation and maximization for the distribution of outliers."""
 
@@ -178,7 +184,8 @@ def autoregression(
 
         e_k = r_k + a_1 r_{k-1} + ... + a_p r_{k-p}
 
-    The coefficients solve the Yule-Walker equations; the order p has the smallest Bayesian information criterion.
+    The coefficients solve the Yule-Walker equations; the order p has the smallest Bayesian information criterion. The order is
+    0 unless the noise is clearly coloured, see `_COLOUR_GAIN`.
 
     **Arguments**: `residual` r (n,); `used` (n,): False for samples to leave out; `max_order`: largest order.
 
@@ -205,7 +212,7 @@ def autoregression(
         return np.ones(1), 0.0
     # Levinson's recursion gives the coefficients of every order.
     taps, variance = np.ones(1), float(covariance[0])
-    best, best_criterion = (taps, variance), n * np.log(variance)
+    best, best_criterion = (taps, variance), n * np.log(variance) - _COLOUR_GAIN
     for order in range(1, max_order + 1):
         reflection = -float(taps @ covariance[order:0:-1]) / variance
         longer = np.concatenate([taps, [0.0]])
