@@ -144,7 +144,8 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
     """Yield sentences about vibrations that are not at the speed of the rotor: in the residuals, or in the readings if there is
     no fit."""
     problem = fitted.problem
-    if len(problem.unbalances) > 1 or (problem.has_loads and not has_fit):  # readings of jammed loads are never at that speed
+    # Readings of jammed loads and of contacts are not at that speed.
+    if len(problem.unbalances) > 1 or (problem.linear is not None and not has_fit):
         return
     for k, (samples, raw, mask, residuals) in enumerate(
         zip(problem.runs, problem.raw, problem.masks, fitted.residuals, strict=True)

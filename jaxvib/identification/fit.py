@@ -152,9 +152,9 @@ def unbalance_prior(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, n
 
 
 def project(problem: Problem, x: np.ndarray) -> _Trial:
-    """Return the best linear unknowns at `x` and their cost; for a motion with loads, those of the problem and their cost."""
+    """Return the best linear unknowns at `x` and their cost; for a nonlinear motion, those of the problem and their cost."""
     if problem.linear is not None:
-        return _with_loads(problem, x, problem.linear)
+        return _nonlinear_trial(problem, x, problem.linear)
     total = _linear_equations(problem, x)
     matrix, right, square = total[:-1, :-1], total[:-1, -1], total[-1, -1]
     if not np.all(np.isfinite(total)):
@@ -171,14 +171,14 @@ def project(problem: Problem, x: np.ndarray) -> _Trial:
     return _Trial(x, linear, max(float(data), 0.0) + known_cost(problem, x, linear))
 
 
-def _with_loads(problem: Problem, x: np.ndarray, linear: np.ndarray) -> _Trial:
-    """Return the unknowns of a motion with loads, and their cost."""
-    cost = known_cost(problem, x, linear) + float(np.sum(differences_with_loads(problem, x, linear) ** 2))
+def _nonlinear_trial(problem: Problem, x: np.ndarray, linear: np.ndarray) -> _Trial:
+    """Return the unknowns of a nonlinear motion, and their cost."""
+    cost = known_cost(problem, x, linear) + float(np.sum(nonlinear_differences(problem, x, linear) ** 2))
     return _Trial(x, linear, cost if np.isfinite(cost) else np.inf)
 
 
-def differences_with_loads(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """Return the weighted differences, readings minus model, of a motion with loads, those of all runs in one array."""
+def nonlinear_differences(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Return the weighted differences, readings minus model, of a nonlinear motion, those of all runs in one array."""
     pairs = zip(problem.runs, linear_places(problem), strict=True)
     return np.concatenate(
         [motion_differences(problem.unknowns, each, problem.scene, x, linear[place]) for each, place in pairs]
@@ -211,8 +211,8 @@ def linear_at(problem: Problem, x: np.ndarray, unbalance: np.ndarray | None) -> 
 
 def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
     """Return the normal equations (p + L + 1, p + L + 1) of each run: of all unknowns and the residuals."""
-    if problem.has_loads:
-        return [columns.T @ columns for columns in columns_with_loads(problem, x, linear)]
+    if problem.linear is not None:
+        return [columns.T @ columns for columns in nonlinear_columns(problem, x, linear)]
     p, size, of_runs = x.size, x.size + linear.size, []
     for samples, place in zip(problem.runs, linear_places(problem), strict=True):
         parts = problem.unknowns, samples, problem.scene
@@ -222,7 +222,7 @@ def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[n
     return of_runs
 
 
-def columns_with_loads(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
+def nonlinear_columns(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
     """Return the columns (n C, p + L + 1) of each run: derivatives with respect to all unknowns, and the residuals."""
     p, size, of_runs = x.size, x.size + linear.size, []
     for samples, place in zip(problem.runs, linear_places(problem), strict=True):
@@ -259,8 +259,8 @@ def _joined(problem: Problem, x: np.ndarray, linear: np.ndarray, total: np.ndarr
 
 def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
     """Return the minimum near `x`, the information of data and of known values there, and True if it was reached."""
-    if problem.has_loads:
-        return _minimize_with_loads(problem, x)
+    if problem.linear is not None:
+        return _minimize_nonlinear(problem, x)
 
     def equations(trial: _Trial) -> Equations:
         return joint_equations(problem, trial.x, trial.linear)
@@ -273,27 +273,28 @@ def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.nd
     return best, information, prior, converged
 
 
-def _minimize_with_loads(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
-    """Return the same as `minimize` for a motion with loads, in which no unknown is linear."""
+def _minimize_nonlinear(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
+    """Return the same as `minimize` for a nonlinear motion, in which no unknown is linear."""
     p, columns = x.size, np.zeros((0, 0))
 
     def equations(trial: _Trial) -> Equations:
         nonlocal columns
-        columns = np.concatenate(columns_with_loads(problem, trial.x, trial.linear))
+        columns = np.concatenate(nonlinear_columns(problem, trial.x, trial.linear))
         return _joined(problem, trial.x, trial.linear, columns.T @ columns)
 
     def stepped(trial: _Trial, step: np.ndarray) -> _Trial:
         step = limited_step(problem, step)
-        return _with_loads(problem, trial.x + step[:p], trial.linear + step[p:])
+        return _nonlinear_trial(problem, trial.x + step[:p], trial.linear + step[p:])
 
     def bend(trial: _Trial, step: np.ndarray) -> np.ndarray:
         new, linear = trial.x + step[:p], trial.linear + step[p:]
         slopes = columns[:, :-1]
-        return slopes.T @ (differences_with_loads(problem, new, linear) - columns[:, -1] + slopes @ step)
+        return slopes.T @ (nonlinear_differences(problem, new, linear) - columns[:, -1] + slopes @ step)
 
     start = project(problem, x)
     count = p + start.linear.size
-    best, (information, prior, _), converged = descend(start, equations, stepped, count, positive_places(problem), bend)
+    with np.errstate(over="ignore", invalid="ignore"):  # a trial may diverge; its cost is then infinite
+        best, (information, prior, _), converged = descend(start, equations, stepped, count, positive_places(problem), bend)
     return best, information, prior, converged
 
 
@@ -405,7 +406,7 @@ def differences_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[
     differences = []
     for samples, place, raw in zip(problem.runs, linear_places(problem), problem.raw, strict=True):
         parts = problem.unknowns, samples, problem.scene
-        if problem.has_loads:
+        if problem.linear is not None:
             model = closed_motion(*parts, x, linear[place])[0]
         else:
             model = np.asarray(model_readings(*parts, jnp.asarray(x), jnp.asarray(linear[place])))
@@ -500,7 +501,7 @@ def _pass(
     problem = with_noise(problem, noise, differences)
     minima = [minimize(problem, x) for x in starts]
     trial, information, prior, converged = min(minima, key=lambda each: each[0].cost)
-    problem = problem._replace(linear=trial.linear) if problem.has_loads else problem
+    problem = problem._replace(linear=trial.linear) if problem.linear is not None else problem
     residuals = differences_of(problem, trial.x, trial.linear)
     pairs = zip(residuals, problem.masks, noise, strict=True)
     deviations = [

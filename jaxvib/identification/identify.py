@@ -25,9 +25,10 @@ from jaxvib.identification.directions import (
 from jaxvib.identification.fit import Fitted, unknown_count
 from jaxvib.identification.jammed.start import first_states, with_first_motion
 from jaxvib.identification.likelihood import QUANTILE, profile_intervals
-from jaxvib.identification.problem import Problem, build_problem, natural
+from jaxvib.identification.problem import Problem, build_problem, has_supports, natural
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.identification.start import track_orders
+from jaxvib.identification.supports.start import untouched_stops, with_guided_motion
 from jaxvib.identification.torque import fit_with_torques
 from jaxvib.machine.numbers.named import find_number, put_numbers
 from jaxvib.machine.scene import Scene
@@ -178,8 +179,10 @@ def identify(
       unbalance, the offsets, and the state at the first sample
     - The noise of each channel may be coloured: residuals are filtered to white noise by an autoregressive model, and the
       intervals follow from the Fisher information with the estimated noise
-    - The supports must be linear. The loads of a scene with one exciter (balls, rollers, pendulums) must be jammed throughout
-      the runs; their motion is that of `vector_field`, and their angles and speeds at the first sample are unknowns
+    - The loads of a scene with one exciter (balls, rollers, pendulums) must be jammed throughout the runs; their motion is that
+      of `vector_field`, and their angles and speeds at the first sample are unknowns
+    - A scene with one exciter without loads can have nonlinear supports, `CubicSupport` and `Stop`. The numbers of a stop that
+      is not touched in the runs are not determined
     - Numbers of a motor, such as "drive.inertia" and "drive.stall_torque", can be unknown if a channel gives the angle or the
       speed of its rotor. The torque balance of the rotor, with the torque of the vibration, is then a part of the fit
 
@@ -235,6 +238,9 @@ def identify(
         raise InputError("unknown", f"has {free} unknowns with those of the runs, for {readings} readings; record longer runs")
     if problem.has_loads:
         problem, first = with_first_motion(problem)
+        starts = [first]
+    elif has_supports(scene):
+        problem, first = with_guided_motion(problem)
         starts = [first]
     else:
         starts = [np.zeros(problem.unknowns.count), track_orders(problem)]
@@ -304,7 +310,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         notes.append(f"{known.names[i]} is not distinguishable from 0; it is at most {estimates[i].high:.3g} {unit}".rstrip())
     return MachineFit(
         status=status,
-        notes=(*problem.notes, *notes, *coverage_notes(fitted, *natural(fit_scene))),
+        notes=(*problem.notes, *notes, *untouched_stops(fitted), *coverage_notes(fitted, *natural(fit_scene))),
         scene=fit_scene,
         names=known.names,
         units=tuple(find_number(scene, name, "unknown").unit for name in known.names),

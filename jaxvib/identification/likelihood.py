@@ -17,10 +17,10 @@ import numpy as np
 from jaxvib.identification.directions import Information, eliminate, elimination, free_unbalances, in_polar_unbalances
 from jaxvib.identification.fit import (
     Fitted,
-    columns_with_loads,
-    differences_with_loads,
     known_cost,
     minimize,
+    nonlinear_columns,
+    nonlinear_differences,
     prior_equations,
     project,
     solved,
@@ -54,7 +54,7 @@ class _Profile:
     error `spread` of the coordinate of the number (its entry of x, or the logarithm of the unbalance); `slopes` (p + L,):
     change of all unknowns per change of the coordinate, of the unbalances as (logarithm of the size, angle); `floor`: the least
     cost; `is_vanished`: True if the number is not distinguishable from 0; distances are then multiples of the standard error of
-    the number itself, not of its logarithm; `columns` (n, p + L + 1) of a motion with loads, see `columns_with_loads`.
+    the number itself, not of its logarithm; `columns` (n, p + L + 1) of a nonlinear motion, see `nonlinear_columns`.
     """
 
     fitted: Fitted
@@ -73,7 +73,7 @@ class _Profile:
 
     def rise(self, distance: float, is_exact: bool) -> float:
         """Return the rise of the cost at a `distance` in standard errors. If `is_exact`, all other unknowns are fitted.
-        Otherwise only the linear ones are fitted, and the others follow from the quadratic form. A motion with loads has no
+        Otherwise only the linear ones are fitted, and the others follow from the quadratic form. A nonlinear motion has no
         linear unknown; see `_in_valley`."""
         target, p = self.center + self.shift(distance), self.fitted.x.size
         problem, known_cost = self._fixed(target)
@@ -90,13 +90,13 @@ class _Profile:
         return trial.cost + known_cost - self.floor
 
     def _in_valley(self, problem: Problem, x: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the unknowns of a motion with loads after a few steps of the method of Gauss and Newton with the derivatives
+        """Return the unknowns of a nonlinear motion after a few steps of the method of Gauss and Newton with the derivatives
         at the fit. The valley of the cost is curved, and the unknowns of the quadratic form are outside it at a large
         distance."""
         assert self.columns is not None
         slopes, p, best, last = self.columns[:, :-1], x.size, (x, linear), math.inf
         for _ in range(_VALLEY_STEPS):
-            left = differences_with_loads(problem, x, linear)
+            left = nonlinear_differences(problem, x, linear)
             cost = float(left @ left) + known_cost(problem, x, linear)
             if not cost < last - _SMALL_REDUCTION:
                 break
@@ -162,7 +162,7 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
     covariance = np.linalg.pinv(eliminate(data + prior, places), rcond=1e-13, hermitian=True)
     floor, intervals, columns = project(problem, fitted.x).cost, {}, None
     if problem.linear is not None:
-        columns = np.concatenate(columns_with_loads(problem, fitted.x, problem.linear))
+        columns = np.concatenate(nonlinear_columns(problem, fitted.x, problem.linear))
     for i, name in enumerate(known.names):
         if not known.determined[i]:
             continue
@@ -178,7 +178,7 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
         if is_vanished:
             intervals[name] = -math.inf, profile.shift(profile.end(1.0))
             continue
-        # The cost of a motion with loads that is not fitted completely may rise by more than in the profile.
+        # The cost of a nonlinear motion that is not fitted completely may rise by more than in the profile.
         if profile.is_quadratic(is_exact=False) or (problem.linear is not None and profile.is_quadratic(is_exact=True)):
             continue
         intervals[name] = -profile.spread * profile.end(-1.0), profile.spread * profile.end(1.0)

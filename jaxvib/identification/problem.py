@@ -21,7 +21,8 @@ from jaxvib.identification.records.decimation import MIN_SAMPLES, decimated
 from jaxvib.identification.response import BLOCK, STRETCH, Samples, Unknowns, rows_of_channel, state_count
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.effects.base import has_term
-from jaxvib.machine.effects.terms import GravityField
+from jaxvib.machine.effects.supports import Stop
+from jaxvib.machine.effects.terms import GravityField, SupportForce
 from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import require_double
@@ -51,7 +52,7 @@ _FREQUENCY_MARGIN, _SPEED_TIMES = 1.5, 64
 sampling rate."""
 
 _STRETCH_ANGLE, _MAX_STRETCHES = 25.0, 64
-"""Length of a stretch of a motion with loads, rad of the slowest vibration, and largest number of stretches. With the first
+"""Length of a stretch of a nonlinear motion, rad of the slowest vibration, and largest number of stretches. With the first
 values of the unknowns, the phase error within a stretch must be less than a radian."""
 
 _STEPS_PER_RADIAN = 1.0
@@ -89,8 +90,8 @@ class Problem(NamedTuple):
     - `unbalances`: for each exciter its known value, None if it is free
     - `angle_errors`, rad: standard error of the rotor's angle in each run, without the errors that are unknowns
     - `notes`: sentences for the reader
-    - `linear` (L,): first values of the linear unknowns of a motion with loads, in which the readings are not linear; None
-      without loads
+    - `linear` (L,): first values of the linear unknowns of a motion with loads or on nonlinear supports, in which the readings
+      are not linear; None for a linear response
     - `load_spread` (L, L): information from the assumption that all loads of a run have nearly the same angle and speed at the
       first sample; None without loads
     """
@@ -151,7 +152,7 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     for runs without a usable channel, and if JAX computes in single precision.
     """
     scene = require_double(scene, "an identification")
-    _require_linear(scene)
+    _require_included(scene, runs)
     if isinstance(unknown, str) or not unknown:
         raise InputError("unknown", f"is {quoted(unknown)}; it must be a list of names, such as ['machine.stiffness']")
     numbers = _singles(scene, unknown)
@@ -235,15 +236,15 @@ def is_of_drive(number: NamedNumber) -> bool:
 def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs: Sequence[MeasuredRun]) -> None:
     """Raise if numbers of a drive are unknown that no record determines."""
     drive, measured = scene.exciters[0].drive, all(run.of_kind(*ROTOR_KINDS) for run in runs)
-    if len(scene.exciters) == 1 and not drive.ideal and not drive.state_units() and measured and not has_loads(scene):
+    if len(scene.exciters) == 1 and not drive.ideal and not drive.state_units() and measured and not is_nonlinear(scene):
         return
     for name, number in free.items():
         if is_of_drive(number):
             raise InputError(
                 f"unknown.{name}",
                 "is a number of the drive, which the recorded angle does not determine; leave it out. Only the numbers of the "
-                "motor of a scene with one exciter without loads can be unknown, if the motor has no currents as states and "
-                "each run has a channel of pulses, angle or speed",
+                "motor of a scene with linear supports and one exciter without loads can be unknown, if the motor has no "
+                "currents as states and each run has a channel of pulses, angle or speed",
             )
 
 
@@ -270,14 +271,34 @@ def has_loads(scene: Scene) -> bool:
     return any(exciter.loads is not None for exciter in scene.exciters)
 
 
+def is_nonlinear(scene: Scene) -> bool:
+    """Return True for a scene whose motion is not linear in its state and its unbalance: with loads or nonlinear supports."""
+    return has_loads(scene) or has_supports(scene)
+
+
+def has_supports(scene: Scene) -> bool:
+    """Return True if a scene has nonlinear supports, such as stops."""
+    return has_term(scene.effects, SupportForce)
+
+
 def require_unbalances_only(scene: Scene, function: str) -> None:
     """Raise for a scene with loads in a `function` that does not include them."""
     if has_loads(scene):
         raise InputError("fit.scene", f"has loads that move on the rotor; {function} needs exciters with an unbalance only")
 
 
-def _require_linear(scene: Scene) -> None:
-    if has_loads(scene) and len(scene.exciters) > 1:
+def require_linear_supports(scene: Scene, function: str) -> None:
+    """Raise for a scene with nonlinear supports in a `function` that does not include them."""
+    for effect in scene.effects:
+        if has_term([effect], SupportForce):
+            problem = f"is a nonlinear support, which {function} does not include; use a fit of a scene with linear supports"
+            raise InputError(f"fit.scene.effects.{effect.kind}", problem)
+
+
+def _require_included(scene: Scene, runs: Sequence[MeasuredRun]) -> None:
+    """Raise for parts of a scene that an identification does not include."""
+    is_alone = len(scene.exciters) == 1
+    if has_loads(scene) and not is_alone:
         problem = f"has {len(scene.exciters)} exciters, one of them with loads; identify needs loads to be on the only exciter"
         raise InputError("scene", problem)
     for exciter in scene.exciters:
@@ -285,10 +306,20 @@ def _require_linear(scene: Scene) -> None:
             problem = f"is of kind {exciter.loads.kind!r}; identify needs loads on a circle: balls, rollers or pendulums"
             raise InputError("scene.loads", problem)
     for effect in scene.all_effects:
-        if not has_term([effect], GravityField):
+        kind, terms = f"effects.{effect.kind}", effect.terms()
+        is_support = isinstance(effect, Stop) or all(isinstance(term, SupportForce) and term.is_smooth for term in terms)
+        if is_support and (has_loads(scene) or not is_alone):
+            raise InputError(kind, "is a nonlinear support; identify needs a scene with one exciter without loads then")
+        if is_support and any(run.of_kind("force") for run in runs):
             raise InputError(
-                f"effects.{effect.kind}",
-                "is not included in identify, which needs linear supports and viscous drag of loads; remove the effect",
+                kind,
+                "presses on the foundation, and a channel of kind 'force' does not contain its force; leave out the channel",
+            )
+        if not is_support and not has_term([effect], GravityField):
+            raise InputError(
+                kind,
+                "is not included in identify, which needs viscous drag of loads, and supports that are linear, cubic or stops; "
+                "remove the effect",
             )
     if any(scene.machine.mounting(exciter.place).gyroscopic is not None for exciter in scene.exciters):
         raise InputError(
@@ -410,17 +441,19 @@ def _samples(
         changed=tuple(numbers),
         actions=tuple(actions),
         turn=turn,
-        stretches=_stretches(_changed(scene, run), count, step) if has_loads(scene) else (0, 0, 0),
+        stretches=_stretches(_changed(scene, run), count, step) if is_nonlinear(scene) else (0, 0, 0),
+        guide=jnp.zeros((state_count(scene, channels), len(channels))) if has_supports(scene) else None,
     )
     return samples, mask, raw, bounds, time, np.stack([angle.at(time) for angle in angles], axis=1)
 
 
 def _stretches(scene: Scene, count: int, step: float) -> tuple[int, int, int]:
-    """Return the number of the stretches of a motion with loads, the samples of each, and the steps per sample.
+    """Return the number of the stretches of a nonlinear motion, the samples of each, and the steps per sample.
 
     **Arguments**: `count` of the samples, and their `step`, s.
     """
     fastest, slowest = (float(each) for each in frequency_bounds(scene))
+    fastest = max(fastest, _stop_frequency(scene))
     longest, is_stiff = equal_step_length(fastest, float(fastest_decay(scene)), _STEPS_PER_RADIAN)
     if is_stiff:
         raise InputError(
@@ -429,6 +462,18 @@ def _stretches(scene: Scene, count: int, step: float) -> tuple[int, int, int]:
         )
     number = max(1, min(_MAX_STRETCHES, round(count * step * slowest / _STRETCH_ANGLE)))
     return number, -(-count // number), max(1, math.ceil(step / longest))
+
+
+def _stop_frequency(scene: Scene) -> float:
+    """Return the highest natural frequency while all stops press, rad/s; 0 without stops."""
+    model = linear_model(scene)
+    stiffness = np.array(model.carrier.stiffness)
+    stops = [effect for effect in scene.effects if isinstance(effect, Stop)]
+    for stop in stops:
+        rows = np.asarray(stop.rows(scene.machine))
+        stiffness += float(stop.stiffness) * rows.T @ rows
+    squares = np.linalg.eigvals(np.linalg.solve(np.asarray(model.mass), stiffness)).real
+    return math.sqrt(float(np.max(squares))) if stops else 0.0
 
 
 def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: Sequence[np.ndarray] | None = None) -> Problem:

@@ -102,8 +102,10 @@ class Samples(eqx.Module):
     - `changed`: numbers of the scene that differ in this run; `actions` ("add", "scale" or "set") and `amounts` of the changes
     - `channels` that are compared; `turn`: index of the run's unknown zero of the angle, or None
     - `errors`: place of the first error of the rotor's angle among the unknowns, and their number
-    - `stretches` in which the motion of loads is integrated: their number, samples of each, steps per sample; (0, 0, 0) without
-      loads
+    - `stretches` in which the motion of loads or on nonlinear supports is integrated: their number, samples of each, steps per
+      sample; (0, 0, 0) for a linear response
+    - `guide` (ns, C) of a motion on nonlinear supports: change of the state at a sample per difference between recorded and
+      computed readings; otherwise None
     """
 
     drives: tuple[Drive, ...]
@@ -120,6 +122,7 @@ class Samples(eqx.Module):
     turn: int | None = eqx.field(static=True)
     errors: tuple[int, int] = eqx.field(static=True, default=(0, 0))
     stretches: tuple[int, int, int] = eqx.field(static=True, default=(0, 0, 0))
+    guide: Array | None = None
 
     def scene(self, scene: Scene) -> Scene:
         """Return the scene as it was in this run."""
@@ -402,6 +405,15 @@ def model_readings(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array,
     """Return the readings (N n, C) of the model with its offsets, without the filter."""
     steps = _built(unknowns, samples, scene, x)
     return _all_readings(steps, samples, scene, x, linear) + _split(steps, linear)[2][None]
+
+
+@cached
+def linear_steps(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> tuple[Array, Array]:
+    """Return the matrices of a step of the free motion (ns, ns) and of the readings (C, ns), for states whose displacements are
+    in m and velocities in m/s."""
+    steps, nd = _built(unknowns, samples, scene, x), len(scene.machine.structure().coordinates)
+    unit = jnp.where(jnp.arange(steps.power.shape[0]) < nd, steps.scale, 1.0)
+    return steps.power * unit[None] / unit[:, None], steps.outputs * unit[None]
 
 
 @cached

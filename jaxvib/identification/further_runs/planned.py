@@ -17,7 +17,7 @@ from jaxvib.identification.directions import covariance_of, eliminate, in_polar_
 from jaxvib.identification.fit import Fitted, information_at, unknown_count
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.jammed.start import is_jammed, with_jam
-from jaxvib.identification.problem import MOTIONS, Problem, build_problem, with_noise
+from jaxvib.identification.problem import MOTIONS, Problem, build_problem, require_linear_supports, with_noise
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive
@@ -112,6 +112,7 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     **Raises** `InputError` for a channel whose noise is unknown, for a scene with several exciters, and for loads that do not
     stay jammed.
     """
+    require_linear_supports(fit.scene, "plan_runs")
     # The spectral density of the noise is the same at all sampling rates. Deviations are stored per square root of the rate.
     deviations: dict[str, float] = {}
     for names, noise, time in reversed(list(zip(fit.channels, fit.noise, fit.time, strict=True))):

@@ -16,7 +16,7 @@ from jaxvib.identification.fit import differences_of, linear_at, minimize, run_e
 from jaxvib.identification.further_runs.planned import own_precisions, problem_of_run, shared_places
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.jammed.start import with_first_motion
-from jaxvib.identification.problem import EXACT, Known, Problem, with_noise
+from jaxvib.identification.problem import EXACT, Known, Problem, require_linear_supports, with_noise
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.numerics.noise import Noise, noise_of
 from jaxvib.results.fields import in_unit
@@ -164,6 +164,7 @@ class _Predicted(NamedTuple):
 
 
 def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
+    require_linear_supports(fit.scene, "predict_run")
     problem = problem_of_run(fit, fit.scene, run)
     unbalances = [1.0 if exciter.unbalance is None else exciter.unbalance for exciter in fit.scene.exciters]
     sizes = np.array([float(np.asarray(each, float)) for each in unbalances])

@@ -1,14 +1,16 @@
-"""Motion of a machine with loads on a rotor of known angle, at the samples of a record, and its normal equations.
+"""Motion of a machine with loads or nonlinear supports and a rotor of known angle, at the samples of a record, and its
+derivatives.
 
 The state is y = (q, q', angles of the loads, their rates, states of high-pass filters). The exact equations of the scene are
-integrated by equal steps of order 8, over J stretches of a record at once. The last state end_j of stretch j has the derivative
-G_j with respect to the first state start_j of the stretch, and H_j with respect to all other unknowns z. A change dz, and a
-change of the state at the first sample, then change start_j by D_j:
+integrated by equal steps of order 8, over J stretches of a record at once. A step also ends where a stop begins or ceases to
+press, see `jaxvib.identification.supports.contact`. The last state end_j of stretch j has the derivative G_j with respect to
+the first state start_j of the stretch, and H_j with respect to all other unknowns z. A change dz, and a change of the state at
+the first sample, then change start_j by D_j:
 
     D_1 = d(state at the first sample),      D_{j+1} = G_j D_j + H_j dz + (end_j - start_{j+1})
 
 The last term closes the gaps between the stretches. Without gaps this is the derivative of the whole motion. The motion of
-loads that are jammed is stable; therefore the products of G_j do not grow.
+jammed loads or on damped supports is stable; therefore the products of G_j do not grow.
 
 Sizes of arrays: n samples, J stretches of `length` samples, C channels, nd coordinates of the carrier, ns states, p unknowns x
 of the scene and the sensors (see `Unknowns`). `pair` are the two components of the unbalance.
@@ -30,6 +32,7 @@ from jaxvib.equations.model import assemble
 from jaxvib.equations.state import State
 from jaxvib.identification.angle import RecordedDrive
 from jaxvib.identification.response import Samples, Unknowns, sensor_rows
+from jaxvib.identification.supports.contact import held, pressing, side_count, switched_step, with_pressing
 from jaxvib.machine.drives.drive import Drive, IdealDrive
 from jaxvib.machine.scene import Scene
 from jaxvib.ode.dopri8_loop import LoopDopri8
@@ -83,6 +86,8 @@ def _equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pai
         scene_of_run = eqx.tree_at(lambda scene: scene.exciters[0].unbalance, scene_of_run, jnp.hypot(pair[0], pair[1]))
     shifted = ShiftedDrive(drive=drive, phase=phase, end=samples.end, speed=drive.speed)
     scene_of_run: Any = eqx.tree_at(lambda scene: scene.exciters[0].drive, scene_of_run, shifted)
+    held_effects = tuple(held(effect, scene_of_run.machine) for effect in scene_of_run.effects)
+    scene_of_run = eqx.tree_at(lambda scene: scene.effects, scene_of_run, held_effects)
     model = assemble(scene_of_run)
     gains = jnp.stack([jnp.asarray(unknowns.gain(x, channel.name)) for channel in samples.channels])
     corners = jnp.asarray([2.0 * np.pi * channel.high_pass for channel in samples.channels if channel.high_pass > 0.0])
@@ -94,7 +99,7 @@ def _rates(samples: Samples, t: Array, y: Array, equations: _Equations) -> tuple
     nd, filters = equations.rows.shape[2], equations.corners.shape[0]
     loads = (y.shape[0] - 2 * nd - filters) // 2
     q, v, angle, rate, slow = jnp.split(y, np.cumsum([nd, nd, loads, loads]))
-    derivative = equations.dynamics(t, State(q, v, (angle,), (rate,)))
+    derivative = equations.dynamics(t, State(q, v, (angle,), (rate,)) if loads else State(q, v))
     readings = equations.rows[:, 0] @ q + equations.rows[:, 1] @ v + equations.rows[:, 2] @ derivative.velocity
     filtered = np.flatnonzero([channel.high_pass > 0.0 for channel in samples.channels])
     filter_rates = equations.corners * (readings[filtered] - slow)
@@ -108,19 +113,43 @@ def _stretch(
     """Return the readings (length, C) and the states (length, ns) from the sample `begin` on, and the state at the end."""
     equations = _equations(unknowns, samples, scene, x, pair)
     term = diffrax.ODETerm(lambda t, y, args: _rates(samples, jnp.asarray(t), y, args)[0])
-    per_sample, solver = samples.stretches[2], LoopDopri8(tangents=True)
+    per_sample, solver, has_stops = samples.stretches[2], LoopDopri8(tangents=True), side_count(equations.dynamics) > 0
 
-    def sample(y: Array, k: Array) -> tuple[Array, tuple[Array, Array]]:
-        t, h = samples.begin + samples.step * (begin + k), samples.step / per_sample
-        readings = equations.gains * _rates(samples, t, y, equations)[1]
+    def step(t: Array, y: Array, h: Array, dynamics: Dynamics) -> Array:
+        return solver.step(term, t, t + h, y, equations._replace(dynamics=dynamics), None, False)[0]
 
-        def step(i: Array, y: Array) -> Array:
-            return solver.step(term, t + i * h, t + (i + 1) * h, y, equations, None, False)[0]
+    def rates(t: Array, y: Array, _: Array, dynamics: Dynamics) -> Array:
+        return _rates(samples, t, y, equations._replace(dynamics=dynamics))[0]
 
-        return jax.lax.fori_loop(0, per_sample, step, y), (readings, y)
+    def pressing_at(y: Array) -> Array:
+        nd = equations.rows.shape[2]
+        return pressing(equations.dynamics, y[:nd], y[nd : 2 * nd]) if has_stops else jnp.zeros(0, bool)
 
-    end, (readings, states) = jax.lax.scan(sample, start, jnp.arange(length))
+    def sample(state: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        (y, presses), t, h = state, samples.begin + samples.step * (begin + k), samples.step / per_sample
+        now = equations._replace(dynamics=with_pressing(equations.dynamics, presses)) if has_stops else equations
+        readings = equations.gains * _rates(samples, t, y, now)[1]
+        if samples.guide is not None:
+            y = y + jnp.where(jnp.any(presses), 0.0, samples.guide @ _innovation(samples, begin + k, readings))
+            presses = pressing_at(y)
+
+        def advance(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+            if has_stops:
+                return switched_step(step, rates, equations.dynamics, t + i * h, state[0], state[1], h)
+            return step(t + i * h, state[0], h, equations.dynamics), state[1]
+
+        return jax.lax.fori_loop(0, per_sample, advance, (y, presses)), (readings, y)
+
+    (end, _), (readings, states) = jax.lax.scan(sample, (start, pressing_at(start)), jnp.arange(length))
     return readings, states, end
+
+
+def _innovation(samples: Samples, k: Array, readings: Array) -> Array:
+    """Return the differences (C,), recorded readings minus `readings`, at the sample k; 0 for readings that do not count."""
+    recorded, weights = (each.reshape(-1, each.shape[2]) for each in (samples.readings, samples.weights))
+    used = weights > 0.0
+    mean = jnp.sum(jnp.where(used, recorded, 0.0), axis=0) / jnp.maximum(jnp.sum(used, axis=0), 1)
+    return jnp.where(used[k], recorded[k] - mean - readings, 0.0)
 
 
 @cached

@@ -146,11 +146,15 @@ class Stop(_Support):
         self.side = side
         self.platform, self.position = _read_place(Stop, self.kind, platform, position)
 
-    def _penetration(self, displacement: Array) -> tuple[Array, Array]:
-        """Return the penetration beyond the gap (negative without contact), and its direction (k,)."""
+    def penetration(self, displacement: Array, side: Side | None = None) -> tuple[Array, Array]:
+        """Return the penetration beyond the gap, m (negative without contact), and its direction (k,).
+
+        **Arguments**: `displacement` (k,), m; `side` of the stop (default: that on which the displacement is).
+        """
         if displacement.shape[0] == 1:
             x = displacement[0]
-            sign = {"above": jnp.ones_like(x), "below": -jnp.ones_like(x)}.get(self.side, jnp.where(x < 0.0, -1.0, 1.0))
+            signs = {"above": jnp.ones_like(x), "below": -jnp.ones_like(x)}
+            sign = signs.get(side or self.side, jnp.where(x < 0.0, -1.0, 1.0))
             return sign * x - self.gap, sign[None]
         square = jnp.sum(displacement**2)
         distance = jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
@@ -172,7 +176,7 @@ class Stop(_Support):
 
     def energy(self, displacement: Array) -> Array:
         """Return k (x - gap)^2 / 2 beyond the gap, J, at the `displacement` (k,), m."""
-        penetration, _ = self._penetration(displacement)
+        penetration, _ = self.penetration(displacement)
         return 0.5 * self.stiffness * jnp.maximum(penetration, 0.0) ** 2
 
     def resistance(self, displacement: Array, velocity: Array) -> Array:
@@ -180,6 +184,6 @@ class Stop(_Support):
 
         A stop never pulls.
         """
-        penetration, direction = self._penetration(displacement)
+        penetration, direction = self.penetration(displacement)
         closing = self.damping * jnp.sum(direction * velocity)
         return jnp.where(penetration > 0.0, jnp.maximum(closing, -self.stiffness * penetration), 0.0) * direction

@@ -11,7 +11,7 @@ import time
 import jax
 import numpy as np
 
-from repeated_records.fits import CASES, JAMMED_CASES, repeated
+from repeated_records.fits import CASES, JAMMED_CASES, SUPPORT_CASES, repeated
 
 
 def main(count: int, names: list[str]) -> None:
@@ -21,7 +21,7 @@ def main(count: int, names: list[str]) -> None:
     )
     for name in names:
         begin = time.process_time()
-        found = repeated(count, **(CASES | JAMMED_CASES)[name])
+        found = repeated(count, **(CASES | JAMMED_CASES | SUPPORT_CASES)[name])
         print(f"| {name} | {found.row} |", flush=True)
         counts = zip(*np.unique(found.statuses, return_counts=True), strict=True)
         print(f"  {time.process_time() - begin:.0f} s of the processor; {', '.join(f'{n} {name}' for name, n in counts)}")
@@ -30,4 +30,4 @@ def main(count: int, names: list[str]) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main(int(sys.argv[1]), sys.argv[2:] or [*CASES, *JAMMED_CASES])
+    main(int(sys.argv[1]), sys.argv[2:] or [*CASES, *JAMMED_CASES, *SUPPORT_CASES])

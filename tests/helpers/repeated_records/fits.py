@@ -11,7 +11,7 @@ import numpy as np
 from run_ups_by_scipy import TRUTH, accelerations, bound, motor_run_up, ramp, record, scene_of
 
 import jaxvib as jv
-from repeated_records import jammed
+from repeated_records import jammed, supports
 
 TIMES = 0.016 * np.arange(1000)
 NOISE, JAMMED_NOISE = 0.05, 0.2
@@ -38,6 +38,13 @@ JAMMED_CASES = {
     "two jammed balls, 2 % outliers": {"balls": True, "outliers": 0.02},
     "two jammed balls, readings clipped at 60 %": {"balls": True, "full_scale": 0.6},
 }
+
+SUPPORT_CASES = {"stop": {"support": "stop"}, "cubic support": {"support": "cubic"}}
+"""Cases of `repeated_records.supports`."""
+
+FACTORS = {"stop[0].gap": 1.2, "stop[0].stiffness": 1.3, "cubic": 1.3, "stiffness": 1.1, "damping": 1.5}
+JAMMED_FACTORS = {"stiffness": 1.05, "damping": 1.3, "loads.mass": 1.1, "drag": 1.2}
+"""Factors on the first values; the first word in the name of a number counts."""
 
 
 @dataclasses.dataclass
@@ -86,8 +93,8 @@ def run_up(motor):
     return motor_run_up(TIMES, TRUTH) if motor else (accelerations(TIMES, [TRUTH])[0], ramp)
 
 
-def repeated(count, seed=0, motor=False, balls=False, **options):
-    """Return the fits of `count` records from stiffnesses 10 % off and dampings 50 % off, in random directions.
+def repeated(count, seed=0, motor=False, balls=False, support=None, **options):
+    """Return the fits of `count` records from stiffnesses 10 % off and dampings 50 % off, in random directions, see `FACTORS`.
 
     In records of jammed balls, the mass and the drag of the balls are 10 % and 20 % off, the dampings 30 %, and the stiffnesses
     5 %.
@@ -96,15 +103,17 @@ def repeated(count, seed=0, motor=False, balls=False, **options):
     if "full_scale" in options:
         options = options | {"full_scale": options["full_scale"] * np.max(np.abs(clean))}
     truth, scene = (jammed.TRUTH, jammed.scene_of) if balls else (TRUTH, scene_of)
-    names = (*NAMES, "loads.mass", "loads.drag") if balls else NAMES
-    factor = (
-        {"stiffness": 1.05, "damping": 1.3, "loads.mass": 1.1, "drag": 1.2} if balls else {"stiffness": 1.1, "damping": 1.5}
-    )
+    names, factor = ((*NAMES, "loads.mass", "loads.drag"), JAMMED_FACTORS) if balls else (NAMES, FACTORS)
+    if support:
+        truth, scene = supports.truth(support), supports.scene_of
+        names = [*NAMES, *(name for name in truth if name.startswith("effects"))]
     away, relative, statuses, order = [], [], [], ()
     for k in range(count):
         rng = np.random.default_rng([seed, k])
         if balls:
             run = jammed.jammed_record(JAMMED_NOISE, rng, **options)
+        elif support:
+            run = supports.support_record(support, NOISE, rng, **options)
         else:
             run = record(TIMES, clean, NOISE, rng, turning=turning, **options)
         first = {
@@ -119,7 +128,10 @@ def repeated(count, seed=0, motor=False, balls=False, **options):
         statuses.append(fit.status_name)
         order = fit.names
     options.pop("full_scale", None)
-    least = jammed.bound(order, JAMMED_NOISE, **options) if balls else _bound(turning, **options)
+    if support:
+        least = supports.bound(support, order, NOISE)
+    else:
+        least = jammed.bound(order, JAMMED_NOISE, **options) if balls else _bound(turning, **options)
     return Repeated(np.array(away), np.array(relative), least, np.array(statuses))
 
 

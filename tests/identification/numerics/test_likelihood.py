@@ -152,7 +152,7 @@ def test_states_of_loads_follow_the_quadratic_form(monkeypatch, bend, expected):
 
     monkeypatch.setattr(likelihood, "project", cost)
     monkeypatch.setattr(likelihood, "minimize", lambda *_: (SimpleNamespace(cost=4.0),))
-    monkeypatch.setattr(likelihood, "columns_with_loads", lambda *_: [np.zeros((3, 6))])
+    monkeypatch.setattr(likelihood, "nonlinear_columns", lambda *_: [np.zeros((3, 6))])
     monkeypatch.setattr(_Profile, "_in_valley", lambda self, problem, x, linear: (x, linear))
     monkeypatch.setattr(likelihood, "in_polar_unbalances", lambda _: (0.75 * matrix, 0.25 * matrix, np.array([0.05])))
     rises, rise = [], _Profile.rise
@@ -174,7 +174,7 @@ def test_steps_lead_into_a_curved_valley(monkeypatch):
         return np.array([20.0 * (linear[0] - x[0] - x[0] ** 2), 20.0 * (linear[1] + x[1] - 0.4 * x[0] ** 2), x[0], x[1], 0.0])
 
     slopes = np.array([[20.0, 0.0, -20.0, 0.0], [0.0, -20.0, 0.0, -20.0], [-1.0, 0, 0, 0], [0, -1.0, 0, 0], [0, 0, 0, 0]])
-    monkeypatch.setattr(likelihood, "differences_with_loads", differences)
+    monkeypatch.setattr(likelihood, "nonlinear_differences", differences)
     prior = np.diag([1e6, 0.0, 0.0, 0.0])
     monkeypatch.setattr(likelihood, "known_cost", lambda problem, x, linear: 1e6 * (x[0] - 0.5) ** 2)
     monkeypatch.setattr(

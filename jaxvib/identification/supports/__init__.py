@@ -1,0 +1,1 @@
+"""Fits of machines on nonlinear supports, such as stops."""

@@ -1,0 +1,210 @@
+"""Steps of a motion that end where a stop begins or ceases to press.
+
+A side of a stop presses if its penetration p and its force k p + c p' are positive. Both numbers together are the switch
+s = min(p, k p + c p'). Between two changes of the sign of a switch the equations are smooth, and a step of order 8 is accurate.
+A change at the time t has the derivative
+
+    dt = -ds / s',      ds: change of s at a constant time
+
+so that derivatives of a motion with stops are exact, also if the force of a damper makes the accelerations jump.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from jaxvib.equations.dynamics import Dynamics
+from jaxvib.machine.carrier import Machine
+from jaxvib.machine.effects.base import Effect
+from jaxvib.machine.effects.supports import Side, Stop
+from jaxvib.machine.effects.terms import SupportForce, Term
+
+_MAX_SWITCHES = 16
+"""Largest number of changes in a step; the rest of the step is then computed without further changes."""
+
+_MAX_TRIALS, _ACCURACY = 60, 1e-13
+"""Largest number of trials for the time of a change, and its error relative to the length of the step."""
+
+_NEAR_TURN, _MIN_SHARE = 0.2, 0.02
+"""Distance of a turning point from a stop, relative to the rise before it, below which the step ends at the turning point, and
+smallest part of a step."""
+
+Step = Callable[[Array, Array, Array, Dynamics], Array]
+"""Function that returns the state after a step from a time, a state and a length of the step, by equations."""
+
+
+class HeldStop(Effect):
+    """Stop of which each side presses or not, as stated, at every displacement. Its force is smooth.
+
+    **Attributes**: `stop`; `presses` (s,): 1 for each of its `sides` that presses, otherwise 0.
+    """
+
+    stop: Stop
+    presses: Array
+    sides: tuple[Side, ...] = eqx.field(static=True)
+    kind: str = eqx.field(static=True, default="held_stop", kw_only=True)
+
+    def terms(self) -> tuple[Term, ...]:
+        """Return the force of spring and damper."""
+        return (SupportForce(self.stop.rows, self.energy, self.resistance, is_smooth=True),)
+
+    def penetrations(self, displacement: Array) -> Array:
+        """Return the penetration (s,) of each side, m, at the `displacement` (k,), m."""
+        return jnp.stack([self.stop.penetration(displacement, side)[0] for side in self.sides])
+
+    def energy(self, displacement: Array) -> Array:
+        """Return the energy of the sides that press, J."""
+        return 0.5 * self.stop.stiffness * jnp.sum(self.presses * self.penetrations(displacement) ** 2)
+
+    def resistance(self, displacement: Array, velocity: Array) -> Array:
+        """Return the force (k,) of the dampers of the sides that press, N."""
+        rates, back = jax.jvp(self.penetrations, (displacement,), (velocity,))[1], jax.vjp(self.penetrations, displacement)[1]
+        return self.stop.damping * back(self.presses * rates)[0]
+
+
+def held(effect: Effect, machine: Machine) -> Effect:
+    """Return a stop as a `HeldStop` that does not press, and any other effect unchanged."""
+    if not isinstance(effect, Stop):
+        return effect
+    sides: tuple[Side, ...] = ("above", "below") if effect.side == "both" and len(effect.rows(machine)) == 1 else (effect.side,)
+    return HeldStop(effect, jnp.zeros(len(sides)), sides)
+
+
+def _effects(dynamics: Dynamics) -> list[HeldStop]:
+    return [effect for effect in dynamics.exciters[0].effects if isinstance(effect, HeldStop)]
+
+
+def side_count(dynamics: Dynamics) -> int:
+    """Return the number of sides of all stops."""
+    return sum(len(stop.sides) for stop in _effects(dynamics))
+
+
+def penetrations(dynamics: Dynamics, q: Array, v: Array) -> tuple[Array, Array, Array]:
+    """Return the penetrations (s,) of all sides, m, their rates (s,), and the switches (s,).
+
+    **Arguments**: `q` and `v` (nd,): displacements and velocities of the coordinates.
+    """
+    found, effects = [], dynamics.exciters[0].effects
+    placed = [effect for effect in effects for term in effect.terms() if isinstance(term, SupportForce)]
+    for effect, support in zip(placed, dynamics.supports, strict=True):
+        if isinstance(effect, HeldStop):
+            depth, rate = jax.jvp(effect.penetrations, (support.rows @ q,), (support.rows @ v,))
+            force = effect.stop.stiffness * depth + effect.stop.damping * rate
+            found.append((depth, rate, jnp.minimum(depth, force)))
+    depths, rates, switches = (jnp.concatenate(each) for each in zip(*found, strict=True))
+    return depths, rates, switches
+
+
+def pressing(dynamics: Dynamics, q: Array, v: Array) -> Array:
+    """Return True (s,) for each side of a stop that presses."""
+    return penetrations(dynamics, q, v)[2] > 0.0
+
+
+def with_pressing(dynamics: Dynamics, presses: Array) -> Dynamics:
+    """Return the equations in which the sides `presses` (s,) press."""
+    sizes = [len(stop.sides) for stop in _effects(dynamics)]
+    ends = [sum(sizes[: k + 1]) for k in range(len(sizes))]
+    parts = [presses[end - size : end].astype(float) for end, size in zip(ends, sizes, strict=True)]
+
+    def places(dynamics: Any) -> list[Array]:
+        (group,) = dynamics.groups
+        return [effect.presses for effect in group.part.effects if isinstance(effect, HeldStop)]
+
+    return eqx.tree_at(places, dynamics, parts)
+
+
+def switched_step(
+    step: Step, rates: Step, dynamics: Dynamics, t: Array, y: Array, presses: Array, h: Array
+) -> tuple[Array, Array]:
+    """Return the state after the time `h`, and the sides of stops that press then.
+
+    **Arguments**: `step`; `rates`: function of the same arguments, which returns the rates of the state; the time `t`; the
+    state `y`, whose first entries are displacements and velocities; the sides `presses` (s,) that press.
+    """
+    nd = dynamics.stiffness_per_mass.shape[0]
+
+    def wrong(y: Array, presses: Array, dynamics: Dynamics) -> Array:
+        """Return the switches (s,), positive for a side that should press and does not, or the reverse."""
+        return jnp.where(presses, -1.0, 1.0) * penetrations(dynamics, y[:nd], y[nd : 2 * nd])[2]
+
+    def go_on(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        done, y, presses, count = state
+        now, begin, rest = with_pressing(dynamics, presses), t + done, h - done
+        fixed = lax.stop_gradient((begin, y, rest, now))
+        change = _first_change(step, rates, lambda y: wrong(y, presses, fixed[3]), *fixed)
+        start, end = (penetrations(fixed[3], each[:nd], each[nd : 2 * nd]) for each in (fixed[1], change.end))
+        is_switch, turn = change.is_found & (count < _MAX_SWITCHES), _turning(start[:2], end[1], presses, fixed[2])
+        is_turn = ~is_switch & (turn > 0.0) & (count < _MAX_SWITCHES)
+        taken = jnp.where(is_switch, change.length, jnp.where(is_turn, turn, rest))
+        new = step(begin, y, taken, now)
+        values = wrong(new, presses, now)
+        which = jnp.argmax(lax.stop_gradient(values))
+        slope = rates(*lax.stop_gradient((begin + taken, new, taken, now)))
+        rate = jax.jvp(lambda y: wrong(y, presses, fixed[3]), (lax.stop_gradient(new),), (slope,))[1][which]
+        # The correction of the time is 0; its derivative is that of the time of the change.
+        correction = (lax.stop_gradient(values) - values)[which] * jnp.where(is_switch, 1.0 / rate, 0.0)
+        presses = presses ^ (is_switch & (jnp.arange(presses.size) == which))
+        done = jnp.where(is_switch | is_turn, done + taken + correction, h)
+        return done, new + correction * slope, presses, count + 1
+
+    start = jnp.zeros_like(h), y, presses, jnp.asarray(0)
+    _, y, presses, _ = lax.while_loop(lambda state: state[0] < h, go_on, start)
+    return y, presses
+
+
+def _turning(start: tuple[Array, Array], last: Array, presses: Array, h: Array) -> Array:
+    """Return the time after which a side that does not press is nearest to its stop within a step, if it is near the stop then;
+    otherwise 0.
+
+    **Arguments**: penetrations (s,) and their rates at the `start`; the `last` rates (s,); length of the step.
+    """
+    depth, rate = start
+    share = rate / jnp.where(rate == last, 1.0, rate - last)
+    rise = 0.5 * rate * share * h
+    is_near = ~presses & (rate > 0.0) & (last < 0.0) & (depth + (1.0 + _NEAR_TURN) * rise > 0.0)
+    is_near &= (share > _MIN_SHARE) & (share < 1.0 - _MIN_SHARE)
+    return jnp.min(jnp.where(is_near, share, 1.0)) * h * jnp.any(is_near)
+
+
+class _Change(NamedTuple):
+    """First change of a switch within a step, by Newton's method between bounds.
+
+    **Attributes**: `low` and `high`: bounds of its time after the start of the step; `length`: the next trial; `is_final`: True
+    if the search has ended; `is_found`: False if no switch differs at the end of the step; `end`: the state there; `trials`:
+    number of trials.
+    """
+
+    low: Array
+    high: Array
+    length: Array
+    is_final: Array
+    is_found: Array
+    end: Array
+    trials: Array
+
+
+def _first_change(
+    step: Step, rates: Step, wrong: Callable[[Array], Array], t: Array, y: Array, h: Array, dynamics: Dynamics
+) -> _Change:
+    """Return the first change within the time `h`; `wrong`: the switches of a state, positive after a change."""
+
+    def trial(at: _Change) -> _Change:
+        new = step(t, y, at.length, dynamics)
+        values, slopes = jax.jvp(wrong, (new,), (rates(t + at.length, new, at.length, dynamics),))
+        which, is_first = jnp.argmax(values), at.trials == 0
+        is_late = values[which] > 0.0
+        low, high = jnp.where(is_late, at.low, at.length), jnp.where(is_late, at.length, at.high)
+        better = at.length - values[which] / slopes[which]
+        better = jnp.where((better > low) & (better < high), better, 0.5 * (low + high))
+        is_final = (is_first & ~is_late) | (jnp.abs(better - at.length) < _ACCURACY * h) | (at.trials > _MAX_TRIALS)
+        is_found, end = jnp.where(is_first, is_late, at.is_found), jnp.where(is_first, new, at.end)
+        return _Change(low, high, better, is_final, is_found, end, at.trials + 1)
+
+    no = jnp.asarray(False)
+    return lax.while_loop(lambda at: ~at.is_final, trial, _Change(0.0 * h, h, h, no, no, y, jnp.asarray(0)))

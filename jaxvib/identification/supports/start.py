@@ -1,0 +1,112 @@
+"""First values of a motion on nonlinear supports: the records guide the motion.
+
+At each sample, the state of the model is changed by a constant matrix times the difference between recorded and computed
+readings, unless a stop presses. The motion then stays near the recorded one, contacts occur when they occurred in the record,
+and the differences are nearly linear functions of errors of the unknowns. The matrix is that of the Kalman filter of the
+machine without nonlinear supports, whose velocities change at random at each sample.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.identification.fit import Fitted, linear_at, linear_places, minimize, project
+from jaxvib.identification.problem import Problem, channel_sizes, with_noise
+from jaxvib.identification.response import Samples, linear_steps, model_states
+from jaxvib.machine.effects.supports import Stop
+from jaxvib.numerics.noise import Noise
+
+_STRENGTH = 0.3
+"""Standard deviation of the random changes of the velocities at a sample, relative to the largest velocities, for readings with
+errors of their own size."""
+
+_OPEN_GAP = 1.1
+"""First value of a gap that is not touched, relative to the largest displacement."""
+
+_SAME_COST = 1.1
+"""Cost of a motion without contacts, relative to that of one with contacts, below which it is the better one."""
+
+
+def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
+    """Return the problem of a motion on nonlinear supports, in which the first values of the linear unknowns are set, and the
+    first values of x.
+
+    The linear response to the whole records gives the unbalance, and that to their first stretches gives the first states. If a
+    fit of the linear machine explains the records as well as the fit that begins with the guided motion, no stop is touched.
+    """
+    noise = [[Noise(np.ones(1), size) for size in of_run] for of_run in channel_sizes(problem)]
+    weighted, x = with_noise(problem, noise), np.zeros(problem.unknowns.count)
+    alone = [project(weighted._replace(runs=(samples,)), x).linear for samples in weighted.runs]
+    for samples, linear in zip(weighted.runs, alone, strict=True):
+        if samples.turn is not None:
+            place = problem.unknowns.first.shape[0] + len(problem.unknowns.gains) + samples.turn
+            x[place] = math.atan2(linear[1], linear[0]) - math.atan2(alone[0][1], alone[0][0])
+    begins = tuple(_beginning(samples) for samples in weighted.runs)
+    linear = linear_at(weighted._replace(runs=begins), x, project(weighted, x).linear[:2])
+    guides = [jnp.asarray(_guide(weighted, r, x, linear)) for r in range(len(problem.runs))]
+    runs = tuple(dataclasses.replace(samples, guide=guide) for samples, guide in zip(weighted.runs, guides, strict=True))
+    guided = weighted._replace(runs=runs, linear=linear)
+    trial, free = minimize(guided, x)[0], minimize(weighted, x)[0]
+    trial = minimize(weighted._replace(linear=trial.linear), trial.x)[0]
+    free = project(weighted._replace(linear=free.linear), _with_open_stops(weighted, free.x, free.linear))
+    best = free if free.cost < _SAME_COST * trial.cost else trial
+    return problem._replace(linear=best.linear), best.x
+
+
+def _beginning(samples: Samples) -> Samples:
+    """Return the samples, of which only those of the first stretch count."""
+    place = jnp.arange(samples.weights.shape[0] * samples.weights.shape[1]).reshape(samples.weights.shape[:2])
+    weights = jnp.where(place[:, :, None] < samples.stretches[1], samples.weights, 0.0)
+    return dataclasses.replace(samples, weights=weights)
+
+
+def _guide(problem: Problem, r: int, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Return the gain (ns, C) of the Kalman filter of a run."""
+    from scipy.linalg import solve_discrete_are  # slow to import
+
+    parts = problem.unknowns, problem.runs[r], problem.scene, jnp.asarray(x)
+    power, outputs = (np.asarray(each) for each in linear_steps(*parts))
+    states = np.asarray(model_states(*parts, jnp.asarray(linear[linear_places(problem)[r]])))
+    nd, random = states.shape[1] // 2, np.zeros(len(power))
+    random[nd : 2 * nd] = (_STRENGTH * np.max(np.abs(states[: len(problem.raw[r]), nd:]), axis=0)) ** 2
+    noise = np.diag(np.array(channel_sizes(problem)[r]) ** 2)
+    covariance = solve_discrete_are(power.T, outputs.T, np.diag(random), noise)
+    return covariance @ outputs.T @ np.linalg.inv(outputs @ covariance @ outputs.T + noise)
+
+
+def _with_open_stops(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Return x with unknown gaps that are so large that the linear response does not touch the stops.
+
+    A stop that no run touches could also be a very soft one, and a fit from a gap that is too small would find that.
+    """
+    x, names = x.copy(), [number.name for number in problem.unknowns.numbers]
+    paths, nd = [], len(problem.scene.machine.structure().coordinates)
+    for samples, place, raw in zip(problem.runs, linear_places(problem), problem.raw, strict=True):
+        states = model_states(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear[place]))
+        paths.append(states[: len(raw), :nd])
+    stops = [effect for effect in problem.unknowns.scene(problem.scene, x).effects if isinstance(effect, Stop)]
+    for k, stop in enumerate(stops):
+        if (name := f"effects.stop[{k}].gap") in names and float(stop.gap) > 0.0:
+            moved = jnp.concatenate(paths) @ stop.rows(problem.scene.machine).T
+            reach = float(stop.gap + jnp.max(jax.vmap(lambda at, stop=stop: stop.penetration(at)[0])(moved)))
+            x[names.index(name)] += max(math.log(_OPEN_GAP * reach / float(stop.gap)), 0.0) if reach > 0.0 else 0.0
+    return x
+
+
+def untouched_stops(fitted: Fitted) -> Iterator[str]:
+    """Yield sentences about stops whose numbers are unknown and have no influence, because no run touches them."""
+    names = [number.name for number in fitted.problem.unknowns.numbers]
+    influence = np.diagonal(fitted.information)[: len(names)]
+    for k in range(len(fitted.problem.scene.effects)):
+        own = [i for i, name in enumerate(names) if name.startswith(f"effects.stop[{k}].")]
+        if own and not np.any(influence[own] > 0.0):
+            yield (
+                f"effects.stop[{k}] is not touched in the runs, which therefore do not determine its numbers: record a run "
+                "with larger vibrations, or leave them out of `unknown`"
+            )

@@ -1,0 +1,152 @@
+"""Machines on nonlinear supports: motion and derivatives against SciPy and differences, fits, and scenes that are refused."""
+
+import dataclasses
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from repeated_records.fits import NAMES, SUPPORT_CASES, repeated
+from repeated_records.supports import STOP, TIMES, motion, scene_of, support_record, truth
+from run_ups_by_scipy import Ramp
+
+import jaxvib as jv
+from jaxvib.identification.jammed.motion import closed_motion, linearized
+from jaxvib.identification.problem import build_problem
+from jaxvib.identification.supports.contact import HeldStop, held
+
+SHORT = TIMES[:300]
+"""Times of a record that passes the first resonance only."""
+
+LOW_NOISE = 0.005
+"""Standard deviation of the noise of short records, m/s^2."""
+
+
+def unknown(kind):
+    return [*NAMES, *(name for name in truth(kind) if name.startswith("effects"))]
+
+
+def short_record(kind, noise=1e-9, **changes):
+    """Return a record of 4 s, from numbers that differ from the truth by `changes`."""
+    clean = motion(truth(kind) | changes, times=SHORT)
+    return support_record(kind, noise, np.random.default_rng(0), times=SHORT, clean=clean)
+
+
+@functools.cache
+def problem_of(kind):
+    """Return the problem of a short record without noise with the exact angle of the rotor, and the true linear unknowns."""
+    problem = build_problem(scene_of(truth(kind)), [short_record(kind)], unknown(kind), {})
+    drive, end = Ramp(jnp.asarray(100.0)), jnp.asarray(SHORT[-1])
+    samples = dataclasses.replace(problem.runs[0], begin=jnp.zeros(()), end=end, drives=(drive,))
+    own = np.concatenate([np.zeros(4), 0.05 * np.array([np.cos(0.4), np.sin(0.4)]), np.zeros(2)])
+    return problem._replace(runs=(samples,)), own
+
+
+@pytest.mark.parametrize("kind", ["stop", "cubic"])
+def test_motion_is_that_of_scipy(kind):
+    (problem, own), x = problem_of(kind), np.zeros(len(unknown(kind)) + 2)
+    readings, _ = closed_motion(problem.unknowns, problem.runs[0], problem.scene, x[: problem.unknowns.count], own)
+    expected = motion(truth(kind), times=SHORT)
+    n = len(problem.raw[0])
+    assert np.max(np.abs(expected)) > 1.0
+    np.testing.assert_allclose(readings[:n], expected[:n], atol=1e-6)
+
+
+def test_derivatives_against_differences_across_contacts():
+    (problem, own), p = problem_of("stop"), problem_of("stop")[0].unknowns.count
+    parts = problem.unknowns, problem.runs[0], problem.scene
+    x, n = np.zeros(p), len(problem.raw[0])
+    _, starts = closed_motion(*parts, x, own)
+    at = linearized(*parts, x, own, starts)
+    assert np.max(np.abs(at.gaps)) < 1e-10
+    names = [number.name for number in problem.unknowns.numbers]
+    for k in (*map(names.index, STOP), 0, p, p + 3, p + 5):  # numbers, states at the first sample, unbalance
+        step = 1e-6 * np.eye(p + own.size)[k]
+        high, low = (closed_motion(*parts, x + s * step[:p], own + s * step[p:])[0][:n] for s in (1.0, -1.0))
+        slope = (high - low) / 2e-6
+        assert np.max(np.abs(slope)) > 0.1
+        np.testing.assert_allclose(at.columns[:n, :, k], slope, atol=2e-5 * max(1.0, np.max(np.abs(slope))))
+
+
+@pytest.mark.parametrize(
+    ("stop", "machine"),
+    [
+        (jv.Stop(2e5, gap=1e-3, damping=300.0), jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)),
+        (jv.Stop(2e5, gap=1e-3, damping=300.0, side="below"), jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)),
+        (jv.Stop(2e5, gap=1e-3, damping=300.0), jv.planar_rotor(mass=40.0, stiffness=1e6, damping=100.0)),
+    ],
+)
+def test_held_stop_has_the_force_of_the_stop(stop, machine):
+    rng, (term,), frozen = np.random.default_rng(0), stop.terms(), held(stop, machine)
+    assert isinstance(frozen, HeldStop)
+    count, pressed = len(stop.rows(machine)), 0
+    for _ in range(60):
+        x, v = jnp.asarray(1.5e-3 * rng.normal(size=count)), jnp.asarray(rng.normal(size=count))
+        depth, rate = frozen.penetrations(x), (frozen.penetrations(x + 1e-7 * v) - frozen.penetrations(x - 1e-7 * v)) / 2e-7
+        presses = (depth > 0.0) & (stop.stiffness * depth + stop.damping * rate > 0.0)
+        (smooth,) = dataclasses.replace(frozen, presses=presses.astype(float)).terms()
+        np.testing.assert_allclose(smooth.force(x, v), term.force(x, v), atol=1e-4)
+        pressed += int(np.any(presses))
+    assert 5 < pressed < 55
+
+
+FACTORS = {"stop[0].gap": 1.2, "stop[0].stiffness": 1.3, "machine.stiffness": 1.1, "machine.damping": 0.67}
+UNKNOWN = ["machine.stiffness", "machine.damping", "exciters[0].unbalance", "effects.stop[0].stiffness", "effects.stop[0].gap"]
+
+
+def first_scene(factors):
+    """Return the scene with a stop and first values away from the truth."""
+    numbers = truth("stop").items()
+    return scene_of({name: value * next((f for word, f in factors.items() if word in name), 1.0) for name, value in numbers})
+
+
+def test_numbers_of_a_stop_and_the_machine_are_found():
+    run = short_record("stop", LOW_NOISE)
+    fit = jv.identify(first_scene(FACTORS), run, unknown=UNKNOWN)
+    assert fit.status_name == "found"
+    away = [(each.value - truth("stop")[name]) / each.error for name, each in zip(fit.names, fit.estimates, strict=True)]
+    assert np.max(np.abs(away)) < 3.5
+    assert fit.estimate("effects.stop[0].gap").error < 2e-5
+    planned = jv.PlannedRun("again", jv.ConstantSpeed(30.0), 4.0, run.channels, rate=62.5)
+    with pytest.raises(jv.InputError, match=r"effects.stop is a nonlinear support, which plan_runs does not include"):
+        jv.plan_runs(fit, [planned])
+    with pytest.raises(jv.InputError, match=r"effects.stop is a nonlinear support, which predict_run does not include"):
+        jv.predict_run(fit, run)
+
+
+def test_stop_that_no_run_touches_is_not_determined():
+    """The first value of the gap is so small that the model touches the stop."""
+    run = short_record("stop", LOW_NOISE, **{"effects.stop[0].gap": 1.0})
+    fit = jv.identify(scene_of(truth("stop")), run, unknown=UNKNOWN)
+    assert fit.status_name == "undetermined"
+    lost = [name for name, each in zip(fit.names, fit.estimates, strict=True) if not np.isfinite(each.error)]
+    assert lost == ["effects.stop[0].stiffness", "effects.stop[0].gap"]
+    assert any(note.startswith("effects.stop[0] is not touched in the runs, which therefore do not") for note in fit.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SUPPORT_CASES)
+def test_intervals_hold_the_truth_with_supports(name):
+    found = repeated(6, **SUPPORT_CASES[name])
+    assert not np.any(found.wrong) and found.statuses.tolist() == ["found"] * 6
+    assert np.mean(np.abs(found.away) < 1.96) > 0.85
+    assert np.sqrt(np.mean(found.ratio**2)) < 1.3
+
+
+def refused(scene, words, names=("machine.stiffness",), channels=()):
+    run = short_record("stop", LOW_NOISE)
+    for channel in channels:
+        same = {name: getattr(run, name) | {channel.name: getattr(run, name)["a1"]} for name in ("times", "values", "clipped")}
+        run = dataclasses.replace(run, channels=(*run.channels, channel), **same)
+    with pytest.raises(jv.InputError, match=words):
+        jv.identify(scene, run, unknown=names)
+
+
+def test_scenes_with_supports_that_are_not_included_are_refused():
+    scene = scene_of(truth("stop"))
+    balls = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
+    refused(jv.Scene(scene.machine, balls, scene.exciter.drive, scene.effects), "effects.stop is a nonlinear support; identify")
+    several = [scene.exciter, jv.Exciter(drive=jv.ConstantSpeed(50.0), unbalance=0.1)]
+    refused(jv.Scene(scene.machine, exciters=several, effects=scene.effects), "needs a scene with one exciter without loads")
+    refused(scene, "effects.stop presses on the foundation", channels=(jv.Channel("f", "force", direction="up"),))
+    refused(scene, "of a scene with linear supports and one exciter without loads can be unknown", names=["drive.inertia"])
