@@ -248,12 +248,13 @@ def test_foreign_vibration_in_words(monkeypatch, fits, share, order, size, words
     samples = SimpleNamespace(channels=(channel("a"),), step=0.5)
     angles = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
     problem = SimpleNamespace(unbalances=(None,), runs=[samples], raw=[raw], masks=[mask], angles=[angles], has_loads=False)
+    problem.linear = None
     fitted = SimpleNamespace(problem=problem, residuals=[left])
     found = list(checks._foreign_vibrations(fitted, fits))
     assert (found == []) == (words == "") and all(words in each for each in found)
     problem.unbalances = (None, None)
     assert list(checks._foreign_vibrations(fitted, fits)) == []
-    problem.unbalances, problem.has_loads = (None,), True  # loads vibrate at other speeds than the rotor
+    problem.unbalances, problem.has_loads, problem.linear = (None,), True, np.zeros(1)  # loads turn at other speeds
     found = list(checks._foreign_vibrations(fitted, fits))
     assert (found == []) == (words == "" or not fits) and all("the motion of the loads is not that" in each for each in found)
 
