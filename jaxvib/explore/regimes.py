@@ -147,14 +147,24 @@ def _working_regimes(scene: Scene, factors: Array) -> _Curves:
     return jax.vmap(at)(factors)
 
 
+_latest: list[tuple[Scene, list[SynchronousRegime]]] = []
+"""Scene of the last call of `regimes_of` and its regimes, because the text and the sketch of one page need the same regimes."""
+
+
 def regimes_of(scene: Scene) -> list[SynchronousRegime]:
     """Return the regimes that the page lists, the stable ones first: all for one or two exciters, otherwise the working
     regime. The list is empty if there is no regime."""
+    for latest, regimes in _latest:
+        if latest is scene:
+            return regimes
     if len(scene.exciters) > _MAX_LISTED:
         regime = jax.device_get(working_regime(scene, throw=False))
-        return [regime] if np.isfinite(regime.speed) else []
-    found = jax.device_get(synchronous_regimes(scene))
-    return [found.select(k) for k in range(found.speed.shape[0])]
+        regimes = [regime] if np.isfinite(regime.speed) else []
+    else:
+        found = jax.device_get(synchronous_regimes(scene))
+        regimes = [found.select(k) for k in range(found.speed.shape[0])]
+    _latest[:] = [(scene, regimes)]
+    return regimes
 
 
 def deck_points(scene: Scene) -> list[tuple[float, float]]:

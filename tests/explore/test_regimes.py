@@ -12,7 +12,7 @@ import svg_charts
 
 import jaxvib as jv
 from jaxvib.draw.style import COLORS
-from jaxvib.explore import pictures
+from jaxvib.explore import pictures, regimes
 from jaxvib.explore.pictures import SceneOrProblem
 from jaxvib.explore.regimes import deck_points, regime_chart, regimes_of
 from jaxvib.explore.sliders import scene_at, sliders_of, typed_value
@@ -181,3 +181,13 @@ def test_the_page_of_a_screen_follows_its_sliders(linear, tmp_path, monkeypatch)
     moved = scene_at(linear, {**found["controls"].value, "exciters[1].unbalance": 2.28})
     assert float(regimes_of(moved)[0].amplitude[1]) < 0.8 * float(regimes_of(linear)[0].amplitude[1])
     assert pictures.toml(SceneOrProblem(moved, "")) != pictures.toml(SceneOrProblem(linear, ""))
+
+
+def test_text_and_sketch_of_a_page_share_one_search(circular, monkeypatch):
+    scene, calls = scene_at(circular, {"exciters[0].unbalance": sliders_of(circular)[1].steps[3]}), []
+    monkeypatch.setattr(regimes, "synchronous_regimes", lambda each: calls.append(each) or jv.synchronous_regimes(each))
+    pictures.readings(scene)
+    pictures.machine(scene, None)
+    assert len(calls) == 1 and calls[0] is scene
+    pictures.readings(circular)
+    assert len(calls) == 2
