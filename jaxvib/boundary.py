@@ -37,6 +37,7 @@ _EXAMPLES = {
     "Drive": "for example ConstantSpeed('1500 rpm')",
     "Effect": "for example Gravity()",
     "Scene": "for example load_scene('machine.toml')",
+    "Vibration": "for example regime.vibration() or run.vibration()",
     "State": "for example initial_state(scene)",
     "Quantity": "for example foundation_force(mode=3)",
     "DesignSpace": "for example DesignSpace(scene, free={'machine.stiffness': (1e4, 1e5)})",

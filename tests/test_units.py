@@ -1,6 +1,7 @@
 """Numbers with units."""
 
 import datetime
+import re
 
 import jax
 import jax.numpy as jnp
@@ -129,13 +130,22 @@ def test_a_speed_must_say_what_it_counts(text):
         to_float("5 percent", "rad", "separation")
 
 
-def test_a_decimal_comma_has_its_own_message():
-    with pytest.raises(
-        jv.InputError,
-        match=r"'1,5 N/m', with a comma; write '1\.5 N/m' if it is a decimal "
-        r"comma, otherwise '15 N/m'",
-    ):
-        to_float("1,5 N/m", "N/m", "machine.stiffness")
+@pytest.mark.parametrize(
+    ("text", "advice"),
+    [
+        ("1,5 N/m", "write '1.5 N/m'"),
+        ("600,0", "write '600.0'"),
+        ("1,500 N/m", "write '1.500 N/m' if it is a decimal comma, otherwise '1500 N/m'"),
+    ],
+)
+def test_a_decimal_comma_has_its_own_message(text, advice):
+    with pytest.raises(jv.InputError, match=f"'{text}', with a comma; {re.escape(advice)}$"):
+        to_float(text, "N/m", "machine.stiffness")
+
+
+@pytest.mark.parametrize("text", ["4 x 55 N/mm", "4*55 N/mm", "4 × 55 N/mm"])
+def test_equal_springs_side_by_side_add(text):
+    assert to_float(text, "N/m", "machine.stiffness") == 220e3
 
 
 @pytest.mark.parametrize(

@@ -90,6 +90,9 @@ _KEY = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
 _LONG_KEY = re.compile(rf"(?<![\w\"'.-]){_KEY}(?:[ \t]*\.[ \t]*{_KEY}){{16}}")
 """A dotted key of more than 16 names; the time of `tomllib` is proportional to the square of their number."""
 
+_DECIMAL_COMMA = re.compile(r"^[^#\n]*=\s*[+-]?\d+,\d", re.MULTILINE)
+"""A number with a decimal comma, which TOML does not read."""
+
 
 def read_toml(path: str | Path) -> Tables:
     """Return the tables of a TOML file.
@@ -113,7 +116,8 @@ def _tables(text: str, name: str) -> Tables:
     except RecursionError as error:
         raise InputError(name, too_deep) from error
     except ValueError as error:  # not TOML, or a number with more digits than Python reads
-        raise InputError(name, f"is not a TOML file: {error}") from error
+        hint = "; write decimals with a point, not with a comma" if _DECIMAL_COMMA.search(text) else ""
+        raise InputError(name, f"is not a TOML file: {error}{hint}") from error
     return tables
 
 
@@ -132,28 +136,36 @@ def _require_plain(value: object, name: str) -> None:
 
 _MARKS = {
     "scene": (*SECTIONS, "effects", "exciters"),
-    "design": ("free", "choices", "objective", "search"),
-    "study": ("axes", "measure"),
+    "design": ("free", "choices", "objective", "search", "recipe"),
+    "study": ("axes", "measure", "run"),
+    "identification": ("machine", "run", "channel", "identify"),
     "measurement": ("record", "pendulum", "identify"),
 }
 """Names that identify each kind of file."""
+
+_COMMANDS = {"design": "optimize", "study": "sweep", "identification": "identify", "measurement": "identify"}
+"""Commands that take a file, by its kind."""
 
 
 def misplaced_name(name: str, tables: Tables, kind: str, allowed: list[str]) -> InputError:
     """Return the error for an unknown `name` in a file of a `kind`.
 
-    The error suggests a similar name or, if the tables are those of another kind of file, states that kind.
+    The error suggests a similar name or, if more names of the file belong to another kind of file, states that kind.
 
     >>> str(misplaced_name("machine", {"machine": {}}, "design", ["free"])).split(";")[0]
-    'machine is not part of a design file: this is a scene file'
+    'machine is not part of a design file: this is a scene file, for commands such as modes and regimes'
     """
-    other = next((each for each, marks in _MARKS.items() if each != kind and any(mark in tables for mark in marks)), None)
-    if other is None or any(mark in tables for mark in _MARKS[kind]):
-        return InputError(name, f"is not part of a {kind} file; {suggest_name(name, allowed)}")
-    if kind == "scene":
-        return InputError(name, f"is not part of a scene file: this is a {other} file; give the scene file that it refers to")
-    new = "sweep" if kind == "study" else kind
-    return InputError(name, f"is not part of a {kind} file: this is a {other} file; `jaxvib new {new}` prints a {kind} file")
+    present = {each: sum(mark in tables for mark in marks) for each, marks in _MARKS.items()}
+    found = max(present, key=lambda each: (present[each], each == kind))
+    own, other = (f"{'an' if each == 'identification' else 'a'} {each} file" for each in (kind, found))
+    if found == kind or not present[found]:
+        is_outside = kind == "scene" and not isinstance(tables[name], (Mapping, list))
+        advice = "write it below the head of its table, such as [machine]" if is_outside else suggest_name(name, allowed)
+        return InputError(name, f"is not part of {own}; {advice}")
+    taken = f"`jaxvib {_COMMANDS[found]}`" if found in _COMMANDS else "commands such as modes and regimes"
+    new = f"`jaxvib new {'sweep' if kind == 'study' else kind}` prints {own}"
+    advice = "give the scene file that it refers to" if kind == "scene" else new
+    return InputError(name, f"is not part of {own}: this is {other}, for {taken}; {advice}")
 
 
 @validated
@@ -260,7 +272,8 @@ def scene_from_tables(tables: Tables) -> Scene:
     for name in ("machine",) if several else SECTIONS:
         if name not in tables:
             instead = ", or [[exciters]] with an unbalance if it has no loads" if name == "loads" else ""
-            raise InputError(name, f"is missing; a scene file needs the table [{name}]{instead}")
+            kinds = f" with kind, one of {', '.join(SECTIONS[name])}; `jaxvib new` prints examples" if name == "machine" else ""
+            raise InputError(name, f"is missing; a scene file needs the table [{name}]{instead}{kinds}")
         parts[name] = build_kind(tables[name], name, SECTIONS[name])
     for name in ("loads", "drive") if several else ():
         if name in tables:

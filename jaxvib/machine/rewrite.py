@@ -9,10 +9,11 @@ from collections.abc import Sequence
 
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
+from jaxvib.units.reading import SEVERAL
 
 _TABLE = re.compile(r"\s*\[(\[?)([\w.]+)\]")
 _ENTRY = re.compile(r"(\s*(\w+)\s*=\s*)((?:[^\"'#]|\"[^\"]*\"|'[^']*')*?)(\s*)(#\s*(.*))?")
-_NUMBER_AND_UNIT = re.compile(r"\s*((?:\d{1,4}\s*[x×]\s*)?)([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)")
+_NUMBER_AND_UNIT = re.compile(rf"\s*((?:{SEVERAL})?)([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)")
 
 _RELATIVE = re.compile(r"%|\bloss\b")
 """Pattern of a damping that is given as a ratio or a loss factor."""

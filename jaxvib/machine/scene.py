@@ -222,7 +222,10 @@ class Scene(Part):
         shared = tuple(effect for effect in effects if _acts_on_machine(effect))
         rotating = tuple(effect for effect in effects if not _acts_on_machine(effect))
         if exciters is None:
-            _require_part("loads", loads, Loads, "balls(...)")
+            if not isinstance(loads, Loads):
+                field, start = ("exciters", "are missing") if loads is None else ("loads", f"is {quoted(loads)}, no Loads")
+                example = 'exciters=[Exciter(drive=ConstantSpeed("1500 rpm"), unbalance="1 kg m")]'
+                raise InputError(field, f"{start}; give {example}, or loads and a drive")
             exciters = (Exciter(loads, drive, effects=rotating),)
         else:
             exciters = _read_exciters(exciters, loads, drive, rotating)

@@ -35,13 +35,18 @@ _TEXT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(\s*[^\W\d_]|\s+
 """Pattern of one number (with a point, not a comma, before decimals), then one unit, which may begin with "1/". Other texts
 are refused as mistakes, even if pint could evaluate them."""
 
-_SEVERAL = re.compile(r"(\d{1,4})\s*[x×]\s*(\S.*)")
-"""Pattern of several equal parts side by side, such as "4 x 50 N/mm"."""
+SEVERAL = r"\d{1,4}\s*[x×*]\s*"
+"""Pattern of the number of equal parts side by side, such as "4 x " in "4 x 50 N/mm"."""
+
+_SEVERAL = re.compile(rf"({SEVERAL})(\S.*)")
 
 _ADDED = ("N/m", "N s/m", "kg", "kg m")
 """Units of values that add if equal parts are side by side."""
 
 _COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*(?:[^\W\d_%°][^,;()]*)?")
+
+_THOUSANDS = re.compile(r"[+-]?\d{1,3},\d{3}(?!\d)")
+"""Pattern of a number whose comma can separate thousands."""
 
 _SPELLINGS = {
     **dict.fromkeys(("RPM", "Rpm", "r/min", "U/min", "rev/min"), "rpm"),
@@ -126,14 +131,13 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         text = value.strip()
         several = _SEVERAL.fullmatch(text) if unit in _ADDED and len(text) < 100 else None
         if several is not None and _SEVERAL.fullmatch(several[2]) is None:
-            return int(several[1]) * to_float(several[2], unit, field)
+            return int(several[1].rstrip("x×* \t")) * to_float(several[2], unit, field)
         parts = _TEXT.fullmatch(text) if len(text) < 100 else None
         if parts is None:
             if len(text) < 100 and _COMMA.fullmatch(text):
                 point, none = quoted(text.replace(",", ".")), quoted(text.replace(",", ""))
-                raise InputError(
-                    field, f"is {quoted(value)}, with a comma; write {point} if it is a decimal comma, otherwise {none}"
-                )
+                thousands = f" if it is a decimal comma, otherwise {none}" if _THOUSANDS.match(text) else ""
+                raise InputError(field, f"is {quoted(value)}, with a comma; write {point}{thousands}")
             raise _wrong_unit(value, unit, field)
         magnitude, written = float(parts[1]), (parts[2] + parts[3]).strip()
         factor = _FACTORS.get(unit, {}).get("rpm" if written in _PER_MINUTE else _SPELLINGS.get(written, written))

@@ -292,6 +292,8 @@ WRONG = [
     (('kind = "two_mass"', 'kind = "two-mass"'), "machine.kind is 'two-mass'; did you mean 'two_mass'"),
     (("[machine]", "[machin]"), "machin is not part of a scene file; did you mean 'machine'"),
     (("[machine]", "[machine"), "is not a TOML file"),
+    (("drag = 1.5", "drag = 1,5"), "; write decimals with a point, not with a comma"),
+    (("[machine]", "mass = 5.0\n[machine]"), "mass is not part of a scene file; write it below the head of its table"),
 ]
 
 
@@ -322,13 +324,25 @@ def test_wrong_scene_files_exit_2_with_a_clear_error(typed, tmp_path, change, sa
         (("simulate", "machine.toml", "--until", "1s", "--start", "jam", "--mode", "1"), 1, "does not exist at rotor speed"),
         (("simulate", "machine.toml", "--until", "9s", "--max-steps", "50"), 1, "max_steps_reached"),
         (("simulate", "machine.toml", "--until", "1s", "--step-tolerance", "1e-30"), 2, "--step-tolerance is 1e-30"),
-        (("optimize", "machine.toml"), 2, "machine is not part of a design file: this is a scene file; `jaxvib new design`"),
-        (("modes", "design.toml"), 2, "scene is not part of a scene file: this is a design file; give the scene file"),
+        (("optimize", "machine.toml"), 2, "this is a scene file, for commands such as modes and regimes; `jaxvib new design`"),
+        (("modes", "design.toml"), 2, "this is a design file, for `jaxvib optimize`; give the scene file"),
+        (("modes", "recipe.toml"), 2, "scene is not part of a scene file: this is a design file, for `jaxvib optimize`"),
+        (("modes", "fit.toml"), 2, "run is not part of a scene file: this is an identification file, for `jaxvib identify`"),
+        (("optimize", "fit.toml"), 2, "this is an identification file, for `jaxvib identify`; `jaxvib new design`"),
+        (("identify", "machine.toml"), 2, "loads is not part of an identification file: this is a scene file"),
+        (("modes", "empty.toml"), 2, "machine is missing; a scene file needs the table [machine] with kind, one of one_mass"),
         (("new", "four-mass"), 2, "four-mass"),
     ],
 )
 def test_failures_have_an_exit_code_and_a_clear_error(typed, tmp_path, words, code, says):
-    (tmp_path / "design.toml").write_text('scene = "machine.toml"\n[free]\n')
+    files = {
+        "design": 'scene = "machine.toml"\n[free]\n',
+        "recipe": 'scene = "machine.toml"\n[recipe]\n',
+        "fit": '[machine]\nfile = "machine.toml"\n[[run]]\n[[channel]]\n[identify]\n',
+        "empty": "",
+    }
+    for name, text in files.items():
+        (tmp_path / f"{name}.toml").write_text(text)
     got, out, err = typed(*words)
     assert (got, out) == (code, "")
     assert says in err and err.count("\n") == 1

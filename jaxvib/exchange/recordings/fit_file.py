@@ -12,7 +12,7 @@ from jaxvib.identification.further_runs.planned import PlannedRun
 from jaxvib.identification.problem import MOTIONS
 from jaxvib.identification.records.channel import Channel
 from jaxvib.identification.run import MeasuredRun
-from jaxvib.machine.files import DRIVES, Tables, build_kind, build_part, load_scene, suggest_name
+from jaxvib.machine.files import DRIVES, Tables, build_kind, build_part, load_scene, misplaced_name, suggest_name
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number
 
@@ -53,7 +53,7 @@ def fit_from_tables(tables: Tables, folder: Path) -> FitInput:
     """
     for name in tables:
         if name not in FIT_TABLES:
-            raise InputError(name, f"is not part of an identification file; {suggest_name(name, FIT_TABLES)}")
+            raise misplaced_name(name, tables, "identification", FIT_TABLES)
     machine = tables.get("machine")
     if not isinstance(machine, Mapping) or set(machine) != {"file"} or not isinstance(machine["file"], str):
         raise InputError(

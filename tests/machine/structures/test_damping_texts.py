@@ -119,6 +119,7 @@ def test_a_found_machine_keeps_the_constant_of_a_ratio():
     stiffer = scene.replace(machine=jv.one_mass(mass=120.0, stiffness="4 x 55 N/mm", damping=scene.machine.damping))
     text = rewrite_scene(FILE, stiffer)
     assert 'stiffness = "4 x 55 N/mm"  # was "4 x 50 N/mm"; four springs' in text and 'was "5 %"; of critical' in text
+    assert 'stiffness = "4*55 N/mm"' in rewrite_scene(FILE.replace("4 x 50", "4*50"), stiffer)
     np.testing.assert_allclose(jv.scene_from_toml(text).machine.damping, scene.machine.damping, rtol=1e-7)
     faster = scene.replace(drive=jv.ConstantSpeed("700 rpm"))
     assert 'damping = "5 %"             # of critical' in rewrite_scene(FILE, faster)
