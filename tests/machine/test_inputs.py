@@ -70,7 +70,7 @@ WRONG = {
     "gravity in kg": (lambda: jv.Gravity("9.81 kg"), "effects.gravity.g is '9.81 kg', which is not in m/s^2"),
     "no machine": (lambda: jv.Scene(3, balls(), jv.ConstantSpeed(1.0)), "machine is 3; it must be a Machine, for example"),
     "no drive": (lambda: jv.Scene(machine(), balls(), 5.0), "drive is 5.0; it must be a Drive, for example ConstantSpeed("),
-    "no exciters": (lambda: jv.Scene(machine()), 'exciters are missing; give exciters=[Exciter(drive=ConstantSpeed("1500 rpm")'),
+    "no exciters": (lambda: jv.Scene(machine()), "exciters are missing; give exciters=[Exciter(drive=Const"),
     "exciters as loads": (lambda: jv.Scene(machine(), []), "loads is [], no Loads; give exciters=[Exciter(drive="),
     "a regime as vibration": (
         lambda: jv.vibration_measures(scene(), 3),
