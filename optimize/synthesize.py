@@ -136,7 +136,7 @@ def synthesize(
     space, problem, result = _search(space, objective, demands, options, report)
     neighbour_scenes = scenes_of(problem, neighbours(problem, result))
     scene = validate_scene(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], neighbour_scenes)))
-    status, unfinished, searched = _searched(result)
+    status, unfinished, searched = _searched(result, space)
     motion = _motion_of(space, objective, demands)
     named = _named_quantities(space, scene, objective, demands, motion)
     demand_sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
@@ -190,10 +190,10 @@ def _unmet(limits: tuple[Limit, ...]) -> ComputationError:
     return failure(SynthesisStatus.contradictory, hint)
 
 
-def _searched(result: SearchResult) -> tuple[SynthesisStatus, str, dict[str, Any]]:
+def _searched(result: SearchResult, space: DesignSpace) -> tuple[SynthesisStatus, str, dict[str, Any]]:
     """Return the status of a search, the reason why its best machine is not verified ("" for none), and the fields of
     `Synthesis` that describe the searches."""
-    best, z = result.best, result.point.z
+    best, z = result.best, result.designs(space)
     is_feasible = result.violation < 10.0 * FEASIBILITY_TOLERANCE
     done = is_feasible & (result.remaining_decrease < _CONVERGED_DECREASE)
     if result.interrupted:

@@ -73,6 +73,12 @@ class SearchResult(NamedTuple):
             return int(np.argmin(np.where(is_feasible, self.point.values[:, 0], np.inf)))
         return int(np.argmin(self.violation))
 
+    def designs(self, space: DesignSpace) -> np.ndarray:
+        """Return the final designs (s, d) in [0, 1], relative to the bounds of `space`, not to the `bounds` of a branch."""
+        if not space.choices:
+            return self.point.z
+        return np.asarray(space.shares(space.within(*self.bounds).numbers(self.point.z)))
+
 
 def require_searcher(searcher: object) -> None:
     """**Raises** `InputError` for a name that is not a `Searcher`, or if the package that it needs is not installed."""

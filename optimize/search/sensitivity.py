@@ -93,11 +93,11 @@ def machines_of(problem: Problem, result: SearchResult, same: float) -> tuple[Ma
     """
     values = np.where(result.violation < 10.0 * FEASIBILITY_TOLERANCE, result.point.values[:, 0], np.inf)
     remaining = [int(k) for k in np.argsort(values) if np.isfinite(values[k])]
-    space, machines = problem.space.within(*result.bounds), []
+    z, numbers = result.designs(problem.space), problem.space.within(*result.bounds).numbers(result.point.z)
+    machines: list[Machine] = []
     while remaining:
-        first = result.point.z[remaining[0]]
-        near = [k for k in remaining if np.max(np.abs(result.point.z[k] - first)) < same]
-        numbers = tuple(map(float, space.numbers(first)))
-        machines.append(Machine(len(near), float(values[remaining[0]]), numbers))
+        first = remaining[0]
+        near = [k for k in remaining if np.max(np.abs(z[k] - z[first])) < same]
+        machines.append(Machine(len(near), float(values[first]), tuple(map(float, numbers[first]))))
         remaining = [k for k in remaining if k not in set(near)]
     return tuple(machines)

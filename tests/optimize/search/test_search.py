@@ -149,6 +149,8 @@ def test_catalogues_give_the_best_of_all_choices():
     least = min(tried, key=lambda pair: tried[pair])
     np.testing.assert_allclose(best.after.parameters["machine.stiffness"], least, rtol=1e-12)
     np.testing.assert_allclose(best.values.min(), tried[least], rtol=1e-9)
+    continued = space.at(jnp.asarray(best.designs[np.argmin(best.values)])).machine
+    np.testing.assert_allclose(continued.stiffness, least, rtol=1e-9)
     several = DesignSpace(SCENE, FREE, choices={"loads.count": [2, 3, 5]})
     mass = Quantity("mass", "kg", lambda s: NEAREST(s) / 1e8 + (s.loads.mass * s.loads.count - 3.8) ** 2)
     assert found(several, mass).scene.loads.count == 5
