@@ -125,7 +125,7 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
 
 def angle_wrapping(scene: Scene, dtype: np.dtype) -> tuple[bool, bool]:
     """Return two flags: True if the integration keeps angles within one turn (single precision); True if the same number of
-    turns is subtracted from the angles of all loads (loads in contact)."""
+    turns is subtracted from a coordinate of all loads of an exciter (loads in contact)."""
     return dtype.itemsize < 8, has_term(scene.all_effects, LoadInteraction)
 
 

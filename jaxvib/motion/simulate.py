@@ -347,9 +347,8 @@ def last_state(scene: Scene, run: Run) -> State:
     _, has_common_turns = angle_wrapping(scene, last.displacement.dtype)
 
     def within_one_turn(exciter_state: ExciterState) -> ExciterState:
-        first = np.ravel(exciter_state.angle[0])[0] if exciter_state.angle else 0.0
         angle = tuple(
-            x - 2.0 * np.pi * np.round((first if has_common_turns else x) / (2.0 * np.pi)) for x in exciter_state.angle
+            x - 2.0 * np.pi * np.round((x[0] if has_common_turns else x) / (2.0 * np.pi)) for x in exciter_state.angle
         )
         return ExciterState(angle, exciter_state.rate, exciter_state.rotor, exciter_state.spin)
 

@@ -54,8 +54,8 @@ class PackedSystem(eqx.Module):
 
     - `field`: the vector field; `state`: a state
     - `wrapped`: True if angles are wrapped
-    - `has_common_turns`: True if the same number of turns is subtracted from the angles of all loads, which keeps their
-      differences
+    - `has_common_turns`: True if the same number of turns is subtracted from a coordinate of all loads of an exciter, which
+      keeps their differences
     - `batch`: True if many runs advance as one batch
     - `solver`; default: `method`
 
@@ -155,10 +155,10 @@ class PackedSystem(eqx.Module):
         )
         is_angle, leader = np.zeros(self.size, bool), np.arange(self.size)
         for exciter in places.exciters:
-            loads = np.concatenate([*exciter.angle, np.zeros(0, int)])
-            is_angle[loads] = True
-            if self.has_common_turns and exciter.angle:
-                leader[loads] = loads[0]
+            for coordinate in exciter.angle:
+                is_angle[coordinate] = True
+                if self.has_common_turns:
+                    leader[coordinate] = coordinate[0]
             if exciter.rotor is not None:
                 is_angle[exciter.rotor[0]] = True
         return is_angle, leader

@@ -97,6 +97,20 @@ def test_wrapping_counts_every_turn(machine, batch):
         np.testing.assert_allclose(np.sin(alone.angle[0][0]), np.sin(state.angle[0]), atol=1e-13)
 
 
+def test_turns_of_the_azimuth_leave_the_other_angle():
+    """Loads in contact share their turns in each coordinate; the angle in the cross-section of a torus has turns of its own."""
+    tube = jv.torus_balls(count=2, mass=0.05, radius=0.2, tube=0.02, ball_radius=0.015)
+    s = jv.Scene(jv.planar_rotor(mass=7.0, stiffness=1e3, damping=9.0), tube, jv.ConstantSpeed(140.0))
+    angle = jnp.asarray([700.0, 701.0]), jnp.asarray([1.4, 1.6])
+    state = jv.State(jnp.zeros(2), jnp.zeros(2), angle, (jnp.zeros(2), jnp.zeros(2)))
+    motion = PackedSystem(jv.vector_field(s), state, wrapped=True, has_common_turns=True)
+    wrap = motion.method().wrap
+    assert wrap is not None
+    held = motion._state(wrap(motion.pack(state))[0])
+    np.testing.assert_allclose(np.diff(held.angle[0]), 1.0, rtol=1e-12)
+    np.testing.assert_array_equal(held.angle[1], angle[1])
+
+
 def test_the_fastest_and_the_slowest_of_rotor_and_resonances():
     """One mass: its natural frequency is sqrt(k / (M + sum m_j))."""
     machine, balls = jv.one_mass(mass=49.0, stiffness=4e4, damping=30.0), jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
