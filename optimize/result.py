@@ -219,10 +219,11 @@ class Synthesis(Result):
         """Return lines of text with the limits, the five largest influences, and the distinct final designs."""
         lines = []
         best = self.machines[0].value if self.machines else math.nan
+        sign = -1.0 if objective_text(self.objective).startswith("greatest ") else 1.0  # changes of the maximized quantity
 
         def change_text(*percent: float) -> str:
             if math.isnan(best) or not max(map(abs, percent)) > _MAX_SHOWN_PERCENT:
-                return " / ".join(f"{influence:+.3g} %" for influence in percent) + " of the objective"
+                return " / ".join(f"{influence + 0.0:+.3g} %" for influence in percent) + " of the objective"
             changes = [max(abs(best), 1e-300) * influence / 100.0 for influence in percent]  # for an objective near 0
             unit, factor = shown_unit(self.unit, max(map(abs, changes)))
             return " / ".join(f"{influence * factor:+.3g} {unit}".rstrip() for influence in changes)
@@ -232,15 +233,15 @@ class Synthesis(Result):
             if limit.violation > 0.0:
                 lines.append(f"  not met: {limit.what}; {limit.shortfall()}")
             elif limit.active:
-                lines.append(f"  at its limit: {limit.what} ({values}); {_limit_influence(limit.gain)}")
+                lines.append(f"  at its limit: {limit.what} ({values}); {_limit_influence(sign * limit.gain)}")
             else:
                 lines.append(f"  met: {limit.what} ({values})")
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
         for influence in ranked[:5]:
-            lines.append(f"  1 % less / more {influence.what}: {change_text(influence.less, influence.more)}")
+            lines.append(f"  1 % less / more {influence.what}: {change_text(sign * influence.less, sign * influence.more)}")
         equal = [m for m in self.machines if abs(m.value - best) <= _EQUAL_VALUE * abs(best)]
         unit, factor = shown_unit(self.unit, abs(best))
-        factor = -factor if objective_text(self.objective).startswith("greatest ") else factor
+        factor *= sign
         if len(equal) > 1 and len(equal) == len(self.machines):
             value = f"{best * factor:.4g} {unit}".rstrip()
             lines.append(
@@ -292,7 +293,7 @@ def _limit_influence(gain: float) -> str:
         share /= 10.0
     if share < _MIN_LIMIT_CHANGE:
         return "the objective is almost zero relative to its slope"
-    return f"changed by {share:g} %: about {gain * share:+.3g} % of the objective"
+    return f"changed by {share:g} %: about {gain * share + 0.0:+.3g} % of the objective"
 
 
 def objective_text(objective: str) -> str:

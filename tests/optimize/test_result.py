@@ -42,6 +42,8 @@ def test_results_are_shown_in_practical_units(searched):
     assert said[8] == "  2 different machines: 3 x 20, 1 x 30 kN"
     greatest = dataclasses.replace(searched, objective="negative pull", machines=(Machine(3, -2e4, (1.0,)), machines[0]))
     assert greatest.findings()[-1] == "  2 different machines: 3 x 20, 3 x -20 kN"
+    assert greatest.findings()[0].endswith("changed by 1 %: about +0.5 % of the objective")  # of the pull itself
+    assert greatest.findings()[3] == "  1 % less / more last: +1.5 % / -9 % of the objective"
     one = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=machines[:1]).findings()
     assert one == ["  1 % less / more x: +400 kN / -0.2 kN"]  # 2000 % of 2e4 N: of almost nothing a share tells nothing
     none = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=()).findings()
