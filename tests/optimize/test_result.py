@@ -33,14 +33,15 @@ def test_results_are_shown_in_practical_units(searched):
     )
     influences = (*(Influence(f"number {k}", float(k), -float(k) / 2.0) for k in range(7)), Influence("last", -1.5, 9.0))
     machines = (Machine(3, 2e4, (1.0,)), Machine(1, 3e4, (2.0,)))
-    said = dataclasses.replace(searched, limits=limits, influences=influences, machines=machines).findings()
+    shown = dataclasses.replace(searched, limits=limits, influences=influences, machines=machines)
+    said = shown.findings()
     assert said[0] == "  at its limit: first at most 2 mm (2 mm); changed by 1 %: about -0.5 % of the objective"
     assert said[1] == "  not met: second at most 3 mm; at best 3.3 mm, 10 % off"
     assert said[2] == "  met: third at most 4 mm (1 mm)"
     assert said[3] == "  1 % less / more last: -1.5 % / +9 % of the objective"
     assert [line.split(":")[0][-8:] for line in said[4:8]] == [f"number {k}" for k in (6, 5, 4, 3)]
     assert said[8] == "  2 different machines: 3 x 20, 1 x 30 kN"
-    greatest = dataclasses.replace(searched, objective="negative pull", machines=(Machine(3, -2e4, (1.0,)), machines[0]))
+    greatest = dataclasses.replace(shown, objective="negative pull", machines=(Machine(3, -2e4, (1.0,)), machines[0]))
     assert greatest.findings()[-1] == "  2 different machines: 3 x 20, 3 x -20 kN"
     assert greatest.findings()[0].endswith("changed by 1 %: about +0.5 % of the objective")  # of the pull itself
     assert greatest.findings()[3] == "  1 % less / more last: +1.5 % / -9 % of the objective"
