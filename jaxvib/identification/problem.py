@@ -58,7 +58,7 @@ values of the unknowns, the phase error within a stretch must be less than a rad
 _STEPS_PER_RADIAN = 1.0
 """Number of steps of order 8 per radian of the fastest motion, with errors of about 2e-7 in a turn."""
 
-_DELAY_MARGIN = 2
+DELAY_MARGIN = 2
 """Number of steps by which both readings and model are delayed, so that the interpolation has samples on both sides."""
 
 
@@ -134,10 +134,14 @@ def read_known(text: Number, number: NamedNumber, field: str) -> Known:
     error = parts[1].strip()
     if error.endswith("%"):
         try:
-            return Known(value, abs(value) * float(error[:-1]) / 100.0)
+            size = abs(value) * float(error[:-1]) / 100.0
         except ValueError as problem:
             raise InputError(field, f"is {quoted(text)}; write for example '95 kg +- 1 %'") from problem
-    return Known(value, abs(_unbounded(number).value(error, field)))
+    else:
+        size = float(_unbounded(number).value(error, field))
+    if not 0.0 <= size < math.inf:
+        raise InputError(field, f"is {quoted(text)}; the standard error after +- must be a finite number, at least 0")
+    return Known(value, size)
 
 
 def _unbounded(number: NamedNumber) -> NamedNumber:
@@ -218,11 +222,17 @@ def _known_means(
     positive: np.ndarray,
     scale: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the means and standard errors of the unknowns whose values are known with an error; 0 and infinity for others."""
+    """Return the means and standard errors of the unknowns whose values are known with an error; 0 and infinity for others.
+
+    **Raises** `InputError` for the value 0 of a positive number, whose logarithm is the unknown.
+    """
     means, errors = np.zeros(len(nonlinear)), np.full(len(nonlinear), np.inf)
     for k, number in enumerate(nonlinear):
         if number.name in known_numbers and known_numbers[number.name][1].error > 0.0:
             each = known_numbers[number.name][1]
+            if positive[k] and each.value == 0.0:
+                problem = "is 0 with an error; the value of a number that cannot be negative must be above 0"
+                raise InputError(f"known[{number.name!r}]", f"{problem}: give a positive value, or 0 without an error")
             means[k] = math.log(each.value / values[k]) if positive[k] else (each.value - values[k]) / scale[k]
             errors[k] = each.error / each.value if positive[k] else each.error / scale[k]
     return means, errors
@@ -350,10 +360,16 @@ def _known_unbalance(
 
 
 def _changes(scene: Scene, run: MeasuredRun) -> tuple[list[NamedNumber], list[str], list[float]]:
-    """Return the changed numbers of a run, the actions and their amounts in SI."""
+    """Return the changed numbers of a run, the actions and their amounts in SI.
+
+    **Raises** `InputError` for a change of an unbalance, which is one linear unknown of all runs.
+    """
     numbers, actions, amounts = [], [], []
     for name, change in run.change.items():
         for number in _singles(scene, [name], "change"):
+            if number.path[-1] == "unbalance":
+                problem = "is an unbalance, which must be the same in all runs; fit runs with other unbalances on their own"
+                raise InputError(f"{run.source}: change[{name!r}]", problem)
             amount = change.amount if change.action == "scale" else _unbounded(number).value(change.amount, f"change[{name!r}]")
             numbers.append(number)
             actions.append(change.action)
@@ -538,13 +554,13 @@ def _delay_taps(delay: float) -> tuple[np.ndarray, np.ndarray]:
 
     Both filters delay their signals by two steps, because the interpolation needs samples on both sides.
     """
-    late = delay + _DELAY_MARGIN
+    late = delay + DELAY_MARGIN
     base = math.floor(late) - 2
     if base < 0:
         raise InputError("delay", f"is {delay:g} steps; the readings cannot be ahead of the motion")
     nodes = np.arange(base, base + 6)
     weights = np.array([np.prod([(late - b) / (a - b) for b in nodes if b != a]) for a in nodes])
-    return np.eye(_DELAY_MARGIN + 1)[-1], np.concatenate([np.zeros(base), weights])
+    return np.eye(DELAY_MARGIN + 1)[-1], np.concatenate([np.zeros(base), weights])
 
 
 @cached

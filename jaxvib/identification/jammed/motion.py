@@ -31,6 +31,7 @@ from jaxvib.equations.dynamics import Dynamics, dynamics_of
 from jaxvib.equations.model import assemble
 from jaxvib.equations.state import State
 from jaxvib.identification.angle import RecordedDrive
+from jaxvib.identification.problem import DELAY_MARGIN
 from jaxvib.identification.response import Samples, Unknowns, sensor_rows
 from jaxvib.identification.supports.contact import held, pressing, side_count, switched_step, with_pressing
 from jaxvib.machine.drives.drive import Drive, IdealDrive
@@ -125,12 +126,15 @@ def _stretch(
         nd = equations.rows.shape[2]
         return pressing(equations.dynamics, y[:nd], y[nd : 2 * nd]) if has_stops else jnp.zeros(0, bool)
 
+    recorded, used = _recorded(samples)
+
     def sample(state: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         (y, presses), t, h = state, samples.begin + samples.step * (begin + k), samples.step / per_sample
         now = equations._replace(dynamics=with_pressing(equations.dynamics, presses)) if has_stops else equations
         readings = equations.gains * _rates(samples, t, y, now)[1]
         if samples.guide is not None:
-            y = y + jnp.where(jnp.any(presses), 0.0, samples.guide @ _innovation(samples, begin + k, readings))
+            away = jnp.where(used[begin + k], recorded[begin + k] - readings, 0.0)
+            y = y + jnp.where(jnp.any(presses), 0.0, samples.guide @ away)
             presses = pressing_at(y)
 
         def advance(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -144,12 +148,21 @@ def _stretch(
     return readings, states, end
 
 
-def _innovation(samples: Samples, k: Array, readings: Array) -> Array:
-    """Return the differences (C,), recorded readings minus `readings`, at the sample k; 0 for readings that do not count."""
+def _recorded(samples: Samples) -> tuple[Array, Array]:
+    """Return the readings (n, C) of a record without their means, each at the time of the motion, and True for those that
+    count. Delays are rounded to whole samples."""
+    delays = np.array([channel.delay for channel in samples.channels])
     recorded, weights = (each.reshape(-1, each.shape[2]) for each in (samples.readings, samples.weights))
     used = weights > 0.0
     mean = jnp.sum(jnp.where(used, recorded, 0.0), axis=0) / jnp.maximum(jnp.sum(used, axis=0), 1)
-    return jnp.where(used[k], recorded[k] - mean - readings, 0.0)
+    values = recorded - mean[None]
+    if np.any(delays):
+        late = DELAY_MARGIN + jnp.rint(delays / samples.step).astype(int)
+        later = jnp.arange(len(recorded))[:, None] + late[None]
+        place = jnp.minimum(later, len(recorded) - 1)
+        values, used = (jnp.take_along_axis(each, place, axis=0) for each in (values, used))
+        used &= later < len(recorded)
+    return values, used
 
 
 @cached

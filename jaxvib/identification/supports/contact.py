@@ -31,9 +31,9 @@ _MAX_SWITCHES = 16
 _MAX_TRIALS, _ACCURACY = 60, 1e-13
 """Largest number of trials for the time of a change, and its error relative to the length of the step."""
 
-_NEAR_TURN, _MIN_SHARE = 0.2, 0.02
-"""Distance of a turning point from a stop, relative to the rise before it, below which the step ends at the turning point, and
-smallest part of a step."""
+_NEAR_TURN = 0.2
+"""Distance of a turning point from a stop, relative to the rise before it, below which a contact at the turning point is
+possible."""
 
 Step = Callable[[Array, Array, Array, Dynamics], Array]
 """Function that returns the state after a step from a time, a state and a length of the step, by equations."""
@@ -137,11 +137,9 @@ def switched_step(
         done, y, presses, count = state
         now, begin, rest = with_pressing(dynamics, presses), t + done, h - done
         fixed = lax.stop_gradient((begin, y, rest, now))
-        change = _first_change(step, rates, lambda y: wrong(y, presses, fixed[3]), *fixed)
-        start, end = (penetrations(fixed[3], each[:nd], each[nd : 2 * nd]) for each in (fixed[1], change.end))
-        is_switch, turn = change.is_found & (count < _MAX_SWITCHES), _turning(start[:2], end[1], presses, fixed[2])
-        is_turn = ~is_switch & (turn > 0.0) & (count < _MAX_SWITCHES)
-        taken = jnp.where(is_switch, change.length, jnp.where(is_turn, turn, rest))
+        change = _first_change(step, rates, lambda y: wrong(y, presses, fixed[3]), presses, *fixed)
+        is_switch = change.is_found & (count < _MAX_SWITCHES)
+        taken = jnp.where(is_switch, change.length, rest)
         new = step(begin, y, taken, now)
         values = wrong(new, presses, now)
         which = jnp.argmax(lax.stop_gradient(values))
@@ -150,7 +148,7 @@ def switched_step(
         # The correction of the time is 0; its derivative is that of the time of the change.
         correction = (lax.stop_gradient(values) - values)[which] * jnp.where(is_switch, 1.0 / rate, 0.0)
         presses = presses ^ (is_switch & (jnp.arange(presses.size) == which))
-        done = jnp.where(is_switch | is_turn, done + taken + correction, h)
+        done = jnp.where(is_switch, done + taken + correction, h)
         return done, new + correction * slope, presses, count + 1
 
     start = jnp.zeros_like(h), y, presses, jnp.asarray(0)
@@ -159,8 +157,8 @@ def switched_step(
 
 
 def _turning(start: tuple[Array, Array], last: Array, presses: Array, h: Array) -> Array:
-    """Return the time after which a side that does not press is nearest to its stop within a step, if it is near the stop then;
-    otherwise 0.
+    """Return the time after which a side that does not press is nearest to its stop within a step, if it may touch the stop
+    then; otherwise 0.
 
     **Arguments**: penetrations (s,) and their rates at the `start`; the `last` rates (s,); length of the step.
     """
@@ -168,7 +166,6 @@ def _turning(start: tuple[Array, Array], last: Array, presses: Array, h: Array) 
     share = rate / jnp.where(rate == last, 1.0, rate - last)
     rise = 0.5 * rate * share * h
     is_near = ~presses & (rate > 0.0) & (last < 0.0) & (depth + (1.0 + _NEAR_TURN) * rise > 0.0)
-    is_near &= (share > _MIN_SHARE) & (share < 1.0 - _MIN_SHARE)
     return jnp.min(jnp.where(is_near, share, 1.0)) * h * jnp.any(is_near)
 
 
@@ -176,8 +173,8 @@ class _Change(NamedTuple):
     """First change of a switch within a step, by Newton's method between bounds.
 
     **Attributes**: `low` and `high`: bounds of its time after the start of the step; `length`: the next trial; `is_final`: True
-    if the search has ended; `is_found`: False if no switch differs at the end of the step; `end`: the state there; `trials`:
-    number of trials.
+    if the search has ended; `is_found`: False if no switch differs at the end of the step or at a turning point within it;
+    `trials`: number of trials.
     """
 
     low: Array
@@ -185,26 +182,37 @@ class _Change(NamedTuple):
     length: Array
     is_final: Array
     is_found: Array
-    end: Array
     trials: Array
 
 
 def _first_change(
-    step: Step, rates: Step, wrong: Callable[[Array], Array], t: Array, y: Array, h: Array, dynamics: Dynamics
+    step: Step,
+    rates: Step,
+    wrong: Callable[[Array], Array],
+    presses: Array,
+    t: Array,
+    y: Array,
+    h: Array,
+    dynamics: Dynamics,
 ) -> _Change:
     """Return the first change within the time `h`; `wrong`: the switches of a state, positive after a change."""
+    nd = dynamics.stiffness_per_mass.shape[0]
+    start = penetrations(dynamics, y[:nd], y[nd : 2 * nd])[:2]
 
     def trial(at: _Change) -> _Change:
         new = step(t, y, at.length, dynamics)
         values, slopes = jax.jvp(wrong, (new,), (rates(t + at.length, new, at.length, dynamics),))
-        which, is_first = jnp.argmax(values), at.trials == 0
+        which = jnp.argmax(values)
         is_late = values[which] > 0.0
-        low, high = jnp.where(is_late, at.low, at.length), jnp.where(is_late, at.length, at.high)
+        # The end of the step is tried first, and then a turning point, at which a short contact is deepest.
+        turn = _turning(start, penetrations(dynamics, new[:nd], new[nd : 2 * nd])[1], presses, h)
+        is_turn = (at.trials == 0) & ~is_late & (turn > 0.0)
+        is_found = at.is_found | is_late
+        low, high = jnp.where(is_late | is_turn, at.low, at.length), jnp.where(is_late, at.length, at.high)
         better = at.length - values[which] / slopes[which]
         better = jnp.where((better > low) & (better < high), better, 0.5 * (low + high))
-        is_final = (is_first & ~is_late) | (jnp.abs(better - at.length) < _ACCURACY * h) | (at.trials > _MAX_TRIALS)
-        is_found, end = jnp.where(is_first, is_late, at.is_found), jnp.where(is_first, new, at.end)
-        return _Change(low, high, better, is_final, is_found, end, at.trials + 1)
+        is_final = ~is_found | (jnp.abs(better - at.length) < _ACCURACY * h) | (at.trials > _MAX_TRIALS)
+        return _Change(low, high, jnp.where(is_turn, turn, better), is_final & ~is_turn, is_found, at.trials + 1)
 
     no = jnp.asarray(False)
-    return lax.while_loop(lambda at: ~at.is_final, trial, _Change(0.0 * h, h, h, no, no, y, jnp.asarray(0)))
+    return lax.while_loop(lambda at: ~at.is_final, trial, _Change(0.0 * h, h, h, no, no, jnp.asarray(0)))

@@ -2,7 +2,11 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
+import diffrax
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,9 +15,13 @@ from repeated_records.supports import STOP, TIMES, motion, scene_of, support_rec
 from run_ups_by_scipy import Ramp
 
 import jaxvib as jv
-from jaxvib.identification.jammed.motion import closed_motion, linearized
+from jaxvib.equations.dynamics import dynamics_of
+from jaxvib.equations.model import assemble
+from jaxvib.equations.state import State
+from jaxvib.identification.jammed.motion import _recorded, closed_motion, linearized
 from jaxvib.identification.problem import build_problem
-from jaxvib.identification.supports.contact import HeldStop, held
+from jaxvib.identification.supports.contact import HeldStop, held, switched_step
+from jaxvib.ode.dopri8_loop import LoopDopri8
 
 SHORT = TIMES[:300]
 """Times of a record that passes the first resonance only."""
@@ -68,6 +76,33 @@ def test_derivatives_against_differences_across_contacts():
         np.testing.assert_allclose(at.columns[:n, :, k], slope, atol=2e-5 * max(1.0, np.max(np.abs(slope))))
 
 
+def test_short_contact_within_a_step_is_that_of_short_steps():
+    """A free vibration passes the gap by 0.5 % of its amplitude, between the ends of a step."""
+    machine, y = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0), 1.005e-3 * jnp.array([np.cos(0.3), 28.28 * np.sin(0.3)])
+    scene = jv.Scene(
+        machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(0.1), unbalance=1e-9)], effects=jv.Stop(2e6, gap=1e-3)
+    )
+    dynamics = dynamics_of(assemble(eqx.tree_at(lambda s: s.effects, scene, (held(scene.effects[0], machine),))))
+    solver = LoopDopri8(tangents=True)
+
+    def rates(t, y, _, dynamics):
+        rate = dynamics(t, State(y[:1], y[1:]))
+        return jnp.concatenate([rate.displacement, rate.velocity])
+
+    term = diffrax.ODETerm(lambda t, y, dynamics: rates(t, y, None, dynamics))
+
+    def step(t, y, h, dynamics):
+        return solver.step(term, t, t + h, y, dynamics, None, False)[0]
+
+    @jax.jit
+    def after(y, n):
+        h = 0.02 / n
+        state = jnp.asarray(0.0), y, jnp.zeros(2, bool)
+        return jax.lax.fori_loop(0, n, lambda k, s: (h * k, *switched_step(step, rates, dynamics, h * k, *s[1:], h)), state)[1]
+
+    np.testing.assert_allclose(after(y, 1), after(y, 500), atol=1e-8)
+
+
 @pytest.mark.parametrize(
     ("stop", "machine"),
     [
@@ -88,6 +123,20 @@ def test_held_stop_has_the_force_of_the_stop(stop, machine):
         np.testing.assert_allclose(smooth.force(x, v), term.force(x, v), atol=1e-4)
         pressed += int(np.any(presses))
     assert 5 < pressed < 55
+
+
+def test_recorded_readings_are_at_the_times_of_the_motion():
+    """Both channels of a run are 2 samples late if one has a delay; the delay adds 3 samples."""
+    channels = tuple(jv.Channel(name, "velocity", at=1, delay=delay) for name, delay in (("a", 0.0), ("b", 0.0301)))
+    readings = jnp.stack([jnp.arange(8.0), 2.0 * jnp.arange(8.0)], axis=1)[None]
+    samples = SimpleNamespace(channels=channels, readings=readings, weights=jnp.ones((1, 8, 2)), step=jnp.asarray(0.01))
+    values, used = _recorded(samples)
+    np.testing.assert_array_equal(np.sum(used, axis=0), [6, 3])
+    np.testing.assert_allclose(values[:3], jnp.stack([jnp.arange(2.0, 5.0) - 3.5, 2.0 * jnp.arange(5.0, 8.0) - 7.0], axis=1))
+    samples.channels = channels[:1] * 2
+    values, used = _recorded(samples)
+    np.testing.assert_allclose(values[:, 0], jnp.arange(8.0) - 3.5)
+    assert np.all(used)
 
 
 FACTORS = {"stop[0].gap": 1.2, "stop[0].stiffness": 1.3, "machine.stiffness": 1.1, "machine.damping": 0.67}
