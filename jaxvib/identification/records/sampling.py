@@ -50,6 +50,24 @@ def require_ascending(time: np.ndarray, where: str) -> None:
         raise InputError(where, f"{problem}; times must ascend: sort the samples, or make two runs of them")
 
 
+def continued_angle(value: np.ndarray, where: str) -> tuple[np.ndarray, list[str]]:
+    """Return an angle (n,), rad, with whole turns added if it begins anew in each turn, and a note; otherwise the same angle.
+
+    Such an angle stays within one turn and has steps of more than half a turn.
+
+    >>> angle, notes = continued_angle(np.array([0.0, 2.0, 4.0, 6.0, 1.7, 3.7]), "run: channel 'rotor'")
+    >>> np.round(angle, 1).tolist(), len(notes)
+    ([0.0, 2.0, 4.0, 6.0, 8.0, 10.0], 1)
+    """
+    is_known = np.isfinite(value)
+    known = value[is_known]
+    if known.size == 0 or np.ptp(known) > 1.001 * 2.0 * np.pi or np.max(np.abs(np.diff(known)), initial=0.0) <= np.pi:
+        return value, []
+    continued = value.copy()
+    continued[is_known] = np.unwrap(known)
+    return continued, [f"{where} begins anew in each turn; whole turns were added"]
+
+
 def even_samples(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Return a channel on an even grid of times, with NaN for missing readings, and notes about repairs.
 

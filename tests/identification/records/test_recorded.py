@@ -165,6 +165,18 @@ def test_falling_edges_and_times_of_pulses():
         MeasuredRun.from_arrays([jv.Channel("frame", "force")], {"x": T}, {"frame": WAVE})
 
 
+@pytest.mark.parametrize("low", [0.0, -180.0])
+def test_whole_turns_are_added_to_an_angle_that_begins_anew(low):
+    angle, t = 400.0 + 70.0 * np.arange(200.0), 0.01 * np.arange(200)
+    readings = (angle - low) % 360.0 + low
+    readings[50] = np.nan
+    run = MeasuredRun.from_arrays([jv.Channel("rotor", "angle", unit="deg")], t, {"rotor": readings})
+    assert run.notes[0] == "run: channel 'rotor' begins anew in each turn; whole turns were added"
+    np.testing.assert_allclose(np.delete(np.diff(run.values["rotor"]), [49, 50]), np.deg2rad(70.0))
+    same = MeasuredRun.from_arrays([jv.Channel("rotor", "angle", unit="deg")], t, {"rotor": 5.0 * angle})  # fast, continuous
+    np.testing.assert_allclose(same.values["rotor"], np.deg2rad(5.0 * angle))
+
+
 def test_range_of_a_sensor_clips():
     values = 0.3 * np.sin(np.arange(400.0))
     values[[50, 60]] = 0.9995, -1.2
