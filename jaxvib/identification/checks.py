@@ -222,12 +222,15 @@ def coverage_notes(fitted: Fitted, frequency: np.ndarray, damping_ratio: np.ndar
             f"no run passes through a resonance: the rotors turn at {low:.3g} to {high:.3g} rad/s, and the natural frequencies "
             f"are {modes} rad/s; record a run through a resonance"
         )
-    decay = 1.0 / np.maximum(damping_ratio * frequency, 1e-300)
+    decays = damping_ratio > 0.0
+    decay = np.max(1.0 / np.where(decays, damping_ratio * frequency, 1.0), where=decays, initial=0.0)
+    longest = float(decay) if np.all(decays) else math.inf
     for k, time in enumerate(problem.times):
-        lasts, longest = float(time[-1] - time[0]), float(np.max(decay, initial=0.0))
+        lasts = float(time[-1] - time[0])
         if lasts < _DECAY_TIMES * longest:
+            each = f"{longest:.3g} s each" if math.isfinite(longest) else "which does not decay"
             yield (
-                f"run {k + 1} lasts {lasts:.3g} s, less than two decay times of the slowest mode ({longest:.3g} s each): its "
+                f"run {k + 1} lasts {lasts:.3g} s, less than two decay times of the slowest mode ({each}): its "
                 "response cannot be distinguished from the free vibration at its start; record a longer run"
             )
 

@@ -386,7 +386,7 @@ def propagate(
 
     **Arguments**: `names` (k,) of the uncertain numbers; `scale` (k,), SI: change of each number that counts as the relative
     change 1; the `covariance` (k, k) of their relative errors; undetermined directions `axes` (k, u) and their `errors` (u,);
-    the `function`, which returns values (m,) other than 0.
+    the `function`, which returns values (m,).
     """
     values, slopes = function(scene), []
     for name, step in zip(names, _STEP * scale, strict=True):
@@ -397,8 +397,9 @@ def propagate(
     slopes = np.stack(slopes, axis=1)
     spread = np.sqrt(np.maximum(np.einsum("mk,kl,ml->m", slopes, covariance, slopes), 0.0))
     undetermined_changes = np.abs(slopes @ axes) * np.minimum(errors, 1e3)
-    determined = np.all(undetermined_changes < 0.1 * np.abs(values)[:, None], axis=1)
+    determined = np.all(undetermined_changes < 0.1 * np.abs(values)[:, None], axis=1) & np.isfinite(spread)
+    sizes = np.where(values != 0.0, np.abs(values), 1.0)
     return [
-        _estimate(value, abs(value), value > 0.0, each / abs(value), bool(is_determined))
-        for value, each, is_determined in zip(values, spread, determined, strict=True)
+        _estimate(value, size, value > 0.0, each / size, bool(is_determined))
+        for value, size, each, is_determined in zip(values, sizes, spread, determined, strict=True)
     ]

@@ -89,7 +89,17 @@ def test_number_of_modes_may_change():
         return np.array([1.0, 2.0]) if float(scene.machine.damping[0]) <= 60.0 else np.array([1.0])
 
     found = propagate(scene_of(), ("machine.damping[0]",), np.full(1, 60.0), np.eye(1), np.zeros((1, 0)), np.zeros(0), function)
-    assert all(np.isnan(each.error) or np.isinf(each.error) for each in found)
+    assert [each[1:] for each in found] == [(np.inf, 0.0, np.inf)] * 2
+
+
+def test_value_0_has_an_absolute_error():
+    def function(scene):
+        return np.array([float(scene.machine.stiffness[0]) - 4e4, 0.0])
+
+    names, scale, no = ("machine.stiffness[0]",), np.array([4e4]), np.zeros((1, 0))
+    found = propagate(scene_of(), names, scale, np.full((1, 1), 1e-4), no, np.zeros(0), function)
+    np.testing.assert_allclose(found[0], (0.0, 400.0, -Z * 400.0, Z * 400.0), rtol=1e-6)
+    assert found[1] == (0.0, 0.0, 0.0, 0.0)
 
 
 def problem_of(gains=(), unbalances=(None,), first=(4e4,)):

@@ -48,7 +48,18 @@ def test_known_values_with_their_errors(text, value, error):
     assert found.value == pytest.approx(value) and found.error == pytest.approx(error)
 
 
-@pytest.mark.parametrize("text", ["95 kg +- 1 % +- 2 %", "95 kg +- much %", "95 kg +- 1 N"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "95 kg +- 1 % +- 2 %",
+        "95 kg +- much %",
+        "95 kg +- 1 N",
+        "95 kg +- -1 %",
+        "95 kg +- nan %",
+        "95 kg +- inf %",
+        "95 kg +- -1 kg",
+    ],
+)
 def test_wrong_known_values_raise_clear_errors(text):
     number = find_number(scene_of(), "machine.mass", "known").single(scene_of())[0]
     with pytest.raises(jv.InputError, match=r"^known"):
@@ -182,6 +193,23 @@ def test_unknowns_with_their_known_values():
     np.testing.assert_allclose(scene.machine.mass, [90.0, 97.0])
     np.testing.assert_allclose(scene.machine.damping, [48.0, 56.0])
     np.testing.assert_allclose(found.runs[1].scene(found.scene).machine.link_stiffness, [9e4])
+
+
+@pytest.mark.parametrize(
+    ("change", "known", "words"),
+    [
+        (
+            {"exciters[0].unbalance": "+5 %"},
+            {},
+            r"run 3: change\['exciters\[0\].unbalance'\] is an unbalance, which must be the",
+        ),
+        ({}, {"machine.damping": "0 N s/m +- 5 N s/m"}, r"known\['machine.damping\[0\]'\] is 0 with an error; the value of"),
+    ],
+)
+def test_changes_and_known_values_that_do_not_count_are_refused(change, known, words):
+    run = run_with({"a": np.sin(T)}, change=change)
+    with pytest.raises(jv.InputError, match=words):
+        build_problem(scene_of(), [run], ["machine.stiffness"], known)
 
 
 def test_places_are_unknowns_of_either_sign():
