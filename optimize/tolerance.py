@@ -12,9 +12,9 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.errors import ComputationError, InputError, quoted
-from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, put_numbers
+from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, present_numbers, put_numbers, put_present
 from jaxvib.machine.scene import Scene
-from jaxvib.units import number, random_numbers
+from jaxvib.units import Bounds, number, random_numbers
 from optimize.quantities.cases import Sampled, require_single_tolerances
 from optimize.quantities.quantity import Demand, Quantity
 
@@ -172,8 +172,10 @@ def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) 
         machine = scene if batch is None else jax.tree.map(lambda leaf, k=k: leaf[k], batch)
         for entry, share in zip(ranges, shares, strict=True):
             value = entry.low + (entry.high - entry.low) * share[k]
-            present = entry.number.read(machine)
-            machine = put_numbers(machine, (entry.number,), present + value if entry.is_added else 0.0 * present + value)
+            if entry.is_added:
+                machine = put_numbers(machine, (entry.number,), entry.number.read(machine) + value)
+            else:
+                machine = put_present(machine, entry.number, value)
         yield machine
 
 
@@ -183,7 +185,12 @@ def _range(scene: Scene, name: str, low: str, high: str) -> _NumberRange:
     entry = find_number(scene, _mass_name(scene, int(material[1] or 1)) if material else name, "tolerances")
     unit = "".join(re.findall(r"[^\d.eE+\-\s].*$", high.strip()))
     ends = [low if re.search(r"[^\d.eE+\-\s]", low) else f"{low.strip()} {unit}".strip(), high]
-    first, last = (float(number(end.strip(), entry.unit, f"tolerances.{name}")) for end in ends)
+    if material:  # a negative range removes material
+        bounds = Bounds(low=-float(entry.read(scene)[0]), open_low=True)
+    else:
+        present_numbers(scene, entry, "tolerances")  # raises an error for an array of absent springs
+        bounds = entry.spec.bounds
+    first, last = (float(number(end.strip(), entry.unit, f"tolerances.{name}", **bounds._asdict())) for end in ends)
     if not first < last:
         raise InputError(f"tolerances.{name}", f"is {low}..{high}; the second must be larger than the first")
     return _NumberRange(entry, first, last, material is not None)

@@ -14,7 +14,7 @@ from jax import Array
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import suggest_name
-from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers
+from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_present
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.units import Number, count, number
@@ -188,6 +188,7 @@ def _target_of(scene: Scene, name: str) -> tuple[Target, str]:
     """Return the target with this name, in the scene or in the initial state, and its unit."""
     if not str(name).startswith("start."):
         parameter = find_number(scene, name, "axes")
+        present_numbers(scene, parameter, "axes")  # raises an error for an array of absent springs
         return Target(parameter, "", None), parameter.unit
     match = re.fullmatch(r"start\.([a-z]+)(?:\[(\d+)\])?", str(name))
     if match is None or match[1] not in _START:
@@ -222,10 +223,10 @@ def require_disjoint(scene: Scene, axes: Sequence[Axis]) -> None:
 
 
 def put(scene: Scene, targets: Sequence[Target], values: Array) -> Scene:
-    """Return the scene with the values (axes,) of the axes in a case."""
+    """Return the scene with the values (axes,) of the axes in a case. Absent springs and dampers stay absent."""
     for k, target in enumerate(targets):
         if target.number is not None:
-            scene = put_numbers(scene, (target.number,), jnp.full(target.number.size, values[k]))
+            scene = put_present(scene, target.number, values[k])
     return scene
 
 

@@ -5,7 +5,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.machine.files import SCREENS, scene_from_toml
-from optimize import expected, jam_frequency, static_deflection, tolerance_ranges
+from optimize import expected, jam_frequency, static_deflection, tolerance_ranges, total
 from optimize.tolerance import read_tolerances
 
 
@@ -43,10 +43,25 @@ def test_modes_that_vanish_lower_the_share(scene):
     assert 0.0 < found.share < 1.0 and np.isfinite(found.high)
 
 
-@pytest.mark.parametrize("text", ["stiffness", "stiffness=5", "stiffness=200%", "nothing=5%", "load=20..0kg", "load=0..2m"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *["stiffness", "stiffness=5", "stiffness=200%", "nothing=5%", "load=20..0kg", "load=0..2m"],
+        *["machine.mass=-70..-60 kg", "load=-50..0 kg"],  # no machine has such masses
+    ],
+)
 def test_wrong_tolerances_are_refused(scene, text):
     with pytest.raises(jv.InputError, match="tolerance"):
         tolerance_ranges(scene, [static_deflection()], [text], samples=4)
+
+
+def test_range_of_an_array_adds_no_spring():
+    machine = jv.two_mass(mass=(50.0, 40.0), stiffness=(4e4, 0.0), damping=(0.0, 0.0), link_stiffness=1e5, link_damping=60.0)
+    two = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
+    sums = tolerance_ranges(two, [total("machine.stiffness")], ["machine.stiffness=4e4..6e4"], samples=4)[0]
+    np.testing.assert_allclose([sums.low, sums.worst], [4.25e4 + 0.025 * 1.5e4, 5.75e4])
+    with pytest.raises(jv.InputError, match="machine.damping is 0 in every entry"):
+        read_tolerances(two, ["machine.damping=1..2"])
 
 
 @pytest.mark.parametrize(

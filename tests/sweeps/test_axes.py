@@ -93,6 +93,15 @@ def test_values_are_put_into_the_named_numbers():
     assert state.velocity.tolist() == [-0.1, -0.1] and state.displacement.tolist() == [0.0, 0.0]
 
 
+def test_an_axis_of_an_array_adds_no_spring():
+    machine = jv.two_mass(mass=(50.0, 40.0), stiffness=(4e4, 0.0), damping=(0.0, 0.0), link_stiffness=1e5, link_damping=60.0)
+    given = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
+    axis = axis_of(given, "machine.stiffness", [1e4, 2e4])
+    assert put(given, (axis.target,), np.array([2e4])).machine.stiffness.tolist() == [2e4, 0.0]
+    with pytest.raises(jv.InputError, match="axes.machine.damping is 0 in every entry"):
+        axis_of(given, "machine.damping", [1.0, 2.0])
+
+
 RUN = ["run.mode"]
 
 

@@ -122,12 +122,11 @@ def onset(
 
 def _scene_function_and_reader(scene: Scene, name: str) -> tuple[Callable[[float], Scene], Callable[[str, str], float]]:
     """Return a function that returns the scene for a value of the parameter `name`, and a function that reads such a value."""
-    import jax.numpy as jnp
-
-    from jaxvib.machine.numbers.named import find_number, put_numbers
+    from jaxvib.machine.numbers.named import find_number, present_numbers, put_present
 
     parameter = find_number(scene, name, "--vary")
-    return lambda x: put_numbers(scene, (parameter,), jnp.full(parameter.size, x)), parameter.value
+    present_numbers(scene, parameter, "--vary")  # raises an error for an array of absent springs
+    return lambda x: put_present(scene, parameter, x), parameter.value
 
 
 def _words_and_unit(scene: Scene, name: str) -> tuple[str, str]:

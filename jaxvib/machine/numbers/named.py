@@ -261,7 +261,7 @@ def present_numbers(scene: Scene, array: NamedNumber, field: str) -> tuple[Named
     return tuple(each for each, value in zip(array.single(scene), values, strict=True) if value != 0.0)
 
 
-def put_present(scene: Scene, array: NamedNumber, value: float) -> Scene:
+def put_present(scene: Scene, array: NamedNumber, value: float | Array) -> Scene:
     """Return the scene with `value` in every entry of an array. Absent springs and dampers stay absent, see
     `present_numbers`."""
     old, new = array.read(scene), jnp.full(array.size, value)
