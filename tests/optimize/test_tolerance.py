@@ -60,7 +60,7 @@ def test_range_of_an_array_adds_no_spring():
     two = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
     sums = tolerance_ranges(two, [total("machine.stiffness")], ["machine.stiffness=4e4..6e4"], samples=4)[0]
     np.testing.assert_allclose([sums.low, sums.worst], [4.25e4 + 0.025 * 1.5e4, 5.75e4])
-    with pytest.raises(jv.InputError, match="machine.damping is 0 in every entry"):
+    with pytest.raises(jv.InputError, match=r"machine\.damping is 0 in every entry"):
         read_tolerances(two, ["machine.damping=1..2"])
 
 

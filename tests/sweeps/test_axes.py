@@ -98,7 +98,7 @@ def test_an_axis_of_an_array_adds_no_spring():
     given = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
     axis = axis_of(given, "machine.stiffness", [1e4, 2e4])
     assert put(given, (axis.target,), np.array([2e4])).machine.stiffness.tolist() == [2e4, 0.0]
-    with pytest.raises(jv.InputError, match="axes.machine.damping is 0 in every entry"):
+    with pytest.raises(jv.InputError, match=r"axes\.machine\.damping is 0 in every entry"):
         axis_of(given, "machine.damping", [1.0, 2.0])
 
 
