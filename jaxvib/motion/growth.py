@@ -131,11 +131,11 @@ def growth(
     - `scene` with a drive of constant speed, or with several exciters, whose drives may be motors
     - `until`, s or text: approximate length of all stretches together; each stretch is a whole number of turns of the rotor;
       typical: 20 to 200
-    - `start`, `mode`, `separation`: as for `simulate`
+    - `start`, `mode`, `separation`: as for `simulate`, except "spin_up"
     - `stretches`: number of stretches, at least 8; typical: 40 (the default). One stretch must be so short that two motions
       with the initial distance d_0 are still close to each other at its end
 
-    **Returns** `Growth`. **Raises** `InputError` for a drive whose speed changes; `ComputationError` for a run that fails.
+    **Returns** `Growth`. **Raises** `InputError` for a rotor whose speed changes; `ComputationError` for a run that fails.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -148,7 +148,7 @@ def growth(
     """
     require_known(scene, "scene", "growth", "use jam_orbit or simulate in it")
     scene = validate_scene(scene)
-    scene = with_settled_drives(scene, "the growth of disturbances needs a constant speed, use ConstantSpeed")
+    scene = with_settled_drives(scene, start, "the growth of disturbances needs a constant rotor speed; use ConstantSpeed")
     if count(stretches, "stretches") < 8:
         raise InputError("stretches", f"is {stretches}; at least 8 are needed to estimate the scatter of the rate")
     end = float(number(until, "s", "until", low=0.0, open_low=True))

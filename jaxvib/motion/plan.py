@@ -431,12 +431,14 @@ def _rates(scenes: Scene) -> tuple[Array, Array]:
     return jax.vmap(lambda scene: (frequency_bounds(scene)[0], fastest_decay(scene)))(scenes)
 
 
-def with_settled_drives(scene: Scene, problem: str) -> Scene:
+def with_settled_drives(scene: Scene, start: Start | State | None, problem: str) -> Scene:
     """Return the scene with motors switched off from the start if they are switched off during the run.
 
-    **Raises** `InputError` with the `problem` for an ideal drive whose speed changes, and for the motor of a single exciter
-    with loads.
+    **Raises** `InputError` with the `problem` for an ideal drive whose speed changes, for the motor of a single exciter with
+    loads, and for the start "spin_up".
     """
+    if isinstance(start, str) and start == "spin_up":
+        raise InputError("start", f"is 'spin_up'; {problem} and start='rest', or simulate")
     for k, exciter in enumerate(scene.exciters):
         drive = exciter.drive
         if not drive.constant and (drive.ideal or scene.is_plain):

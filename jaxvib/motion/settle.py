@@ -85,7 +85,7 @@ def settle(
     **Arguments**
 
     - `scene` with a drive of constant speed
-    - `start`, `mode`: as for `simulate`; default: near the jam mode `mode`; without a mode, at rest
+    - `start`, `mode`: as for `simulate`, except "spin_up"; default: near the jam mode `mode`; without a mode, at rest
     - `separation`: angle between neighbouring loads at a named start, rad; default: as for `simulate`, in a jam 1 degree
     - `drift`: drift below which a motion has settled, see `Measured`; typical: 1e-3 to 1e-8; default: 1e-6, in single precision
       1e-3. A drift given here must be reached; with the default, motions that beat or creep also count as settled. In addition,
@@ -105,7 +105,7 @@ def settle(
     **Returns** the `Run` of the last stretch, without a trajectory and without an estimate of its error.
 
     **Raises** `ComputationError` (status "not_settled", or "left_mode" if the loads settled in another mode than `mode`),
-    `InputError` for a drive whose speed changes; and the errors of `simulate`.
+    `InputError` for a rotor whose speed changes; and the errors of `simulate`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -161,7 +161,7 @@ def _plan_settle(
     """Validate the arguments of `settle` and choose its stretches. **Raises** `InputError`."""
     require_known(scene, "scene", "settle", "use jam_orbit or simulate in it")
     scene = validate_scene(scene)
-    scene = with_settled_drives(scene, "a motion settles under a constant speed: use ConstantSpeed")
+    scene = with_settled_drives(scene, start, "a motion settles at a constant rotor speed; use ConstantSpeed")
     count(periods, "periods")
     double = scene.top_speed.dtype.itemsize >= 8
     default_drift = 1e-6 if double else 1e-3

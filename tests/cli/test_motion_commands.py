@@ -109,7 +109,7 @@ def test_settle_and_growth_pass_their_options(typed, tmp_path, monkeypatch):
     code, _, err = typed("growth", "machine.toml", "--until", "4s", "--stretches", "5")
     assert code == 2 and "stretches is 5; at least 8 are needed" in err
     code, _, err = typed("growth", "machine.toml", "--until", "4s", "--start", "spin_up")
-    assert code == 2 and "--start is 'spin_up'" in err
+    assert code == 2 and "start is 'spin_up'" in err
 
 
 @pytest.mark.parametrize("command", ["simulate", "settle", "envelope", "growth", "run-up-map"])

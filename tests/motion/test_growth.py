@@ -143,6 +143,7 @@ def test_wrapped_angles_are_compared_across_a_turn(monkeypatch):
     [
         (dict(stretches=4), "at least 8 are needed"),
         (dict(start="jam"), "mode is missing"),
+        (dict(start="spin_up"), "start is 'spin_up'; the growth of disturbances needs a constant rotor speed"),
         (dict(until=0.0), "greater than 0"),
         (dict(until=1e308), "turns of the rotor"),
     ],

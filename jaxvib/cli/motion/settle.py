@@ -134,8 +134,6 @@ def growth(scene: Path, speed: str | None, output: Output, **options: Any) -> No
 
     The growth shows if the motion is regular, unstable, chaotic or undecided. It also determines the time after which
     derivatives are meaningless."""
-    if options["start"] == "spin_up":
-        raise InputError("--start", "is 'spin_up'; the growth of disturbances needs a constant speed, use 'rest' or 'jam'")
     result = jv.growth(loaded_scene(scene, speed=speed, constant=True), **_with_start(options))
     output.picture("growth.png", result.plot)
     output.done(result.as_dict(), result.summary, "growth", result)
