@@ -132,9 +132,9 @@ class BatchRun(NamedTuple):
     """Run of a batch with its measurements.
 
     **Attributes**: `scene`; `window`: trajectory in the measuring window; `measured`: the quantities measured in the window;
-    `regime` of the window, None without loads or with several exciters; `part_speed` (PARTS_OF_RUN, count): mean speeds of the
-    loads, or of rotors without loads, rad/s, over the equal parts before the window; `part_length` of such a part, s; `finite`:
-    True if the motion stayed finite; `peaks` of the whole run, None if the plan has no blocks.
+    `regime` of the window, None for a scene that is not plain (`Scene.is_plain`); `part_speed` (PARTS_OF_RUN, count): mean
+    speeds of the loads, or of rotors without loads, rad/s, over the equal parts before the window; `part_length` of such a
+    part, s; `finite`: True if the motion stayed finite; `peaks` of the whole run, None if the plan has no blocks.
     """
 
     scene: Scene
@@ -204,8 +204,7 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     window = trajectory(model, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length
     measured = measure(model, field, times, states, natural_units(scene))
-    has_regime = len(scene.exciters) == 1 and scene.exciter.loads is not None
-    kind = regime(scene, window) if has_regime else None
+    kind = regime(scene, window) if scene.is_plain else None
     peaks = None
     if part_peaks is not None:
         last_peaks = locate_peaks(model, field, times, states)

@@ -226,7 +226,7 @@ def _solver_for_derivatives(adjoint: diffrax.AbstractAdjoint | None) -> LoopDopr
 def _stretches(scene: Scene, end: Array, state: State, fastest: Array | np.ndarray) -> int:
     """Return the number of consecutive integrations. It is above 1 for long runs in single precision, which cannot resolve a
     step at a late time."""
-    if state.displacement.dtype.itemsize >= 8 or len(scene.exciters) != 1 or not scene.drive.constant:
+    if state.displacement.dtype.itemsize >= 8 or len(scene.exciters) != 1 or not scene.exciter.drive.constant:
         return 1
     return max(1, math.ceil(float(end * fastest) / (2.0 * math.pi * _STRETCH_TURNS)))
 

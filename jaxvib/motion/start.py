@@ -113,11 +113,10 @@ def initial_state(
         return with_spin(scene, on_device(state))
     if mode is None:
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
-    if not scene.drive.constant:
-        raise InputError(
-            "start", f"is 'jam', but the drive is {quoted(scene.drive.kind)} and starts at another speed; use start='rest'"
-        )
     try:
+        if not scene.drive.constant:
+            problem = f"is 'jam', but the drive is {quoted(scene.drive.kind)} and starts at another speed; use start='rest'"
+            raise InputError("start", problem)
         modes = jam_modes(scene)
     except InputError as error:
         problem, _, advice = error.problem.partition(";")

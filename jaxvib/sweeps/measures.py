@@ -59,7 +59,7 @@ def _regime_measure(name: str, unit: str, field: str, meanings: tuple[str, ...] 
 
     def read(run: BatchRun) -> Array:
         if run.regime is None:
-            problem = f"is {name}, which needs a scene with one exciter and loads"
+            problem = f"is {name}, which needs a scene with one anticlockwise exciter that has loads and no unbalance"
             raise InputError(
                 "measure", f"{problem}; for other scenes use run.load_speed, run.relative_rotation or run.shaft_torque"
             )

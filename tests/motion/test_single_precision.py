@@ -8,6 +8,7 @@ import pytest
 from scenes import published, scene
 
 import jaxvib as jv
+from jaxvib.motion.plan import plan_stretch
 
 
 def test_a_long_run_keeps_its_phase():
@@ -41,6 +42,15 @@ def test_single_precision_keeps_its_phase():
         bound = 2.0 * float(np.spacing(times[-1])) / float(times[-1] - times[0])
         np.testing.assert_allclose(float(run.omega), 100.0, rtol=bound)
     assert np.max(np.abs((phase + np.pi) % (2.0 * np.pi) - np.pi)) < 100.0 * float(np.spacing(times[-1])) + 1e-3
+
+
+def test_long_runs_are_divided_in_both_directions():
+    for way in (1, -1):
+        turning = jv.Scene(scene().machine, exciters=[jv.Exciter(scene().loads, scene().drive, direction=way)])
+        with jax.enable_x64(False):
+            single = machine32(turning)
+            plan = plan_stretch(single, 3e3, jv.initial_state(single), jv.Tolerance(1e-5), throw=True)
+        assert plan.stretches == 3
 
 
 def test_an_imbalance_sets_the_unit_where_loads_hardly_shake():

@@ -73,6 +73,11 @@ def test_impossible_starts_name_an_alternative():
             "start is 'jam', but effects cubic_support and stop are not included in this function (term SupportForce); "
             "start at 'rest', or from a State"
         )
+    loads, drive = scene().loads, scene().drive
+    clockwise, twice = [jv.Exciter(loads, drive, direction=-1)], 2 * [jv.Exciter(loads, drive)]
+    for exciters, problem in ((clockwise, r"scene\.exciters\[0\]\.direction is -1"), (twice, "scene has 2 exciters")):
+        with pytest.raises(jv.InputError, match=f"^start is 'jam', but {problem}; start at 'rest', or from a State$"):
+            jv.initial_state(jv.Scene(scene().machine, exciters=exciters), "jam", mode=3)
     with pytest.raises(jv.InputError, match=r"separation is 0\.1; it is used only with named starts"):
         jv.simulate(scene(), 1.0, start=jv.initial_state(scene()), separation=0.1)
     np.testing.assert_allclose(jv.initial_state(scene(), separation="3 deg").azimuth, -np.pi / 2 + np.deg2rad([-3.0, 0.0, 3.0]))

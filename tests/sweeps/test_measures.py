@@ -82,9 +82,21 @@ def test_runs_of_several_exciters_are_measured(tmp_path):
     assert found["relative_rotation"][0] < 0.05 and found["relative_rotation"][1] > 2.0 * np.pi
     assert 0.0 < found["settling_time"][0] < 9.0
     with pytest.raises(
-        jv.InputError, match=r"run.regime, which needs a scene with one exciter and loads; for other scenes use"
+        jv.InputError, match=r"run.regime, which needs a scene with one anticlockwise exciter .*; for other scenes use"
     ):
         jv.sweep(scene, {"exciters[0].unbalance": [1.0, 1.5]}, ["run.regime"], tmp_path / "regime.zarr", until=1.0)
+
+
+def test_runs_of_a_clockwise_exciter_are_measured(tmp_path):
+    """Without gravity its speeds are those of the anticlockwise exciter with the other sign."""
+    table, balls = jv.one_mass(mass=49.0, stiffness=4e4, damping=100.0), jv.balls(count=1, mass=0.5, radius=0.1, drag=2.0)
+    found = []
+    for way in (1, -1):
+        scene = jv.Scene(table, exciters=[jv.Exciter(balls, jv.ConstantSpeed(60.0), direction=way)])
+        path = tmp_path / f"{way}.zarr"
+        found.append(jv.sweep(scene, {"drive.speed": [25.0, 60.0]}, ["run.load_speed", "run.drift"], path, until=2.0).data)
+    for name in ("load_speed", "drift"):
+        np.testing.assert_allclose(found[1][name], found[0][name], rtol=1e-6)
 
 
 def test_a_spin_up_in_a_sweep_is_that_of_simulate(tmp_path):

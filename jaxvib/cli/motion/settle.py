@@ -83,11 +83,11 @@ def settle(
 
 
 def _modes_of(run: jv.Run) -> list[int] | None:
-    """Return the jam mode of a run in a list; None for a scene with several exciters or without loads.
+    """Return the jam mode of a run in a list; None for a scene without jam modes, see `Scene.is_plain`.
 
     **Raises** `InputError` for loads that are not jammed.
     """
-    if len(run.scene.exciters) > 1 or run.scene.exciter.loads is None:
+    if not run.scene.is_plain:
         return None
     if not (mode := int(run.regime.mode)):
         raise InputError("--tolerance", f"is for jams; these loads are {run.regime.label.replace('_', ' ')}, leave it out")
