@@ -276,7 +276,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         **Returns** `Spectrum`; for several segments its figure is a waterfall diagram, with resonances marked.
 
         **Raises** `InputError` for more segments than the samples allow, and for several segments if the run kept only its
-        window.
+        window or fewer than 3 states for each turn of the rotor.
         """
         return spectrum_of(self.scene, self.window, self.trajectory, parts)
 

@@ -37,7 +37,8 @@ class Spectrum(Result):
     **Attributes** (P segments, nf frequencies, nd coordinates, nb directions of the force)
 
     - `time` (P,), s: the middles of the segments
-    - `frequency` (nf,), rad/s; its resolution is about 2 pi divided by the duration of a segment
+    - `frequency` (nf,), rad/s, up to 1.5 times the largest rotor speed; its resolution is about 2 pi divided by the duration of
+      a segment
     - `amplitude` (P, nf, nd), m (rad for tilts)
     - `force` (P, nf, nb), N, on the foundation
     - `rotor_speeds` (P, E), rad/s, of the E exciters, and `load_speeds` (P, L), rad/s, of the L exciters with loads: means over
@@ -130,12 +131,17 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
             "parts", f"is {parts}, which leaves {size} samples for each segment; at least 64 are needed, give fewer parts"
         )
     starts = np.linspace(0, time.size - size, parts).astype(int)
-    step = float(time[1] - time[0])
+    step = float(np.ptp(time)) / (time.size - 1)  # the mean, because single precision rounds each time
     points = _ZERO_PADDING_FACTOR * 2 ** int(np.ceil(np.log2(size)))
     frequency = 2.0 * np.pi * np.fft.rfftfreq(points, step)
     speeds = np.stack([np.asarray(item, float) for item in stretch.rotor_speeds], axis=1)
     rates = [np.mean(np.asarray(item.rate[0], float), axis=1) for item in stretch.state.exciters if item.rate]
-    is_shown = frequency <= _MAX_FREQUENCY_RATIO * max(float(np.max(np.abs(speeds))), 1e-300)
+    top = max(float(np.max(np.abs(speeds))), 1e-300)
+    if np.pi / step < _MAX_FREQUENCY_RATIO * top:
+        stored = f"is {parts}, but the run has {2.0 * np.pi / (step * top):.2g} states for each turn of the rotor"
+        needed = f"{2.0 * _MAX_FREQUENCY_RATIO:g} are needed; simulate with more samples, or give 1"
+        raise InputError("parts", f"{stored}, and at least {needed}")
+    is_shown = frequency <= _MAX_FREQUENCY_RATIO * top
     weight = np.hanning(size)
 
     def amplitudes(values: np.ndarray) -> np.ndarray:

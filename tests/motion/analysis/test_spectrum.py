@@ -33,6 +33,23 @@ def test_pieces_of_a_spectrum_share_their_halves(parts, size):
     np.testing.assert_allclose(at, [0.0, 0.5, 1.0, 0.5, 0.0], atol=0.03)
 
 
+def test_spectra_of_few_samples_are_refused():
+    """Two states for each turn: a vibration at 50 rad/s would have its peak at 10 rad/s."""
+    run = jv.simulate(SCENE, 40.0, samples=764, estimate=False)
+    with pytest.raises(jv.InputError, match=r"^parts is 4, but the run has 2 states for each turn .* at least 3 are needed"):
+        run.spectrum(4)
+    assert run.spectrum().frequency[-1] > 80.0
+
+
+def test_rounded_times_do_not_move_a_peak():
+    """Late in a run in single precision a step between two times, 2^-10 s, is rounded by up to 6 %."""
+    exact = 1000.0 + 1.03 * 2.0**-10 * np.arange(4096)
+    time, wave = jnp.asarray(exact, jnp.float32), jnp.asarray(np.sin(28.0 * exact), jnp.float32)[:, None]
+    motion = Trajectory(time, jv.State(wave, wave, (wave,), (0.0 * wave,)), wave, (time,), (0.0 * time + 60.0,))
+    found = spectrum_of(SCENE, motion, None, 1)
+    assert abs(found.frequency[np.argmax(found.amplitude[0, :, 0])] - 28.0) <= found.frequency[1] / 2.0
+
+
 def test_spectrum_marks_the_speed_of_each_exciter():
     """Unbalances at 60 and 90 rad/s, clockwise and anticlockwise, on a platform far above its resonance: a peak at each."""
     exciters = [jv.Exciter(drive=jv.ConstantSpeed(w), unbalance=0.1, direction=d, at=1) for w, d in ((60.0, 1), (90.0, -1))]
