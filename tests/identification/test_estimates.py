@@ -211,7 +211,8 @@ def test_status_of_a_prediction(monkeypatch, size, chances, deviation, status, w
     monkeypatch.setattr(predict, "_at_the_fit", lambda *_: at)
     monkeypatch.setattr(predict, "_deviation", lambda *_: found)
     monkeypatch.setattr(predict, "residual_chance", chance)
-    fit = SimpleNamespace(channels=(("a", "b"), ("a",)), noise=(np.array([9.0, 9.0]), np.array([0.1])))
+    noise, time = (np.array([9.0, 9.0]), np.array([0.1])), (np.arange(4.0),) * 2
+    fit = SimpleNamespace(channels=(("a", "b"), ("a",)), noise=noise, time=time)
     run = predict.predict_run.__wrapped__(fit, None)
     assert (
         bool(run.status == getattr(PredictionStatus, status)) and run.notes[0] == "first" and len(run.notes) == 1 + len(words)
@@ -222,3 +223,14 @@ def test_status_of_a_prediction(monkeypatch, size, chances, deviation, status, w
     np.testing.assert_array_equal(run.readings, np.where(mask, raw, np.nan))
     np.testing.assert_array_equal(run.predicted, raw - left)
     assert run.channels == ("a", "new") and run.chance == deviation and run.time.tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(("own", "others"), [(0.001, 0.01), (0.01, 0.001), (0.003, 0.01), (0.01, 0.01)])
+@pytest.mark.parametrize("white", [True, False])
+def test_noise_is_compared_at_one_sampling_rate(own, others, white):
+    """White noise of one spectral density, or a slow vibration; the residuals are twice those of the fit."""
+    rng, times = np.random.default_rng(0), [step * np.arange(round(40.0 / step)) for step in (own, others)]
+    left = [rng.normal(size=t.size) / np.sqrt(t[1]) if white else np.sin(9.0 * t) for t in times]
+    parts = {"time": (times[1],), "noise": ([np.std(left[1])],), "readings": (left[1][:, None],), "fitted": (np.zeros((1, 1)),)}
+    fit = SimpleNamespace(channels=(("a",),), **parts)
+    assert predict._noise_ratio(fit, "a", times[0], 2.0 * left[0]) == pytest.approx(2.0, rel=0.06)

@@ -17,6 +17,7 @@ from jaxvib.identification.further_runs.planned import own_precisions, problem_o
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.jammed.start import with_first_motion
 from jaxvib.identification.problem import EXACT, Known, Problem, require_linear_supports, with_noise
+from jaxvib.identification.records.decimation import filter_readings
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.numerics.noise import Noise, noise_of
 from jaxvib.results.fields import in_unit
@@ -28,6 +29,10 @@ _NOISE_RATIO = 1.5
 
 _NUMBER_ERROR = 1e-6
 """Relative standard error of the numbers of a scene with loads, so small that a fit of the first state does not change them."""
+
+
+_MIN_FILTERED = 64
+"""Smallest number of residuals per factor of a reduced sampling rate; with fewer, the rest counts as white noise."""
 
 
 class PredictionStatus(eqx.Enumeration):
@@ -51,8 +56,8 @@ class RunPrediction(Result):
 
     - `status`: a `PredictionStatus`; `notes`: sentences for the reader
     - `chance` of a deviation as large as this one, if the machine is the same
-    - `channels` (C,): names; `noise` (C,), SI: standard deviation of the residuals; `ratio` (C,) of `noise` to that of the fit,
-      NaN for a channel that the fit does not have
+    - `channels` (C,): names; `noise` (C,), SI: standard deviation of the residuals; `ratio` (C,) of this standard deviation to
+      that of the fit, both at the lower one of the two sampling rates; NaN for a channel that the fit does not have
     - `time` (n,) s, `readings` and `predicted` (n, C), SI, NaN for samples that do not count
     """
 
@@ -114,10 +119,7 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     """
     at = _at_the_fit(fit, run)
     names, noise = [channel.name for channel in at.problem.runs[0].channels], np.nanstd(at.residuals, axis=0)
-    fit_noise: dict[str, float] = {}
-    for channel_names, noises in zip(fit.channels, fit.noise, strict=True):
-        fit_noise |= dict(zip(channel_names, noises, strict=True))
-    ratio = noise / np.array([fit_noise.get(name, math.nan) for name in names])
+    ratio = np.array([_noise_ratio(fit, name, at.problem.times[0], at.residuals[:, k]) for k, name in enumerate(names)])
     deviation, notes = _deviation(fit, at), []
     for k, name in enumerate(names):
         if ratio[k] > _NOISE_RATIO:
@@ -145,6 +147,28 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
         readings=np.where(mask, raw, np.nan),
         predicted=raw - at.residuals,
     )
+
+
+def _noise_ratio(fit: MachineFit, name: str, time: np.ndarray, residuals: np.ndarray) -> float:
+    """Return the standard deviation of the residuals (n,) of a channel, relative to that of the last run of the fit with this
+    channel; NaN without such a run. The one with the higher sampling rate is reduced to the rate of the other."""
+    runs = [r for r, names in enumerate(fit.channels) if name in names]
+    if not runs:
+        return math.nan
+    r, k = runs[-1], fit.channels[runs[-1]].index(name)
+    own, others = time[1] - time[0], fit.time[r][1] - fit.time[r][0]
+    of_fit = (
+        float(fit.noise[r][k]) if own < 1.5 * others else _reduced(fit.readings[r][:, k] - fit.fitted[r][:, k], own / others)
+    )
+    return (float(np.nanstd(residuals)) if others < 1.5 * own else _reduced(residuals, others / own)) / of_fit
+
+
+def _reduced(residuals: np.ndarray, ratio: float) -> float:
+    """Return the standard deviation of residuals (n,) at a sampling rate that is lower by the `ratio`."""
+    factor = max(min(round(ratio), residuals.size // _MIN_FILTERED), 1)
+    if factor > 1:
+        residuals = filter_readings(residuals, factor)[0]
+    return float(np.nanstd(residuals)) * math.sqrt(factor / ratio)
 
 
 class _Predicted(NamedTuple):
