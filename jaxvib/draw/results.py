@@ -122,7 +122,6 @@ def phase_circles(
     *,
     weights: np.ndarray | None = None,
     imbalance: complex = 0.0,
-    first: int = 1,
     resultant: bool = True,
     ax: Onto = None,
 ) -> Drawn:
@@ -130,9 +129,8 @@ def phase_circles(
 
     A black arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel.
     `weights` (count,), whose sum is 1, are those of the mean; default: equal ones. An orange arrow shows the `imbalance` of the
-    rotor, relative to the unbalance of all loads at one angle. `first`: number of the first point; loads are numbered from 1,
-    exciters from 0. `resultant`: False for masses that turn in different directions, whose mean has no meaning. `ax` must
-    contain one axes object for each circle.
+    rotor, relative to the unbalance of all loads at one angle. `resultant`: False for masses that turn in different directions,
+    whose mean has no meaning. `ax` must contain one axes object for each circle.
 
     >>> import numpy as np
     >>> len(phase_circles([("a", np.zeros(2)), ("b", np.ones(2))]).axes)
@@ -165,7 +163,7 @@ def phase_circles(
                     fontsize="x-small",
                     color="#555555",
                 )
-        _loads_on_circle(axis, angles, first)
+        _loads_on_circle(axis, angles)
         mean = np.average(np.exp(1j * angles), weights=weights) if angles.size else 0.0
         for value, color in ((mean, "black"), (imbalance, COLORS[1])) if resultant else ():
             if abs(value) > 0.02:
@@ -187,7 +185,7 @@ _SIDES, _ENDS = ("right", "left"), ("top", "bottom")
 """Alignments of a text on the left and on the right of a circle, and below and above it."""
 
 
-def _loads_on_circle(axis: Axes, angles: np.ndarray, first: int) -> None:
+def _loads_on_circle(axis: Axes, angles: np.ndarray) -> None:
     """Draw loads as points with their numbers; loads at the same angle share a label."""
     order = np.argsort(np.mod(angles + 1e-6, 2.0 * np.pi))
     groups: list[list[int]] = []
@@ -199,7 +197,7 @@ def _loads_on_circle(axis: Axes, angles: np.ndarray, first: int) -> None:
             look = {"mfc": COLORS[j % len(COLORS)], "mec": "black", "ms": 9.0, "zorder": 3 + 0.01 * j}
             axis.plot([np.cos(angles[j])], [np.sin(angles[j])], MARKERS[j % len(MARKERS)], **look)
         e = np.mean(np.exp(1j * angles[group]))
-        names = ", ".join(str(j + first) for j in sorted(group)) if len(group) < 5 else f"{len(group)} loads"
+        names = ", ".join(str(j + 1) for j in sorted(group)) if len(group) < 5 else f"{len(group)} loads"
         x, y = 1.15 * np.real(e / abs(e)), 1.15 * np.imag(e / abs(e))
         # The text begins at the point and extends away from the circle.
         across, up = (("center" if abs(v) < 0.5 else names_of[int(v > 0.0)]) for v, names_of in ((x, _SIDES), (y, _ENDS)))

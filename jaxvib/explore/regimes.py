@@ -122,8 +122,9 @@ def _panels(
     found = [(_panel(0, "rotor speed, rpm", high, (0.0, 1.06 * high)), {"": speed}), logarithmic(1, titles[0], moving)]
     if len(scene.exciters) == 1:
         return [*found, logarithmic(2, titles[1], force)]
-    phases = {f"exciter {k}": _with_gaps(np.rad2deg(np.asarray(curves.phases)[:, k])) for k in range(1, len(scene.exciters))}
-    return [*found, (_panel(2, "phase, deg, relative to exciter 0", high, (-185.0, 185.0)), phases)]
+    angles = np.rad2deg(np.asarray(curves.phases))
+    phases = {f"exciter {k + 1}": _with_gaps(angles[:, k]) for k in range(1, len(scene.exciters))}
+    return [*found, (_panel(2, "phase, deg, relative to exciter 1", high, (-185.0, 185.0)), phases)]
 
 
 def _panel(k: int, title: str, high: float, limits: tuple[float, float], log: bool = False) -> Panel:

@@ -228,7 +228,7 @@ def start_notes(scene: Scene) -> list[str]:
     for k, (exciter, torques) in enumerate(zip(scene.exciters, lifting_torques(scene), strict=True)):
         if torques is None or exciter.drive.jump_ts() or float(torques[1]) > float(torques[0]):
             continue
-        which = f" of exciter {k}" if len(scene.exciters) > 1 else ""
+        which = f" of exciter {k + 1}" if len(scene.exciters) > 1 else ""
         weight, start = (f"{float(each):.3g} N m" for each in torques)
         by_plate = getattr(exciter.drive, "starting_ratio", 0.0) is None
         hint = " by Kloss's formula; give that of the catalogue as starting_ratio" if by_plate else ""

@@ -101,7 +101,7 @@ def parameter_tables(scene: Scene) -> str:
     parts = []
     owners = [("", tables, scene.exciters[0])]
     if "exciters" in tables:
-        owners = [(f"exciter {k}, ", t, e) for k, (t, e) in enumerate(zip(tables["exciters"], scene.exciters, strict=True))]
+        owners = [(f"exciter {k}, ", t, e) for k, (t, e) in enumerate(zip(tables["exciters"], scene.exciters, strict=True), 1)]
     kind = str(tables["machine"].pop("kind"))
     parts.append((f"machine: {_words(kind)}", tables["machine"], _units(type(scene.machine))))
     for prefix, table, exciter in owners:

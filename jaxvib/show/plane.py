@@ -148,7 +148,7 @@ class PlaneView(View):
             for k, (at, wheel) in enumerate(zip(self._axes, self.wheels, strict=True)):
                 x, y = self.scale * at
                 look: Look = {"fontsize": "x-small", "ha": "center", "va": "top"}
-                texts.append(Text(float(x), float(y) - wheel.rim - 0.05, str(k), look))
+                texts.append(Text(float(x), float(y) - wheel.rim - 0.05, str(k + 1), look))
         return texts
 
     def supports(self) -> list[tuple[float, float]]:

@@ -96,7 +96,7 @@ def _evenly_spread(loads: Loads | None) -> tuple[np.ndarray, ...]:
 def caption(scene: Scene) -> str:
     """Return a short description of loads, unbalances, drives and effects for the title of a sketch."""
     lines: dict[str, list[int]] = {}
-    for k, exciter in enumerate(scene.exciters):
+    for k, exciter in enumerate(scene.exciters, 1):
         lines.setdefault("\n".join(_words_of(exciter)), []).append(k)
     if len(scene.exciters) == 1:
         lines_of_text = list(lines)

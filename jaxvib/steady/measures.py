@@ -239,7 +239,7 @@ class VibrationMeasures(Readable):
             passed = f"of the exciter's {quantity_text(self.exciter_force, 'N', 4)}, {100.0 * ratio:.3g} % reach the foundation"
             lines.append(passed + (f" (isolation {100.0 * (1.0 - ratio):.3g} %)" if ratio < 1.0 else ""))
         shafts = [f"{float(t):.4g} N m, {float(p):.4g} W" for t, p in zip(self.torque, self.power, strict=True)]
-        number = [""] if len(shafts) == 1 else [f" of exciter {k}" for k in range(len(shafts))]
+        number = [""] if len(shafts) == 1 else [f" of exciter {k + 1}" for k in range(len(shafts))]
         lines += [f"shaft{k}: {text}" for k, text in zip(number, shafts, strict=True) if "nan" not in text]
         return "\n".join([*lines, *self._throw_text()])
 

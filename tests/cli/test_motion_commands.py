@@ -327,7 +327,7 @@ def test_a_motor_that_cannot_start_is_named(tmp_path, capsys):
     scene = jv.load_scene(path)
     weight = 0.7246113537767085 * 9.80665 * float(scene.exciters[0].unbalance)
     start = float(scene.exciters[0].drive.torque(0.0))
-    note = f"note: the motor of exciter 0 cannot start: the weight of its unbalance needs {weight:.3g} N m"
+    note = f"note: the motor of exciter 1 cannot start: the weight of its unbalance needs {weight:.3g} N m"
     assert capsys.readouterr().err == f"{note}, its starting torque is {start:.3g} N m\n" and start < weight
     loaded_scene(path, ["gravity"])
     assert capsys.readouterr().err == ""
@@ -350,7 +350,7 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     assert (tmp_path / "o" / "regimes.png").stat().st_size > 10_000
     out = typed("regimes", "screen.toml", "--deck", "0.4, 0.1", "--slope", "-5 deg")[1]
     assert "954.887" in out and "point (0.4, 0.1) m: stroke" in out and max(map(len, out.splitlines())) <= 80
-    assert "rotation: exciter 0 anticlockwise, exciter 1 clockwise" in out and "margin: factor" in out
+    assert "rotation: exciter 1 anticlockwise, exciter 2 clockwise" in out and "margin: factor" in out
     assert "natural frequencies: 42.706, 42.706, 51.247 rpm" in out and "stable, above all natural frequencies:" in out
     code, _, err = typed("regimes", "screen.toml", "--slope", "10")
     assert code == 2 and "--slope is 10 rad (573 degrees), no slope of a deck; write degrees as '10 deg'" in err

@@ -212,10 +212,9 @@ def test_a_legend_ends_before_the_header_of_the_values():
     assert axis.get_legend().get_window_extent().x1 <= header.get_window_extent().x0
 
 
-@pytest.mark.parametrize("first", [0, 1])
-def test_points_on_a_circle_begin_with_the_first_number(first):
-    texts = [text.get_text() for text in phase_circles([("", np.array([0.5, 2.0]))], first=first).axes[0].texts]
-    assert {f"{first}", f"{first + 1}"} <= set(texts)
+def test_points_on_a_circle_are_numbered_from_1():
+    texts = [text.get_text() for text in phase_circles([("", np.array([0.5, 2.0]))]).axes[0].texts]
+    assert {"1", "2"} <= set(texts) and "0" not in texts
 
 
 def test_a_branch_crosses_a_speed_between_its_points():

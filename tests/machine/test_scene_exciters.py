@@ -120,7 +120,7 @@ def test_numbers_of_several_exciters_have_names():
     assert {"exciters[0].loads.mass", "exciters[1].drive.stall_torque", "exciters[1].unbalance"} < set(names)
     assert {"exciters[1].effects.static_imbalance.moment", "effects.gravity.g", "machine.mass"} < set(names)
     found = find_number(scene, "exciters[1].unbalance", "axes")
-    assert found.words(scene) == ["unbalance of the rotor (exciter 1)"] and found.unit == "kg m"
+    assert found.words(scene) == ["unbalance of the rotor (exciter 2)"] and found.unit == "kg m"
     assert put_numbers(scene, [found], jnp.asarray([0.7])).exciters[1].unbalance == 0.7
     assert "loads.mass" in numbers_of(jv.Scene(TWO, LOADS, DRIVE))
 

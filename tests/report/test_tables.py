@@ -60,6 +60,6 @@ def test_a_report_shows_what_the_terminal_would(tmp_path):
 
 def test_exciters_are_numbered_and_placed_with_a_unit():
     text = parameter_tables(jv.scene_from_toml(SCREENS["feeder"]))
-    assert [head for head in cells(text, "h3") if head.startswith("exciter") and ":" not in head] == ["exciter 0", "exciter 1"]
-    table = text.partition("exciter 1<")[2]
+    assert [head for head in cells(text, "h3") if head.startswith("exciter") and ":" not in head] == ["exciter 1", "exciter 2"]
+    table = text.partition("exciter 2<")[2]
     assert cells(table)[:2] == ["-481, -390", "mm"]

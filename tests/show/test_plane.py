@@ -127,7 +127,8 @@ def test_film_shows_each_rotor_at_its_angle(run, tmp_path):
 
 def test_histories_have_a_line_for_each_rotor(run):
     speeds = run.plot().axes[4]
-    assert [text.get_text() for text in speeds.get_legend().get_texts()] == ["load 1", "load 2", "rotor 0", "rotor 1"]
+    names = [text.get_text() for text in speeds.get_legend().get_texts()]
+    assert names == ["load 1", "load 2", "rotor 1", "rotor 2 (clockwise: negative)"]
 
 
 def test_deck_on_platforms_raises_a_clear_error(run):

@@ -79,7 +79,7 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
         directions = ("anticlockwise" if exciter.direction == 1 else "clockwise" for exciter in loaded.exciters)
         notes = [
             f"natural frequencies: {speed_text(frequencies)}",
-            f"rotation: {', '.join(f'exciter {k} {direction}' for k, direction in enumerate(directions))}",
+            f"rotation: {', '.join(f'exciter {k} {direction}' for k, direction in enumerate(directions, 1))}",
             "margin: factor by which the differences of the motors' torques can grow; inf for",
             "equal motors",
             *([] if status_name(result.search) == "done" else [jv.RegimeSearchStatus[result.search]]),

@@ -127,7 +127,7 @@ def _text(
             rows = [
                 [f"{scale * points.speed[k]:.5g}", str(number), *(f"{x:.4g}" for x in (needed, motor, points.speed[k] * motor))]
                 for k in operating
-                for number, (needed, motor) in enumerate(zip(points.torque[k], points.motor_torque[k], strict=True))
+                for number, (needed, motor) in enumerate(zip(points.torque[k], points.motor_torque[k], strict=True), 1)
             ]
             head = [unit, "exciter", "torque of its vibration, N m", "of its motor, N m", "power of its motor, W"]
             lines.append(table("torques at the operating points", head, rows))

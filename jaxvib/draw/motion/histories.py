@@ -241,11 +241,12 @@ def _smoothed_peaks(values: np.ndarray) -> np.ndarray:
 
 
 def _draw_rotor_speeds(axis: Axes, time: np.ndarray, speeds: np.ndarray) -> None:
-    """Draw the speeds of the rotors (nt, exciters) as dashed lines."""
+    """Draw the speeds of the rotors (nt, exciters), negative for a clockwise rotor, as dashed lines."""
     rotors = speeds.shape[1]
     for k in range(rotors):
         look = {"color": "black" if rotors == 1 else COLORS[k % len(COLORS)], "ls": "--", "lw": 1.1}
-        axis.plot(time, speeds[:, k], label="rotor" if rotors == 1 else f"rotor {k}", **look)
+        sense = " (clockwise: negative)" if np.sum(speeds[:, k]) < 0.0 else ""
+        axis.plot(time, speeds[:, k], label=f"rotor{'' if rotors == 1 else f' {k + 1}'}{sense}", **look)
 
 
 def amplitude_histories(

@@ -96,7 +96,8 @@ class NamedNumber(NamedTuple):
         leaf, each = self.leaf(scene), self.spec.each
         words = self._numbered(scene, self.spec.words.format(load=load))
         if self.path[0] == "exciters" and len(scene.exciters) > 1:
-            return [f"{word} (exciter {self.path[1]})" for word in self._words_of_entries(scene, words, leaf, load, each)]
+            number = 1 + int(self.path[1])
+            return [f"{word} (exciter {number})" for word in self._words_of_entries(scene, words, leaf, load, each)]
         return self._words_of_entries(scene, words, leaf, load, each)
 
     def _words_of_entries(self, scene: Scene, words: str, leaf: Array, load: str, each: str) -> list[str]:

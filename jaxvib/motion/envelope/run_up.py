@@ -93,7 +93,7 @@ class MotorRunUp(Result):
         lines = [self.message, *(f"  {note}" for note in start_notes(self.scene))]
         if self.status_name == "not_turning":
             lines.append("without gravity (exciters that are turning already):")
-        for k, (speed, caught) in enumerate(zip(np.asarray(self.speed), np.asarray(self.caught_at).tolist(), strict=True)):
+        for k, (speed, caught) in enumerate(zip(np.asarray(self.speed), np.asarray(self.caught_at).tolist(), strict=True), 1):
             at = f", caught by resonance {caught} at {speed_text(self.resonances[caught - 1])}" if caught else ""
             lines.append(f"  exciter {k}: {speed_text(speed)}{at}")
         structure = self.scene.machine.structure()

@@ -101,7 +101,7 @@ class RegimePartitions(Result):
         return regimes
 
     def summary(self) -> str:
-        """Return a line of text for each motion: the masses of each group and its speed."""
+        """Return a line of text for each motion: the masses of each group, counted from 1, and its speed."""
         lines = []
         for group, speed, stable, growth, interaction in zip(
             self.group, self.speed, self.stable, self.growth, self.interaction, strict=True
@@ -109,7 +109,7 @@ class RegimePartitions(Result):
             named = []
             for number in range(int(np.max(group)) + 1):
                 masses = np.flatnonzero(group == number)
-                named.append(f"{', '.join(map(str, masses))}: {speed_text(speed[masses[0]], 6)}")
+                named.append(f"{', '.join(map(str, masses + 1))}: {speed_text(speed[masses[0]], 6)}")
             judged = f"{'stable' if stable else 'unstable'} ({growth:.3g} 1/s), interaction {interaction:.2g}"
             lines.append(f"{'; '.join(named)}; {judged}")
         return "\n".join(lines) or RegimeSearchStatus[RegimeSearchStatus.none]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, TypedDict, overload
+from typing import Any, overload
 
 import equinox as eqx
 import jax
@@ -176,7 +176,8 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
         """Plot the phases of the masses on a circle, each in its direction of rotation."""
         from jaxvib.draw.results import phase_circles  # slow import
 
-        return phase_circles([(speed_text(self.speed, 6), np.asarray(self.phases))], **_circle_options(self.scene), ax=ax)
+        one = [(speed_text(self.speed, 6), np.asarray(self.phases))]
+        return phase_circles(one, resultant=_has_resultant(self.scene), ax=ax)
 
 
 @cached
@@ -187,11 +188,6 @@ def _vibration_of(regime: SynchronousRegime) -> Vibration:
     return Vibration(
         speed, regime.displacement, regime.amplitude, regime.foundation_force, exciter, regime.power / rotors, regime.power
     )
-
-
-class _CircleOptions(TypedDict):
-    first: int
-    resultant: bool
 
 
 _MAX_CIRCLES = 8
@@ -239,17 +235,12 @@ class SynchronousRegimes(AbstractSynchronousRegime):
             (f"{speed_text(self.speed[k], 6)}\n{'stable' if self.stable[k] else 'unstable'}", np.asarray(self.phases[k]))
             for k in order
         ]
-        return phase_circles(sets, **_circle_options(self.scene), ax=ax)
+        return phase_circles(sets, resultant=_has_resultant(self.scene), ax=ax)
 
 
-def _circle_options(scene: Scene) -> _CircleOptions:
-    """Return options of `phase_circles`.
-
-    The masses are numbered from 1 if there are loads, otherwise from 0 like the exciters. They have a resultant if all of them
-    turn in one direction.
-    """
-    first = int(any(exciter.loads is not None for exciter in scene.exciters))
-    return {"first": first, "resultant": len({exciter.direction for exciter in scene.exciters}) == 1}
+def _has_resultant(scene: Scene) -> bool:
+    """Return True if all masses turn in one direction; otherwise the mean of their phases has no meaning."""
+    return len({exciter.direction for exciter in scene.exciters}) == 1
 
 
 @validated

@@ -477,7 +477,7 @@ def test_run_up_reads_peaks_and_speeds(monkeypatch):
     assert float(again.least_torque) == 0.5 and again.least_torque.dtype == again.resonances.dtype
     lines = again.summary().splitlines()
     assert lines[0] == "all exciters pass all resonances below their working speeds"
-    assert lines[1:3] == ["  exciter 0: 859.44 rpm", "  exciter 1: 763.94 rpm"]
+    assert lines[1:3] == ["  exciter 1: 859.44 rpm", "  exciter 2: 763.94 rpm"]
     np.testing.assert_allclose(angles[:8], np.arange(8) * np.pi / 4.0, rtol=1e-12)
     assert lines[3] == "  peaks on the way (largest of several initial angles; the figure shows one run):"
     assert lines[4].startswith("    x 4 mm") and lines[4].endswith("; foundation force 6.083 N")
@@ -487,7 +487,7 @@ def test_run_up_reads_peaks_and_speeds(monkeypatch):
     monkeypatch.setattr(run_up_module, "envelope", lambda *_, **__: slow)
     caught = jv.run_up(scene, "9 s", least=True)
     assert caught.status_name == "caught" and float(caught.least_torque) == 2.0
-    assert caught.summary().splitlines()[1].startswith("  exciter 0: 47.746 rpm, caught by resonance 1 at ")
+    assert caught.summary().splitlines()[1].startswith("  exciter 1: 47.746 rpm, caught by resonance 1 at ")
     drawn = caught.plot(unit="rad/s").axes[-2].get_lines()
     assert any(line.get_ydata()[0] == pytest.approx(float(caught.resonances[0])) for line in drawn)
     plt.close("all")
