@@ -54,7 +54,8 @@ def load_design(path: str | Path) -> Design:
     - `[search]`: the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`, `polishing`, `searcher`
 
     A quantity with `tolerances` is a statistic over machines whose parameters deviate within these tolerances: the mean
-    (`statistic = "expected"`) or the largest value (`"worst"`).
+    (`statistic = "expected"`) or the value of the worst machine (`"worst"`): the largest value, or the smallest value of a
+    quantity that is maximized or `at_least` a value.
 
     **Returns** `Design`. **Raises** `InputError` for a file that cannot be read, and for an error in it; the message names the
     field.
@@ -112,10 +113,11 @@ def _design_from_tables(scene: Scene, tables: Tables, folder: Path) -> Design:
     ties = {name: tuple(v) if isinstance(v, list) else v for name, v in tables.get("ties", {}).items()}
     free, choices = dict(tables.get("free", {})), dict(tables.get("choices", {}))
     choices = {name: _from_catalogue(scene, name, listed, folder) for name, listed in choices.items()}
-    objective, options = quantity_from_table(tables["objective"], "objective", ("maximize",))
+    is_maximized = tables["objective"].get("maximize") is True
+    objective, options = quantity_from_table(tables["objective"], "objective", ("maximize",), is_large_good=is_maximized)
     if not isinstance(options.get("maximize", False), bool):
         raise InputError("objective.maximize", f"is {quoted(options['maximize'])}; write true or false, without quotes")
-    if options.get("maximize", False):
+    if is_maximized:
         objective = -objective
     return Design(DesignSpace(scene, free, held, ties=ties, choices=choices), objective)
 
@@ -165,15 +167,20 @@ def _from_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Any:
 def _demands(table: object, section: str) -> list[Demand]:
     if isinstance(table, Mapping) and "equal_to" in table:
         raise InputError(f"{section}.equal_to", "is not a demand; a quantity keeps a value by [[hold]] with value = ...")
-    quantity, more = quantity_from_table(table, section, ("at_most", "at_least"))
+    names = ("at_most", "at_least")
+    small, more = quantity_from_table(table, section, names)
     if not more:
         raise InputError(section, "has no limit; give at_most, at_least or both")
-    comparison = {"at_most": quantity.__lt__, "at_least": quantity.__gt__}
-    return [comparison[name](limit) for name, limit in more.items()]
+    large, _ = quantity_from_table(table, section, names, is_large_good=True)
+    return [small < limit if name == "at_most" else large > limit for name, limit in more.items()]
 
 
-def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> tuple[Quantity, Tables]:
+def quantity_from_table(
+    table: object, section: str, more: tuple[str, ...], *, is_large_good: bool = False
+) -> tuple[Quantity, Tables]:
     """Return the quantity that a table in the `section` of a file describes, and the values of the table's fields in `more`.
+
+    The worst machine within tolerances has the largest value or, if `is_large_good` is True, the smallest value.
 
     **Raises** `InputError` for an unknown quantity, and for values that are not allowed.
     """
@@ -191,13 +198,20 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
     if "mode" in values:
         count(values["mode"], f"{section}.mode")
     quantity = build_part(_QUANTITIES[name], values, section)
+    for key in ("statistic", "samples"):
+        if key in table and "tolerances" not in table:
+            raise InputError(f"{section}.{key}", "is used only with tolerances; give tolerances too, or leave it out")
     if "tolerances" in table:
         statistic = table.get("statistic", "expected")
         if not isinstance(statistic, str) or statistic not in _STATISTICS:
             raise InputError(
                 f"{section}.statistic", f"is {quoted(statistic)}; {suggest_name(str(statistic), list(_STATISTICS))}"
             )
-        quantity = _STATISTICS[statistic](quantity, table["tolerances"], samples=table.get("samples", 64))
+        is_least = is_large_good and statistic == "worst"
+        over = _STATISTICS[statistic](
+            -quantity if is_least else quantity, table["tolerances"], samples=table.get("samples", 64)
+        )
+        quantity = (-over).named(f"worst {quantity.words}") if is_least else over
     return quantity, {k: table[k] for k in more if k in table}
 
 

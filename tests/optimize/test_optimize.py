@@ -22,6 +22,8 @@ from optimize import (
     support_frequency_squared,
     synthesize,
     total,
+    total_mass,
+    worst,
 )
 from optimize.files import TEMPLATES as DESIGNS
 
@@ -290,6 +292,23 @@ def test_design_files_equal_designs_in_python(tmp_path, monkeypatch):
     assert design.objective.statistic == "expected" and design.objective.case.samples == 64
 
 
+def test_worst_machine_of_a_maximum_has_the_least_value(tmp_path):
+    (tmp_path / "machine.toml").write_text(jv.scene_to_toml(scene("two_mass")))
+    over = 'quantity = "total_mass"\ntolerances = { "machine.mass" = 0.1 }\nsamples = 8\nstatistic = "worst"'
+    demand = f"[[demand]]\n{over}\nat_least = 1.0\nat_most = 999.0\n"
+    text = f'scene = "machine.toml"\n[free]\n"machine.mass" = [1, 99]\n[objective]\n{over}\nmaximize = true\n{demand}'
+    (tmp_path / "design.toml").write_text(text)
+    design = load_design(tmp_path / "design.toml")
+    least, most = (
+        s * float(worst(s * total_mass(), {"machine.mass": 0.1}, samples=8)(design.space.scene)) for s in (-1.0, 1.0)
+    )
+    assert float(design.objective(design.space.scene)) == -least > -most
+    assert [float(d.quantity(design.space.scene)) for d in design.subject_to] == [most, least]
+    assert [d.words for d in design.subject_to] == [
+        f"worst mass of platforms and loads at {x} kg" for x in ("most 999", "least 1")
+    ]
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -315,12 +334,13 @@ def test_design_files_equal_designs_in_python(tmp_path, monkeypatch):
         (("[objective]", '[[demand]]\nquantity = "power"\nmode = 3\nat_most = "3 kg"\n[objective]'), "is not in W"),
         (("[objective]", "[ties]\nx = 3\n[objective]"), "ties.x is not a parameter of this scene"),
         (("[objective]", '[choices]\n"loads.drag" = 3\n[objective]'), "give a list of values"),
-        (("# tolerances", "tolerances"), "objective.statistic is 'worts'"),
+        (('# statistic = "worst"', 'tolerances = {}\nstatistic = "worts"'), "objective.statistic is 'worts'"),
+        (('# statistic = "worst"', 'statistic = "worst"'), "objective.statistic is used only with tolerances"),
     ],
 )
 def test_wrong_design_files_raise_clear_errors(tmp_path, change, says):
     (tmp_path / "machine.toml").write_text(jv.scene_to_toml(scene("two_mass")))
-    text = DESIGNS["design"].replace(*change).replace('# statistic = "worst"', 'statistic = "worts"')
+    text = DESIGNS["design"].replace(*change)
     (tmp_path / "design.toml").write_text(text)
     with pytest.raises(jv.InputError) as caught:
         load_design(tmp_path / "design.toml")
