@@ -216,7 +216,7 @@ def ensemble(
     if plan.is_compared:
         # The error is the part (coarse/each)^3 of the difference, as for a method of order 3. This is conservative, because the
         # method has order 8.
-        error = estimated_error(difference, (plan.coarse / plan.each) ** 3, plan.scenes)
+        error = estimated_error(difference, (plan.coarse / plan.each) ** 3, plan.scenes, ends_at_jumps=False)
     unknown = np.asarray(np.nan, plan.end.dtype)
     resolved = plan.implicit | ~is_unresolved(plan.decay, plan.end / (ENSEMBLE_PARTS * plan.each))
     if not plan.is_allowed:

@@ -120,7 +120,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
     rad, speeds of loads relative to the rotor speed.
 
     - It is estimated as a fraction of the difference to a run with larger steps, or as twice this difference if an effect is
-      not `smooth`; rounding errors are added
+      not `smooth`, or if the acceleration of a drive jumps and the steps are equal; rounding errors are added
     - A motion whose phase is not determined has a large error, but its amplitudes may be exact
     """
 

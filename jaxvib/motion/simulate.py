@@ -336,7 +336,8 @@ def _estimate_error(
     states = window.state
     coarse_states = with_nearest_turns(coarse_states, states) if angle_wrapping(scene, window.time.dtype)[0] else coarse_states
     difference = scaled_error(states, coarse_states, error_scale(states, natural_units(scene)))
-    error = estimated_error(difference, _error_share(control, coarser), scene, steps, fastest * window.time[-1])
+    radians, ends_at_jumps = fastest * window.time[-1], control.steps is None
+    error = estimated_error(difference, _error_share(control, coarser), scene, steps, radians, ends_at_jumps=ends_at_jumps)
     return jnp.where(is_known & jnp.isfinite(error), error, jnp.inf), evaluations[0] + evaluations[1]
 
 

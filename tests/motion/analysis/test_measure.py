@@ -11,7 +11,7 @@ from small_machine import small_run
 import jaxvib as jv
 from jaxvib.equations.model import assemble
 from jaxvib.motion.analysis.measure import mean_speeds, measure
-from jaxvib.motion.analysis.scaled_error import estimated_error, natural_units
+from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
 
 
 def test_measure_reads_a_known_motion():
@@ -147,6 +147,19 @@ def test_rounding_counts_for_every_step_and_radian():
     np.testing.assert_allclose(estimated_error(1e-4, 0.5, s), 5e-5, rtol=1e-12)
     bent = scene("one_mass", "balls", effects=(jv.Stop(1e6, gap=1e-3),))
     np.testing.assert_allclose(estimated_error(1e-4, 0.5, bent), 2e-4, rtol=1e-12)
+    jumping = eqx.tree_at(lambda s: s.exciters[0].drive, s, jv.RunUp(60.0, acceleration=40.0))
+    np.testing.assert_allclose(estimated_error(1e-4, 0.5, jumping), 5e-5, rtol=1e-12)
+    np.testing.assert_allclose(estimated_error(1e-4, 0.5, jumping, ends_at_jumps=False), 2e-4, rtol=1e-12)
+
+
+def test_equal_steps_across_a_jump_have_a_larger_error():
+    """The acceleration of the rotor jumps within a step; the error no longer falls with a high power of the length of steps."""
+    machine, loads = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0), jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5)
+    s = jv.Scene(machine, loads, jv.RunUp(60.0, acceleration=40.0))
+    run, exact = (jv.simulate(s, 2.0, stepsize_controller=c) for c in (jv.EqualSteps(195), jv.EqualSteps(6000)))
+    scale = error_scale(run.window.state, natural_units(s))
+    error = float(scaled_error(run.window.state, exact.window.state, scale))
+    assert error < float(run.error) < 100.0 * error
 
 
 def test_a_force_that_changes_alone_is_a_drift():
