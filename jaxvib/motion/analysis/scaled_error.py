@@ -132,9 +132,9 @@ def estimated_error(
         difference * share + 2 eps (steps + radians)
 
     If an effect is not smooth, or if the acceleration of a drive jumps within a step, the share is 2: the error then depends on
-    the positions of the steps relative to the kinks and jumps, and both runs may have the same error. Rounding adds 2 eps for each step and for each radian of the fastest
-    motion, whose phase depends on rounded times. `ensemble` omits this term, because equal steps cause much smaller rounding
-    errors.
+    the positions of the steps relative to the kinks and jumps, and both runs may have the same error. Rounding adds 2 eps for
+    each step and for each radian of the fastest motion, whose phase depends on rounded times. `ensemble` omits this term,
+    because equal steps cause much smaller rounding errors.
 
     **Arguments**: `difference`: see `scaled_error`; `share`: error of a smooth motion, relative to the difference; `steps`:
     number of steps of the run; `radians`: phase of the fastest motion over the run, rad; `ends_at_jumps`: True if steps end at
