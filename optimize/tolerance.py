@@ -106,7 +106,7 @@ def tolerance_ranges(
         is_met = np.isfinite(values)
         at_least = isinstance(item, Demand) and item.sense == "at least"
         if isinstance(item, Demand):
-            limits = np.array([float(item.limit(machine)) for machine in machines])
+            limits = np.array([_value(item.limit.simplified, machine) for machine in machines])
             is_met = values >= limits if at_least else values <= limits
         low, high = np.quantile(existing, [0.025, 0.975]) if existing.size else (np.nan, np.nan)
         worst = np.nan if not existing.size else np.min(existing) if at_least else np.max(existing)
