@@ -22,6 +22,9 @@ of the noise at the natural frequencies of its model. This gap in the spectrum o
 filter for it makes standard errors too small. With 400 white residuals of a fit with 17 unknowns, the difference is larger in 1
 of 1000 cases."""
 
+_FREQUENCIES = 2**14
+"""Number of frequencies at which a spectral density is evaluated."""
+
 _EXPECTATIONS = 40
 """Number of iterations of expectation and maximization for the distribution of outliers."""
 
@@ -50,6 +53,31 @@ class Noise(NamedTuple):
     deviation: float
     outliers: float = 0.0
     width: float = 1.0
+
+
+def resampled(noise: Noise, ratio: float) -> Noise:
+    """Return noise with the same spectral density at a sampling step that is `ratio` times as long, without outliers.
+
+    Above the highest frequency of the given noise, its density is that at this frequency. The coefficients follow from the
+    covariances at the new step by the Yule-Walker equations.
+
+    >>> white = resampled(Noise(np.ones(1), 3.0), 9.0)
+    >>> white.taps.tolist(), white.deviation
+    ([1.0], 1.0)
+    >>> resampled(Noise(np.array([1.0, -0.9]), 1.0), 1.0).taps.round(6).tolist()
+    [1.0, -0.9]
+    """
+    from scipy.linalg import solve_toeplitz  # slow to import
+
+    if len(noise.taps) == 1:
+        return Noise(noise.taps, noise.deviation / math.sqrt(ratio))
+    order = len(noise.taps) - 1 if ratio == 1.0 else _MAX_ORDER
+    frequency = (np.arange(_FREQUENCIES) + 0.5) / (2.0 * _FREQUENCIES * ratio)  # per old step
+    density = np.abs(np.exp(-2j * np.pi * np.minimum(frequency, 0.5)[:, None] * np.arange(len(noise.taps))) @ noise.taps) ** -2
+    waves = np.cos(2.0 * np.pi * ratio * np.arange(order + 1)[:, None] * frequency)
+    covariance = noise.deviation**2 / ratio * (waves @ density) / _FREQUENCIES
+    taps = np.asarray(solve_toeplitz(covariance[:-1], -covariance[1:]))
+    return Noise(np.concatenate([[1.0], taps]), math.sqrt(covariance[0] + float(covariance[1:] @ taps)))
 
 
 def noise_of(residual: np.ndarray) -> Noise:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -22,7 +21,7 @@ from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.noise import Noise
+from jaxvib.numerics.noise import Noise, noise_of, resampled
 from jaxvib.results.readable import Readable
 from jaxvib.units import Number, number
 
@@ -113,14 +112,10 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     stay jammed.
     """
     require_linear_supports(fit.scene, "plan_runs")
-    # The spectral density of the noise is the same at all sampling rates. Deviations are stored per square root of the rate.
-    deviations: dict[str, float] = {}
-    for names, noise, time in reversed(list(zip(fit.channels, fit.noise, fit.time, strict=True))):
-        deviations |= dict(zip(names, noise * math.sqrt(time[1] - time[0]), strict=True))
-    deviations |= {name: each / math.sqrt(planned.rate) for name, each in planned.noise.items()}
+    noises = _noises(fit) | {name: (Noise(np.ones(1), each), 1.0 / planned.rate) for name, each in planned.noise.items()}
     vibration_channels = [channel for channel in planned.channels if channel.kind in MOTIONS]
     for channel in vibration_channels:
-        if channel.name not in deviations:
+        if channel.name not in noises:
             there = f"channel {quoted(channel.name)}"
             raise InputError(f"candidates: {planned.name}: {there}", "is new; give its noise, noise={name: standard deviation}")
     time = np.arange(0.0, planned.duration, 1.0 / planned.rate)
@@ -131,8 +126,9 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
         raise InputError("fit.scene", f"has {count} exciters; plan_runs needs a scene with one exciter")
     scene = eqx.tree_at(lambda s: s.exciters[0], fit.scene, exciter.with_parts(exciter.loads, planned.drive))
     problem = problem_of_run(fit, scene, run)
-    root = math.sqrt(float(problem.runs[0].step))
-    problem = with_noise(problem, [[Noise(np.ones(1), float(deviations[c.name]) / root) for c in vibration_channels]])
+    step, of_channels = float(problem.runs[0].step), [noises[channel.name] for channel in vibration_channels]
+    # The spectral density of the noise is the same at all sampling rates.
+    problem = with_noise(problem, [[resampled(noise, round(step / own, 9)) for noise, own in of_channels]])
     problem = problem._replace(precisions=own_precisions(fit, problem))
     linear = np.zeros(unknown_count(problem) - problem.unknowns.count)
     size = 1.0 if exciter.unbalance is None else float(np.asarray(exciter.unbalance, float))
@@ -147,6 +143,17 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     fitted = information_at(problem, linear)
     has_mark = any(channel.kind in ("pulses", "angle") for channel in planned.channels)
     return Expected(fitted, *shared_places(fit, problem, has_mark))
+
+
+def _noises(fit: MachineFit) -> dict[str, tuple[Noise, float]]:
+    """Return the noise of each channel in the first run of the fit that has the channel, and the sampling step, s."""
+    noises: dict[str, tuple[Noise, float]] = {}
+    for r in reversed(range(len(fit.channels))):
+        step, residuals = float(fit.time[r][1] - fit.time[r][0]), (fit.readings[r] - fit.fitted[r]).T
+        for name, deviation, each in zip(fit.channels[r], fit.noise[r], residuals, strict=True):
+            noise = noise_of(each)
+            noises[name] = (noise if len(noise.taps) > 1 else Noise(noise.taps, float(deviation)), step)
+    return noises
 
 
 def problem_of_run(fit: MachineFit, scene: Scene, run: MeasuredRun) -> Problem:

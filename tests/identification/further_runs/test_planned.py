@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import jaxvib as jv
 from jaxvib.identification.directions import eliminate
@@ -37,7 +38,8 @@ def fit():
         scene=jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=0.05)]),
         names=NAMES, scale=np.array([4e4, 0.05, 300.0]), gain_names=("deck", "frame"), phase=np.array([0.4]),
         channels=(("frame",), ("deck", "frame")), noise=(np.array([1e-3]), np.array([5e-3, 7e-3])),
-        time=(0.01 * np.arange(3), 0.0025 * np.arange(3)), information=np.diag([4e4, 100.0, 900.0, 1e4, 1e4, 400.0]),
+        time=(0.01 * np.arange(3), 0.0025 * np.arange(3)), readings=(np.zeros((3, 1)), np.zeros((3, 2))),
+        fitted=(np.zeros((3, 1)), np.zeros((3, 2))), information=np.diag([4e4, 100.0, 900.0, 1e4, 1e4, 400.0]),
     )  # fmt: skip
 
 
@@ -71,6 +73,23 @@ def test_noise_of_another_rate_and_of_new_channels(noise, deviation):
     ]  # no gain, but the mark of the angle
     with pytest.raises(jv.InputError, match="candidates: ramp: channel 'new' is new; give its noise, noise="):
         expected_run(fit(), ramp(channels=(jv.Channel("new", "velocity", at=1),)))
+
+
+@pytest.mark.parametrize("rate", [100.0, 50.0, 200.0])
+def test_coloured_noise_keeps_its_density_at_other_rates(rate):
+    """The fit has noise with the correlation 0.9 of neighbours at 100 Hz."""
+    white = 1e-3 * np.random.default_rng(0).normal(size=20000)
+    left, taps = np.asarray(lfilter([1.0], [1.0, -0.9], white)), np.array([1.0, -0.9])
+    parts = {"time": (0.01 * np.arange(20000),), "readings": (left[:, None],), "fitted": (np.zeros((20000, 1)),)}
+    coloured = SimpleNamespace(**vars(fit()) | {"channels": (("frame",),), "noise": ([np.std(left)],)} | parts)
+    samples = expected_run(coloured, ramp(rate=rate)).fitted.problem.runs[0]
+    for frequency in (0.5, 3.0, 10.0):  # Hz
+
+        def density(taps, step, deviation, frequency=frequency):
+            return deviation**2 * step / np.abs(np.polyval(taps[::-1], np.exp(-2j * np.pi * frequency * step))) ** 2
+
+        found = density(np.asarray(samples.taps)[:, 0], 1.0 / rate, 1.0 / float(samples.weights.max()))
+        assert found == pytest.approx(density(taps, 0.01, 1e-3), rel=0.15)
 
 
 def test_information_of_a_run_is_in_the_units_of_the_fit():
