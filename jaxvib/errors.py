@@ -139,6 +139,20 @@ def require_path(value: object, field: str) -> Path:
     return Path(value)
 
 
+def with_ending(path: str | Path, ending: str) -> Path:
+    """Return the path of a file to be written, with the `ending` of its name if it is missing.
+
+    **Raises** `InputError` for a path without the name of a file.
+
+    >>> with_ending("results/run", ".npz").as_posix(), with_ending("run.npz", ".npz").as_posix()
+    ('results/run.npz', 'run.npz')
+    """
+    path = Path(path)
+    if path.name in ("", ".."):
+        raise InputError("path", f"is {quoted(str(path))}, which is a folder; name a file in it")
+    return path if path.suffix == ending else path.with_name(path.name + ending)
+
+
 @contextlib.contextmanager
 def written(path: Path) -> Iterator[Path]:
     """Yield the path of a temporary file in the same folder, which replaces the file at `path` at the end of the context.

@@ -22,7 +22,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.state import State
-from jaxvib.errors import InputError, require_one_of, require_writable, written
+from jaxvib.errors import InputError, require_one_of, require_writable, with_ending, written
 from jaxvib.exchange.c_code import CProgram, number_text, write_program
 from jaxvib.exchange.description import Fmi, Variable, describe_model
 from jaxvib.exchange.model import DriveBy, Equations, equations_of, has_events, named_entries, without_motor_states
@@ -125,8 +125,7 @@ def export_fmu(
         raise InputError("start", "is 'spin_up', which replaces the drive; give the scene a SpinUp drive and start at 'rest'")
     scene = validate_scene(scene)
     state = start_state(scene, start, mode)
-    path = Path(path)
-    path = path if path.suffix == ".fmu" else path.with_name(path.name + ".fmu")
+    path = with_ending(path, ".fmu")
     require_writable(path)
     files, statements, identifier = _source_files(scene, state, path.stem, fmi, drive)
     message = "source only: no binary was requested"

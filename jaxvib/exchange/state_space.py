@@ -15,7 +15,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.averaged import Amplitudes, averaged_field
 from jaxvib.equations.linear import linear_model
-from jaxvib.errors import InputError, optional_module, quoted, require_writable, written
+from jaxvib.errors import InputError, optional_module, quoted, require_writable, with_ending, written
 from jaxvib.exchange.model import Signal, coordinate_signals, force_inputs, foundation_forces
 from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.effects.base import terms_of
@@ -118,8 +118,7 @@ class StateSpace(NamedTuple):
 
         **Returns** the path. **Raises** `InputError` for a path that cannot be written to.
         """
-        path = Path(path)
-        path = path if path.suffix == ".mat" else path.with_name(path.name + ".mat")
+        path = with_ending(path, ".mat")
         require_writable(path)
         content: dict[str, Any] = {name: getattr(self, name) for name in ("A", "B", "C", "D", "x0", "u0", "y0", "about")}
         for kind in ("state", "input", "output"):

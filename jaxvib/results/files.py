@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.errors import CONTROL, InputError, open_regular, quoted, written
+from jaxvib.errors import CONTROL, InputError, open_regular, quoted, with_ending, written
 from jaxvib.results.fields import Plain, is_named_tuple
 from jaxvib.results.status import is_status, member, status_names
 from jaxvib.runtime.compat import enumeration_of
@@ -51,8 +51,7 @@ def save(result: eqx.Module, path: str | Path) -> Path:
     """
     arrays: dict[str, np.ndarray] = {}
     layout = json.dumps(_encoded(result, arrays))
-    path = Path(path)
-    path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+    path = with_ending(path, ".npz")
     head = {_LAYOUT: np.asarray(layout), _DIGEST: np.asarray(_digest(layout, arrays))}
     with written(path) as part, part.open("wb") as file:
         np.savez(file, **head, **arrays)  # pyright: ignore[reportArgumentType]

@@ -142,6 +142,12 @@ def test_what_no_file_can_hold_is_refused_before_writing(tmp_path, modes):
             _encoded(value, {})
 
 
+@pytest.mark.parametrize("path", [".", "..", "/", "folder/.."])
+def test_paths_without_the_name_of_a_file_are_refused(modes, path):
+    with pytest.raises(jv.InputError, match=r"^path is '.*', which is a folder; name a file in it$"):
+        modes.save(path)
+
+
 def test_a_changed_array_is_refused(modes, tmp_path):
     path = modes.save(tmp_path / "modes")
     with np.load(path) as archive:
