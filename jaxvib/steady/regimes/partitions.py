@@ -34,9 +34,11 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
+from jaxvib.results.status import status_name
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.regimes.search import exchanges_in
+from jaxvib.steady.regimes.symmetry import Exchange
 from jaxvib.steady.regimes.synchronous import (
     RegimeSearchStatus,
     SynchronousRegime,
@@ -53,6 +55,9 @@ _LARGEST_INTERACTION = 1.0
 
 _EQUAL_SPEEDS = 1e-9
 """Relative difference of speeds below which two groups are not different."""
+
+_EQUAL_NUMBERS, _EQUAL_PHASES = 1e-5, 1e-3
+"""Differences of speeds and torques, relative to the largest, and of exp(i alpha) below which two motions count as one."""
 
 _MOTIONS_PER_PROGRAM = 64
 """Number of motions whose interaction is computed in one program."""
@@ -168,8 +173,7 @@ def regime_partitions(scene: Scene, *, stable: bool = True) -> RegimePartitions:
     interaction = in_chunks(_MOTIONS_PER_PROGRAM, _interactions, rows.speed, rows.group, shared=(scene,))
     kept = np.flatnonzero(interaction <= _LARGEST_INTERACTION)
     kept = kept[np.lexsort((np.max(rows.group[kept], axis=1, initial=0), ~rows.stable[kept]))]
-    orders = np.array([exchange.permutation for exchange in exchanges_in(assemble_for_search(scene))])
-    kept = kept[_distinct(rows.speed[kept], rows.torque[kept], orders)]
+    kept = kept[_distinct(_Rows(*(field[kept] for field in rows)), exchanges_in(assemble_for_search(scene)))]
     return RegimePartitions(
         status=RegimeSearchStatus.done if kept.size else RegimeSearchStatus.none,
         group=rows.group[kept],
@@ -183,19 +187,21 @@ def regime_partitions(scene: Scene, *, stable: bool = True) -> RegimePartitions:
 
 
 class _Rows(NamedTuple):
-    """Motions: `group`, `speed`, `phases`, `torque` (n, masses); `growth` and `stable` (n,)."""
+    """Motions: `group`, `speed`, `phases`, `torque` (n, masses), `family`: True in a group whose regime is one of a family;
+    `growth` and `stable` (n,)."""
 
     group: np.ndarray
     speed: np.ndarray
     phases: np.ndarray
     torque: np.ndarray
+    family: np.ndarray
     growth: np.ndarray
     stable: np.ndarray
 
 
 def _no_rows(masses: int) -> _Rows:
     empty = np.zeros((0, masses))
-    return _Rows(empty.astype(int), empty, empty, empty, np.zeros(0), np.zeros(0, bool))
+    return _Rows(empty.astype(int), empty, empty, empty, empty.astype(bool), np.zeros(0), np.zeros(0, bool))
 
 
 def _can_share(scene: Scene, owners: np.ndarray) -> bool:
@@ -231,13 +237,13 @@ def _products(left: tuple[int, ...], regimes: dict[tuple[int, ...], list[Synchro
 
 def _motion(parts: list[_Group], count: int) -> tuple:
     """Return the fields of `_Rows` of a motion."""
-    group, (speed, phases, torque) = np.zeros(count, int), np.zeros((3, count))
+    group, family, (speed, phases, torque) = np.zeros(count, int), np.zeros(count, bool), np.zeros((3, count))
     for number, (subset, regime) in enumerate(parts):
         masses = list(subset)
-        group[masses] = number
+        group[masses], family[masses] = number, status_name(regime.status) == "degenerate"
         speed[masses], phases[masses], torque[masses] = regime.speed, regime.phases, regime.torque
     growth = max(float(regime.growth) for _, regime in parts)
-    return group, speed, phases, torque, growth, all(bool(regime.stable) for _, regime in parts)
+    return group, speed, phases, torque, family, growth, all(bool(regime.stable) for _, regime in parts)
 
 
 @cached
@@ -261,13 +267,22 @@ def _interactions(speed: Array, group: Array, scene: Scene) -> Array:
     return jax.vmap(one)(speed, group)
 
 
-def _distinct(speed: np.ndarray, torque: np.ndarray, orders: np.ndarray) -> np.ndarray:
-    """Return indices of motions (n,) of which no two differ only by an exchange of masses, `orders` (exchanges, masses)."""
-    numbers = np.stack([speed, torque], axis=-1)
-    scale = 1e-5 * np.max(np.abs(numbers), axis=(0, 1), initial=1e-300)
+def _distinct(motions: _Rows, exchanges: list[Exchange]) -> np.ndarray:
+    """Return indices of motions of which no two differ only by an exchange of masses, or by common shifts of groups."""
+    permutations, shifts = (np.array(parts) for parts in zip(*exchanges, strict=True))
+    inverses = np.argsort(permutations)
+    numbers = np.stack([motions.speed, motions.torque], axis=-1)
+    scale = _EQUAL_NUMBERS * np.max(np.abs(numbers), axis=(0, 1), initial=1e-300)
+    phasors = np.exp(1j * motions.phases)
+    # For each pair of masses of one group the difference of their phases, as a phasor; 1 in a family, 0 for two groups.
+    group, family = motions.group[:, :, None] == motions.group[:, None], motions.family[:, :, None] & motions.family[:, None]
+    pairs = np.where(group & ~family, phasors[:, :, None] * phasors[:, None].conj(), group)
     kept: list[int] = []
     for k, motion in enumerate(numbers):
-        exchanged = motion[orders]
-        if not any(np.any(np.all(np.abs(exchanged - numbers[i]) <= scale, axis=(1, 2))) for i in kept):
+        turned = pairs[k] * np.where(family[k], 1.0, np.exp(1j * (shifts[:, :, None] - shifts[:, None])))
+        exchanged = np.take_along_axis(np.take_along_axis(turned, inverses[:, :, None], 1), inverses[:, None], 2)
+        equal = np.all(np.abs(motion[inverses] - numbers[kept][:, None]) <= scale, axis=(2, 3))
+        equal &= np.all(np.abs(exchanged - pairs[kept][:, None]) <= _EQUAL_PHASES, axis=(2, 3))
+        if not np.any(equal):
             kept.append(k)
     return np.asarray(kept, dtype=int)

@@ -7,7 +7,9 @@ import pytest
 from scipy.optimize import brentq
 
 import jaxvib as jv
-from jaxvib.steady.regimes.partitions import _motion
+from jaxvib.steady.regimes.partitions import _distinct, _motion, _Rows
+from jaxvib.steady.regimes.symmetry import Exchange
+from jaxvib.steady.regimes.synchronous import RegimeStatus
 
 MASS, INERTIA = 300.0, 75.0
 
@@ -120,8 +122,54 @@ def test_a_motion_is_stable_if_all_its_groups_are():
 
     def regime(masses, growth, stable):
         numbers = np.arange(1.0, masses + 1.0)
-        return SimpleNamespace(speed=10.0 * masses, phases=numbers, torque=-numbers, growth=growth, stable=stable)
+        status = RegimeStatus.found if stable else jv.RegimeStatus.degenerate
+        return SimpleNamespace(
+            speed=10.0 * masses, phases=numbers, torque=-numbers, growth=growth, stable=stable, status=status
+        )
 
-    group, speed, phases, torque, growth, stable = _motion([((0, 2), regime(2, -2.0, True)), ((1,), regime(1, 3.0, False))], 3)
+    group, speed, phases, torque, family, growth, stable = _motion(
+        [((0, 2), regime(2, -2.0, True)), ((1,), regime(1, 3.0, False))], 3
+    )
     assert list(group) == [0, 1, 0] and list(speed) == [20.0, 10.0, 20.0] and (growth, stable) == (3.0, False)
-    assert list(phases) == [1.0, 1.0, 2.0] and list(torque) == [-1.0, -1.0, -2.0]
+    assert list(family) == [False, True, False] and list(phases) == [1.0, 1.0, 2.0] and list(torque) == [-1.0, -1.0, -2.0]
+
+
+def distinct(speed, torque, exchanges, phases=None, group=None, family=False):
+    """Return `_distinct` for motions of two masses in groups of their own if no `group` is given."""
+    n, masses = np.shape(speed)
+    rows = [
+        np.arange(masses) if group is None else group,
+        speed,
+        np.zeros(masses) if phases is None else phases,
+        torque,
+        family,
+    ]
+    rows = [np.broadcast_to(each, (n, masses)) for each in rows]
+    return _distinct(_Rows(*rows, np.zeros(n), np.ones(n, bool)), exchanges).tolist()
+
+
+SAME, SWAP = (Exchange(np.array(order), np.zeros(2)) for order in ([0, 1], [1, 0]))
+
+
+def test_motions_that_differ_by_an_exchange_are_one():
+    speed, torque = np.array([[90.0, 60.0], [60.0, 90.0], [90.0, 60.0], [90.0, 60.1]]), np.array(
+        [[5.0, 3.0], [3.0, 5.0], [5.0, 2.9], [5.0, 3.0]]
+    )  # fmt: skip
+    assert distinct(speed, torque, [SAME, SWAP]) == [0, 2, 3]
+    assert distinct(speed, torque, [SAME]) == [0, 1, 2, 3]
+    close = np.array([[90.0, 60.0], [90.0 + 8e-4, 60.0], [90.0 + 1e-3, 60.0]])
+    assert distinct(close, torque[[0, 0, 0]], [SAME]) == [0, 2]
+    assert distinct(np.zeros((0, 2)), np.zeros((0, 2)), [SAME]) == []
+
+
+def test_motions_of_other_phases_are_different():
+    """Without damping the speeds and torques of regimes in phase and in antiphase are equal."""
+    speed, torque = np.full((4, 2), 90.0), np.zeros((4, 2))
+    phases = np.array([[0.0, 0.0], [0.0, np.pi], [0.5, 0.5], [0.3, 0.3 - np.pi]])
+    assert distinct(speed, torque, [SAME, SWAP], phases, group=[0, 0]) == [0, 1]
+    assert distinct(speed, torque, [SAME, SWAP], phases) == [0]  # phases of two groups have no relation
+    assert distinct(speed, torque, [SAME, SWAP], phases, group=[0, 0], family=True) == [0]
+    # A mirror with a shift: alpha' = (alpha_2 + 1, alpha_1), of which 0, 0.4 gives 1.4, 0.
+    mirror = Exchange(np.array([1, 0]), np.array([0.0, 1.0]))
+    phases = np.array([[0.0, 0.4], [1.4, 0.0], [0.0, -0.4], [0.0, -0.6]])
+    assert distinct(speed, torque, [SAME, mirror], phases, group=[0, 0]) == [0, 2]

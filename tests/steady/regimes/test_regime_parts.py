@@ -400,25 +400,13 @@ def test_interaction_spares_prescribed_speeds():
     np.testing.assert_allclose(found, torque / 38.0 / np.hypot(J[1] * 38.0, STALL[1] / SPEEDS[1]), rtol=1e-9)
 
 
-def test_motions_that_differ_by_an_exchange_are_one():
-    speed, torque = np.array([[90.0, 60.0], [60.0, 90.0], [90.0, 60.0], [90.0, 60.1]]), np.array(
-        [[5.0, 3.0], [3.0, 5.0], [5.0, 2.9], [5.0, 3.0]]
-    )  # fmt: skip
-    same, swap = np.array([0, 1]), np.array([1, 0])
-    assert partitions._distinct(speed, torque, np.stack([same, swap])).tolist() == [0, 2, 3]
-    assert partitions._distinct(speed, torque, np.stack([same])).tolist() == [0, 1, 2, 3]
-    close = np.array([[90.0, 60.0], [90.0 + 8e-4, 60.0], [90.0 + 1e-3, 60.0]])
-    assert partitions._distinct(close, torque[[0, 0, 0]], np.stack([same])).tolist() == [0, 2]
-    assert partitions._distinct(np.zeros((0, 2)), np.zeros((0, 2)), np.stack([same])).size == 0
-
-
 def test_partitions_combine_the_regimes_of_their_groups():
     every = [each for size in (1, 2, 3) for each in itertools.combinations(range(3), size)]
     counted = {subset: [f"{subset}{k}" for k in range(sum(subset) % 2 + 1)] for subset in every}
     found = [[name for _, name in parts] for parts in partitions._products((0, 1, 2), counted)]
     assert len(found) == 1 * 2 * 1 + 2 * 1 + 1 * 2 + 2 * 1 + 2 and ["(0, 1)1", "(2,)0"] in found
     assert all(sorted(k for parts, _ in each for k in parts) == [0, 1, 2] for each in partitions._products((0, 1, 2), counted))
-    assert [len(each) for each in partitions._no_rows(4)] == [0] * 6 and partitions._no_rows(4).speed.shape == (0, 4)
+    assert [len(each) for each in partitions._no_rows(4)] == [0] * 7 and partitions._no_rows(4).speed.shape == (0, 4)
 
 
 def test_ideal_drives_of_two_speeds_cannot_share():
@@ -539,7 +527,9 @@ def test_partitions_keep_weak_interactions_and_stable_motions(monkeypatch, stabl
         numbers = np.arange(float(len(subset)))
         every = [(90.0 - sum(subset), -1.0, True), (50.0 - sum(subset), 2.0, False)]
         return [
-            SimpleNamespace(speed=w, phases=numbers, torque=10.0 * w + numbers, growth=g, stable=s)
+            SimpleNamespace(
+                speed=w, phases=numbers, torque=10.0 * w + numbers, growth=g, stable=s, status=synchronous.RegimeStatus.found
+            )
             for w, g, s in every
             if s or not stable
         ]
