@@ -65,7 +65,8 @@ class AbstractResponse(Readable):
       equal share of the torque that the motors of other exciters lack
     - `torque_share`: the sum of `torque` divided by that of `motor_torque`
 
-    Values at an undamped resonance are infinite.
+    Values at an undamped resonance are infinite. Values at speed 0 are the limits at low speeds: the transmissibility of a
+    machine on springs is 1, and the amplitude of one without supports is S/M.
     """
 
     speed: Array = eqx.field(metadata=in_unit("rad/s", "*"))
@@ -319,10 +320,30 @@ def _default_speeds(scene: Scene, top: Array, points: int) -> Array:
 @cached
 def _response(scene: Scene, speeds: Array, phases: Array) -> Response:
     model = unbalanced_model(scene, phases).decomposed()
-    status, curve = jax.vmap(partial(motion_at, model))(speeds)
-    operating, folds = operation_of(model)
     resonances = jax.lax.stop_gradient(model).modes()[0]
-    return Response(**curve, status=status, operating=operating, folds=folds, resonances=resonances, scene=scene)
+    status, curve = jax.vmap(partial(motion_at, model))(jnp.where(speeds > 0.0, speeds, _slow_speed(resonances)))
+    rests, moves = speeds == 0.0, resonances[0] == 0.0
+    for name in (
+        "displacement",
+        "amplitude",
+        "acceleration",
+        "velocity",
+        "exciter_force",
+        "foundation_force",
+        "torque",
+        "power",
+    ):
+        is_zero = rests & ~moves if name in ("displacement", "amplitude") else rests
+        curve[name] = jnp.where(is_zero.reshape((-1,) + (1,) * (curve[name].ndim - 1)), 0.0, curve[name])
+    operating, folds = operation_of(model)
+    fields = curve | {"speed": speeds}
+    return Response(**fields, status=status, operating=operating, folds=folds, resonances=resonances, scene=scene)
+
+
+def _slow_speed(resonances: Array) -> Array:
+    """Return a speed, rad/s, at which a response is its limit at speed 0, within about 1e-9 in double precision."""
+    lowest = jnp.min(jnp.where(resonances > 0.0, resonances, jnp.inf))
+    return float(jnp.finfo(lowest.dtype).eps) ** 0.3 * jnp.where(jnp.isfinite(lowest), lowest, 1.0)
 
 
 def motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dict[str, Any]]:
@@ -338,7 +359,7 @@ def motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dic
     torque = model.required_torque(omega, z)
     motor = model.drive_torque(omega, torque)
     forced = exciter > 0.0
-    ratio = jnp.where(forced, force / jnp.where(forced, exciter, 1.0), jnp.where(omega > 0.0, jnp.inf, 0.0))
+    ratio = jnp.where(forced, force / jnp.where(forced, exciter, 1.0), jnp.inf)
     share = jnp.sum(torque) / model.motor_torque(omega) if model.highest_speed is not None else jnp.ones_like(omega)
     fields = {
         "displacement": z,

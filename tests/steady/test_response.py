@@ -49,6 +49,23 @@ def test_one_mass_has_the_closed_form():
     assert found.operating.speed.tolist() == [pytest.approx(50.0 * np.pi)] and bool(found.operating.stable[0])
 
 
+def test_values_at_rest_are_limits_at_low_speeds():
+    link = {"link_stiffness": 2e5, "link_damping": 60.0}
+    free = jv.two_mass(mass=(120.0, 95.0), stiffness=(0.0, 0.0), damping=(0.0, 0.0), **link)
+    exciters = [jv.Exciter(drive=jv.ConstantSpeed(100.0), unbalance=S)]
+    for scene, ratio, amplitude in (
+        (one_mass(), 1.0, 0.0),
+        (body(exciters), 1.0, 0.0),
+        (jv.Scene(free, exciters=exciters), 0.0, S / 215.0),
+    ):
+        found = jv.response(scene, [0.0, 0.01])
+        np.testing.assert_allclose(found.transmissibility, ratio, rtol=1e-6)
+        np.testing.assert_allclose(found.amplitude[0], amplitude, rtol=1e-7)
+        forces = [found.foundation_force, found.exciter_force, found.torque[:, 0], found.power[:, 0], found.acceleration[:, 0]]
+        assert [float(each[0]) for each in forces] == [0.0] * 5 and np.all(found.status == jv.ResponseStatus.done)
+        assert float(found.speed[0]) == 0.0 < float(found.exciter_force[1])
+
+
 def dense(scene, w, phases, senses):
     """Response of a body in its plane, with its matrices from the machine and the forces written out here."""
     carrier = scene.machine.carrier()
