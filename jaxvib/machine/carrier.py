@@ -300,14 +300,6 @@ class Machine(Part):
         return None
 
     @property
-    def is_split(self) -> bool:
-        """True if horizontal and vertical values of a rotor's supports differ.
-
-        The whirls of such a rotor are ellipses, which every rotating force excites.
-        """
-        return False
-
-    @property
     def body_count(self) -> int:
         """Number of bodies on which a point is given by (x, y)."""
         return 1

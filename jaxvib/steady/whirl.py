@@ -98,6 +98,10 @@ class Whirl(Result):
       one, with which the displacement creeps back. Several overdamped motions are in the order of increasing decay
     - `forward`: (ns, nd) True if the motion turns with the rotor, False if it turns against the rotor or not at all
     - `straight`: (ns, nd) True if the axis moves on a straight line, which needs different horizontal and vertical supports
+    - `directivity`: (ns, nd) (f - b)/(f + b), where the ellipse of the motion is the sum of a forward circle of the radius f
+      and a backward circle of the radius b: 1 for a forward circle, 0 for a straight line, -1 for a backward circle, which no
+      force that turns with the rotor excites. For a rotor that tilts, f and b are root sums of squares over the displacement
+      of the axis, m, and its tilts, rad
     - `critical`: the critical speeds
     - `status`: a `WhirlStatus`; motions that are lost in rounding errors are NaN
     """
@@ -108,6 +112,7 @@ class Whirl(Result):
     decay: Array = eqx.field(metadata=in_unit("1/s", "rotor_speed", "whirl"))
     forward: Array = eqx.field(metadata=in_unit("", "rotor_speed", "whirl"))
     straight: Array = eqx.field(metadata=in_unit("", "rotor_speed", "whirl"))
+    directivity: Array = eqx.field(metadata=in_unit("", "rotor_speed", "whirl"))
     critical: CriticalSpeeds = eqx.field(metadata=part(prefix="critical_"))
 
     @property
@@ -202,7 +207,7 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
         speed = jnp.where(creeps, 0.0, jnp.where(oscillates & (values.imag > 0.0), values.imag, jnp.inf))
         return jnp.lexsort((-values.real, speed))[:nd], oscillates
 
-    def at(n: Array) -> tuple[Array, Array, Array, Array, Array]:
+    def at(n: Array) -> tuple[Array, ...]:
         resisting = carrier.damping + n * gyroscopic
         values = jnp.linalg.eigvals(first_order(resisting))
         # The coupling is too small to change the speeds. It separates two whirls of equal speed.
@@ -220,13 +225,14 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
             -values.real[chosen],
             turns & (_sense(model.mount, chosen_shapes) > 0.0) & ~straight,
             straight,
+            _directivity(model.mount, chosen_shapes),
             error[nearest][chosen] > MAX_EIGENVALUE_ERROR,
         )
 
-    speed, decay, forward, straight, lost = jax.vmap(at)(speeds)
+    speed, decay, forward, straight, directivity, lost = jax.vmap(at)(speeds)
     status = WhirlStatus.where(jnp.any(lost), WhirlStatus.lost_digits, WhirlStatus.done)
     speed, decay = (jnp.where(lost, jnp.nan, x) for x in (speed, decay))
-    return Whirl(status, speeds, speed, decay, forward, straight, critical=_critical_speeds(model, loads))
+    return Whirl(status, speeds, speed, decay, forward, straight, directivity, critical=_critical_speeds(model, loads))
 
 
 def _coupling_size(dtype: np.dtype) -> float:
@@ -351,6 +357,13 @@ def _sense(mount: Mount, shapes: Array) -> Array:
     the rotor."""
     moved = jnp.stack(mount.rows).astype(shapes.dtype) @ shapes
     return jnp.sum(jnp.imag(moved[:, 0] * jnp.conj(moved[:, 1])), axis=0)
+
+
+def _directivity(mount: Mount, shapes: Array) -> Array:
+    """Return (f - b)/(f + b) for shapes (nd, k), see `Whirl`."""
+    moved = jnp.stack(mount.rows).astype(shapes.dtype) @ shapes
+    forward, backward = (jnp.sqrt(jnp.sum(jnp.abs(moved[:, 0] + turn * moved[:, 1]) ** 2, axis=0)) for turn in (1j, -1j))
+    return (forward - backward) / (forward + backward)
 
 
 def _is_straight(model: LinearModel, shapes: Array) -> Array:

@@ -1,11 +1,13 @@
 """Rotors whose supports differ across and up: against NumPy and SciPy in the fixed frame, and time integration."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
 
 import jaxvib as jv
+from jaxvib.motion.analysis import regime
 
 K, UP, B, BUP = (6.0e5, 5.0e5), (9.0e5, 8.0e5), (440.0, 400.0), (300.0, 350.0)
 L, MASS, ACROSS, ALONG = (0.165, -0.155), 37.0, 0.479, 0.2
@@ -49,6 +51,24 @@ def test_matrices_are_those_of_each_support():
     np.testing.assert_allclose(carrier.foundation_damping, c[:2], rtol=1e-14, atol=1e-12)
     equal, plain = (rotor(stiffness_up=up).carrier().stiffness for up in (K, None))
     np.testing.assert_array_equal(equal, plain)
+
+
+@pytest.mark.parametrize("up", [9e4, 4e4])
+def test_whirls_with_a_forward_part_are_excited(up):
+    """M = m 1, K = diag(k, up), G = g (0 1; -1 0): (k - m w^2) y + i w n g z = 0, so that z = i (k - m w^2)/(w n g) y."""
+    mass, g, n = 20.0, 4.0, 100.0
+    skew = g * np.array([[0.0, 1.0], [-1.0, 0.0]])
+    machine = jv.from_matrices(mass * np.eye(2), np.zeros((2, 2)), np.diag([4e4, up]), skew, places=[[0, 1]])
+    whirls = jv.whirl(scene(machine), n, loads="none")
+    values = np.roots([mass**2, 0.0, -mass * (4e4 + up) - (n * g) ** 2, 0.0, 4e4 * up])
+    w = np.sort(values[values > 0.0])
+    ratio = (4e4 - mass * w**2) / (w * n * g)
+    np.testing.assert_allclose(whirls.speed[0], w, rtol=1e-9)
+    exact = (np.abs(1.0 - ratio) - np.abs(1.0 + ratio)) / (np.abs(1.0 - ratio) + np.abs(1.0 + ratio))
+    np.testing.assert_allclose(whirls.directivity[0], exact, atol=1e-6)
+    np.testing.assert_array_equal(whirls.forward[0], exact > 0.0)
+    natural = regime._resonances(scene(machine), jnp.asarray(n))
+    assert np.isfinite(natural).tolist() == [True, up != 4e4]
 
 
 def test_critical_speeds_split_as_by_numpy():

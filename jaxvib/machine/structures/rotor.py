@@ -156,11 +156,6 @@ class Rotor(Machine):
         """Return the coordinates of a translation by 1 m in the second direction: upward if the axis is horizontal."""
         return np.array([0.0, 1.0, 0.0, 0.0])
 
-    @property
-    def is_split(self) -> bool:
-        """True if vertical values of the supports are given."""
-        return self.stiffness_up is not None or self.damping_up is not None
-
     def shaft_supports(self) -> list[tuple[float, float, float]]:
         """Return the two supports with their vertical values; if terms replace these, the values with the same total force."""
         position = np.asarray(self.position)
@@ -333,11 +328,6 @@ class PlanarRotor(Machine):
             foundation_damping=matrix(self.damping, self.damping_up),
             coordinates=("y", "z"),
         )
-
-    @property
-    def is_split(self) -> bool:
-        """True if vertical values of the support are given."""
-        return self.stiffness_up is not None or self.damping_up is not None
 
     def upward(self) -> np.ndarray:
         """Return the coordinates of a translation by 1 m in the second direction: upward if the axis is horizontal."""

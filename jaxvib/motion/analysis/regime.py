@@ -39,6 +39,9 @@ below which the lag is steady. A load with a steady lag is jammed, even if the l
 STILL_SHARE = 0.01
 """Speed of a rotor, relative to a working or resonance speed, below which texts state that it is at rest."""
 
+_BACKWARD = -0.98
+"""Directivity of a whirl up to which it counts as a backward circle, that is with at most 1 % of forward motion."""
+
 _EQUAL_FREQUENCIES = 1e-6
 """Relative difference of natural frequencies up to which they count as equal."""
 
@@ -307,11 +310,11 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
     """Return the natural frequencies that turning loads excite, rad/s, ascending.
 
-    For a gyroscopic rotor these are the frequencies of the forward whirls at the rotor speed, or of all whirls if the
-    horizontal and the vertical values of its supports differ. Missing frequencies are infinite.
+    For a gyroscopic rotor these are the frequencies of the whirls at the rotor speed that are not backward circles. Missing
+    frequencies are infinite.
     """
     if scene.mounting.gyroscopic is None:
         return estimated_frequencies(scene)
     whirls = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
-    excited = jnp.isfinite(whirls.speed[0]) if scene.machine.is_split else whirls.forward[0] & jnp.isfinite(whirls.speed[0])
+    excited = (whirls.speed[0] > 0.0) & (whirls.directivity[0] > _BACKWARD)
     return jnp.sort(jnp.where(excited, whirls.speed[0], jnp.inf))
