@@ -49,13 +49,22 @@ def _platforms(scene: Scene, least: int) -> Platforms:
 def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[str, tuple[Number, Number]]:
     """Return the bounds k/`range_` and k*`range_` of the stiffness k of each spring in the fields `kinds` of the machine."""
     bounds: dict[str, tuple[Number, Number]] = {}
+    factor = _factor(range_)
     for kind in kinds:
-        for k, value in enumerate(np.asarray(getattr(machine, kind))):
+        for k, value in enumerate(np.asarray(getattr(machine, kind)).tolist()):
             if value > 0.0:
-                bounds[f"machine.{kind}[{k}]"] = (float(value / range_), float(value * range_))
+                bounds[f"machine.{kind}[{k}]"] = (value / factor, value * factor)
     if not bounds:
         raise InputError("scene", "has no springs that can be changed")
     return bounds
+
+
+def _factor(range_: Number) -> float:
+    """Return the factor by which springs may differ. **Raises** `InputError` if it is not greater than 1."""
+    factor = number_in(range_, "", "range_")
+    if not factor > 1.0:
+        raise InputError("range_", f"is {quoted(range_)}; it must be greater than 1, such as 1.5")
+    return factor
 
 
 def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
@@ -150,12 +159,13 @@ def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[
     at most 1.
     """
     count(mode, "mode")
-    if not 0.0 < keep <= 1.0:
+    share = number_in(keep, "", "keep")
+    if not 0.0 < share <= 1.0:
         raise InputError("keep", f"is {quoted(keep)}; it must be greater than 0 and at most 1")
     machine = _platforms(scene, 1)
     space = DesignSpace(scene, _springs(machine, 3.0, ("stiffness", "link_stiffness")))
     amplitude_of_mode = amplitude(mode=mode, of=of)
-    return Design(space, -fold_margin(mode=mode), subject_to=(amplitude_of_mode > keep * float(amplitude_of_mode(scene)),))
+    return Design(space, -fold_margin(mode=mode), subject_to=(amplitude_of_mode > share * float(amplitude_of_mode(scene)),))
 
 
 def linear_screen(
@@ -238,10 +248,11 @@ def feeder(
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine.
     """
     free, ties = _exciters(scene, 2, reach)
+    factor = _factor(range_)
     for k, support in enumerate(scene.machine.supports):  # pyright: ignore[reportAttributeAccessIssue]
         for j, value in enumerate(np.asarray(support.stiffness).tolist()):
             if value > 0.0:
-                free[f"machine.supports[{k}].stiffness[{j}]"] = (value / range_, value * range_)
+                free[f"machine.supports[{k}].stiffness[{j}]"] = (value / factor, value * factor)
     middle = _middle(points)
     held = [hold(throw_angle(at=middle), angle), hold(throw_stroke(at=middle), stroke)]
     space = DesignSpace(scene, free, held, ties=ties)
@@ -271,7 +282,8 @@ def _exciters(scene: Scene, least: int, reach: Number) -> tuple[dict[str, Bounds
 
 def _middle(points: Sequence[Sequence[Number]]) -> tuple[float, float]:
     """Return the mean (x, y), m, of the points of a deck."""
-    if not isinstance(points, (list, tuple)) or not all(isinstance(p, (list, tuple)) and len(p) == 2 for p in points):
+    is_list = isinstance(points, (list, tuple)) and len(points) > 1
+    if not is_list or not all(isinstance(p, (list, tuple)) and len(p) == 2 for p in points):
         raise InputError("points", f"is {quoted(points)}; it must be a list of at least two points (x, y)")
     x, y = np.mean([[number_in(v, "m", f"points[{k}]") for v in p] for k, p in enumerate(points)], axis=0).tolist()
     return x, y

@@ -9,11 +9,13 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
+from jaxvib.machine.files import SCREENS
 from jaxvib.machine.numbers.named import find_number, put_numbers
 from optimize import DesignSpace, Quantity, amplitude, fold_margin, force_per_amplitude, pareto, recipes
-from optimize.recipes import anti_resonance, antiphase, lightest_exciter, retune, widest_range
+from optimize.recipes import anti_resonance, antiphase, feeder, lightest_exciter, linear_screen, retune, widest_range
 
 SCENE = scene("two_mass", speed=120.0)
+SCREEN = jv.scene_from_toml(SCREENS["linear_screen"])
 
 
 def test_front_contains_machines_between_its_ends():
@@ -177,6 +179,11 @@ def test_the_widest_range_is_that_of_the_whole_branch():
         (lambda: antiphase(3.0), "needs a machine of platforms"),
         (lambda: widest_range(SCENE, mode=3, keep=2.0), "at most 1"),
         (lambda: lightest_exciter(scene("one_mass", "pendulums"), 0.01, mode=1), "differs from load to load"),
+        (lambda: widest_range(SCENE, mode=3, keep="much"), "keep is 'much'"),
+        (lambda: antiphase(SCENE, range_=0.0), "range_ is 0.0; it must be greater than 1"),
+        (lambda: antiphase(SCENE, range_="wide"), "range_ is 'wide'"),
+        (lambda: feeder(SCREEN, points=[(0.0, 0.0), (1.0, 0.0)], range_=0), "range_ is 0; it must be greater than 1"),
+        (lambda: linear_screen(SCREEN, points=[]), "must be a list of at least two points"),
         (lambda: pareto(None, None, None, points=1), "space is None; it must be a DesignSpace"),
     ],
 )
