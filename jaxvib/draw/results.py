@@ -139,40 +139,45 @@ def phase_circles(
     columns = max(len(sets), 1) if ax is not None else min(max(len(sets), 1), 4)
     rows = 1 if ax is not None else -(-max(len(sets), 1) // columns)
     figure, axes = panels(rows, columns, size=(3.2, 3.2), ax=ax)
-    turn = np.linspace(0.0, 2.0 * np.pi, 181)
     for k, axis in enumerate(axes):
-        axis.set(aspect="equal", xlim=(-1.6, 1.6), ylim=(-1.35, 1.35))
         axis.set_axis_off()
-        if k >= len(sets):
-            continue
-        title, angles = sets[k]
-        axis.plot(np.cos(turn), np.sin(turn), color=GUIDE, lw=0.9)
-        for degrees in range(0, 360, 45):
-            e = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
-            tick = np.outer(e, [0.96, 1.04])
-            axis.plot(tick[0], tick[1], color=GUIDE, lw=0.9)
-            is_free = np.all(np.abs(np.exp(1j * angles) - complex(*e)) > 0.3)  # no load is near the label
-            if degrees % 90 == 0 and is_free:
-                side = {0: "right", 180: "left"}.get(degrees, "center")
-                axis.text(
-                    0.88 * float(e[0]),
-                    0.88 * float(e[1]),
-                    f"{degrees}°",
-                    ha=side,
-                    va="center",
-                    fontsize="x-small",
-                    color="#555555",
-                )
-        _loads_on_circle(axis, angles)
-        mean = np.average(np.exp(1j * angles), weights=weights) if angles.size else 0.0
-        for value, color in ((mean, "black"), (imbalance, COLORS[1])) if resultant else ():
-            if abs(value) > 0.02:
-                arrow = {"arrowstyle": "-|>", "lw": 1.6, "color": color, "shrinkA": 0.0, "shrinkB": 0.0}
-                axis.annotate("", (np.real(value), np.imag(value)), (0.0, 0.0), arrowprops=arrow)
-        axis.plot([0.0], [0.0], "+", color="black", ms=7.0)
-        text = f"\n{_resultant_text(mean, imbalance)}" if resultant else ""
-        axis.set_title(f"{title}{text}", fontsize="medium")
+        if k < len(sets):
+            draw_circle(axis, *sets[k], weights=weights, imbalance=imbalance, resultant=resultant)
     return figure if ax is None else ax
+
+
+def draw_circle(
+    axis: Axes,
+    title: str,
+    angles: np.ndarray,
+    *,
+    weights: np.ndarray | None = None,
+    imbalance: complex = 0.0,
+    resultant: bool = True,
+) -> None:
+    """Draw angles (count,) rad as points on a circle, with arrows, see `phase_circles`."""
+    axis.set(aspect="equal", xlim=(-1.6, 1.6), ylim=(-1.35, 1.35))
+    axis.set_axis_off()
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    axis.plot(np.cos(turn), np.sin(turn), color=GUIDE, lw=0.9)
+    for degrees in range(0, 360, 45):
+        e = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+        tick = np.outer(e, [0.96, 1.04])
+        axis.plot(tick[0], tick[1], color=GUIDE, lw=0.9)
+        is_free = np.all(np.abs(np.exp(1j * angles) - complex(*e)) > 0.3)  # no load is near the label
+        if degrees % 90 == 0 and is_free:
+            side = {0: "right", 180: "left"}.get(degrees, "center")
+            look: Look = {"ha": side, "va": "center", "fontsize": "x-small", "color": "#555555"}
+            axis.text(0.88 * float(e[0]), 0.88 * float(e[1]), f"{degrees}°", **look)
+    _loads_on_circle(axis, angles)
+    mean = np.average(np.exp(1j * angles), weights=weights) if angles.size else 0.0
+    for value, color in ((mean, "black"), (imbalance, COLORS[1])) if resultant else ():
+        if abs(value) > 0.02:
+            arrow = {"arrowstyle": "-|>", "lw": 1.6, "color": color, "shrinkA": 0.0, "shrinkB": 0.0}
+            axis.annotate("", (np.real(value), np.imag(value)), (0.0, 0.0), arrowprops=arrow)
+    axis.plot([0.0], [0.0], "+", color="black", ms=7.0)
+    text = f"\n{_resultant_text(mean, imbalance)}" if resultant else ""
+    axis.set_title(f"{title}{text}", fontsize="medium")
 
 
 def _resultant_text(mean: complex, imbalance: complex) -> str:

@@ -14,7 +14,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, Onto, speed_text
 from jaxvib.equations.averaged import require_rotating_masses
-from jaxvib.equations.linear import linear_model, peak_force
+from jaxvib.equations.linear import linear_model, natural_frequencies, peak_force
 from jaxvib.equations.torque_balance import (
     TorqueBalance,
     assemble_for_search,
@@ -22,6 +22,7 @@ from jaxvib.equations.torque_balance import (
     balance_of_group,
     balance_residuals,
     can_start,
+    influence_of,
     motion_of,
     owners_of,
     response_of,
@@ -190,8 +191,11 @@ def _vibration_of(regime: SynchronousRegime) -> Vibration:
     )
 
 
-_MAX_CIRCLES = 8
-"""Maximum number of regimes in a figure."""
+_MAX_CIRCLES = 7
+"""Maximum number of circles in a figure."""
+
+_CURVE_POINTS = 401
+"""Number of speeds of the curves of torques."""
 
 
 class SynchronousRegimes(AbstractSynchronousRegime):
@@ -224,18 +228,44 @@ class SynchronousRegimes(AbstractSynchronousRegime):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the phases of the masses of each regime on a circle: the stable ones first, and at most 8 without `ax`.
+        """Plot the torques of the motors over the speed with all regimes, and the phases of each regime on a circle.
 
-        **Returns** a matplotlib figure, or the given `ax`, which must contain one axes object for each regime.
+        Circles begin with the stable regimes; without `ax` there are at most 7. The torques that the vibration needs are those
+        at the phases of the first regime. There is no panel of torques for regimes of some of the masses, and without motors
+        and loads.
+
+        **Returns** a matplotlib figure, or the given `ax`, which must contain one axes object for each panel.
         """
-        from jaxvib.draw.results import phase_circles  # slow import
+        from jaxvib.draw.motion.regimes import DrawnRegime, TorqueCurves, regimes_chart  # slow import
 
         order = np.argsort(~np.asarray(self.stable), kind="stable")[: None if ax is not None else _MAX_CIRCLES]
-        sets = [
-            (f"{speed_text(self.speed[k], 6)}\n{'stable' if self.stable[k] else 'unstable'}", np.asarray(self.phases[k]))
+        regimes = [
+            DrawnRegime(float(self.speed[k]), np.asarray(self.phases[k]), np.asarray(self.torque[k]), bool(self.stable[k]))
             for k in order
         ]
-        return phase_circles(sets, resultant=_has_resultant(self.scene), ax=ax)
+        owners, curves = mass_owners(self.scene), None
+        if regimes and self.phases.shape[1] == owners.size:
+            curves = TorqueCurves(*map(np.asarray, _torque_curves(self.scene, self.phases[order[0]])))
+            curves = None if np.all(np.isnan(curves.driving)) else curves
+        names = [f"{'motor' if self.scene.exciters[owner].loads is None else 'load'} {k + 1}" for k, owner in enumerate(owners)]
+        resonances = np.asarray(natural_frequencies(self.scene))
+        return regimes_chart(regimes, curves, resonances, names=names, resultant=_has_resultant(self.scene), ax=ax)
+
+
+@cached
+def _torque_curves(scene: Scene, phases: Array) -> tuple[Array, Array, Array]:
+    """Return speeds up to the largest working speed, and at each the torques of the drives and those that the vibration needs.
+
+    The torque of an ideal drive is NaN.
+    """
+    balance = assemble_torque_balance(scene)
+    speeds = balance.speed * jnp.linspace(0.0, 1.0, _CURVE_POINTS)[1:]
+
+    def torques(w: Array) -> tuple[Array, Array]:
+        needed = -torques_at(balance.unbalance, influence_of(balance, w), w, jnp.exp(1j * phases))
+        return jnp.where(balance.is_prescribed, jnp.nan, balance.driving_torque(w)), needed
+
+    return (speeds, *jax.vmap(torques)(speeds))
 
 
 def _has_resultant(scene: Scene) -> bool:

@@ -474,11 +474,16 @@ def test_summary_and_plot_of_regimes(two):
     for index in (3, -1):
         with pytest.raises(jv.InputError, match=rf"^index is {index}; there are 3 regimes, counted from 0"):
             several.select(index)
-    assert [each.get_title()[:11] for each in several.plot().axes[:3]] == ["300 rpm\nsta", "290.451 rpm", "280.901 rpm"]
+    torques, *circles = several.plot().axes
+    titles = [each.get_title() for each in circles]
+    assert [each.partition(",")[0] for each in titles] == ["300 rpm", "290.451 rpm", "280.901 rpm"]
+    assert titles[0].startswith("300 rpm, stable\nphases 0, -90 deg\ntorques ")
+    named = {text.get_text() for text in torques.get_legend().get_texts()}
+    assert torques.get_ylabel() == "torque, N m" and {"of motor 1", "of motor 2", "regime; hollow: unstable"} <= named
     (axis,) = regime.plot().axes
     assert axis.get_title() == "300 rpm" and {"1", "2"} <= {text.get_text() for text in axis.texts}
     mixed = eqx.tree_at(lambda r: r.stable, as_list(regime, 12), jnp.arange(12) == 11)
-    assert [axis.get_title().rpartition("\n")[2] for axis in mixed.plot().axes] == ["stable", *7 * ["unstable"]]
+    assert ["unstable" in axis.get_title() for axis in mixed.plot().axes[1:]] == [False, *6 * [True]]
     same = [jv.Exciter(drive=each.drive, unbalance=each.unbalance, at=each.at) for each in TWO.exciters]
     together = eqx.tree_at(lambda r: r.scene, regime, jv.Scene(TWO.machine, exciters=same))
     assert together.plot().axes[0].get_title().startswith("300 rpm\nresultant")
