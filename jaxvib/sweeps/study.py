@@ -119,10 +119,12 @@ def _run_plan(
     """Return the plan of the runs of all cases, or None if no measure needs a run."""
     runs = [m for m in measures if isinstance(m, RunMeasure)]
     if not runs:
-        if until is not None or any(axis.target.number is None for axis in axes):
-            field = "until" if until is not None else next(f"axes.{a.name}" for a in axes if a.target.number is None)
+        options = {"until": until, "mode": mode, "steps": steps, "start": None if start == "rest" else start}
+        fields = [name for name, value in options.items() if value is not None]
+        fields += [f"axes.{axis.name}" for axis in axes if axis.target.number is None]
+        if fields:
             problem = "applies to runs, but no quantity is measured in a run; measure for example run.regime"
-            raise InputError(field, problem)
+            raise InputError(fields[0], problem)
         return None
     if until is None:
         raise InputError("until", f"is missing; {runs[0].name} is measured in a run; give the duration of the run")
