@@ -35,6 +35,8 @@ def test_limits_have_the_gain_from_their_change():
     np.testing.assert_allclose(
         [held.value, held.violation, held.multiplier, held.gain], [7.007, 1e-3, -2.0, -2.0 / 5.0], rtol=1e-12
     )
+    falling = problem_of(DesignSpace(SCENE, FREE, [hold(SUM, -7.0)]), WISH, demands)  # an increase is a smaller modulus
+    assert limits_of(falling, demands, found, sides)[0].multiplier == 2.0
     assert first.active and first.violation == 0.0 and first.what == "first at most 4"
     np.testing.assert_allclose([first.multiplier, first.gain], [-3.0, -3.0 / 5.0], rtol=1e-12)
     assert (first.value, first.limit, room.value, room.limit) == (4.0, 4.0, 4.0, 8.0)
