@@ -189,7 +189,8 @@ def _steps(scene: Scene, channels: tuple[Channel, ...], step: Array, turn: Array
     force = jnp.stack(forces, axis=1)  # (nd, E, 2, 2)
     c, s = jnp.cos(turn), jnp.sin(turn)
     force = jnp.einsum("neaf,ab->nebf", force, jnp.asarray([[c, -s], [s, c]]))
-    scale = jax.lax.stop_gradient(jnp.sqrt(jnp.max(jnp.diagonal(stiffness) / jnp.diagonal(mass))))
+    square = jnp.max(jnp.diagonal(stiffness) / jnp.diagonal(mass))
+    scale = jax.lax.stop_gradient(jnp.sqrt(jnp.where(square > 0.0, square, 1.0)))  # any number for a free machine
     solved = jnp.linalg.solve(mass, jnp.concatenate([stiffness / scale, damping, force.reshape(nd, -1)], axis=1))
     elastic, viscous, accelerance = solved[:, :nd], solved[:, nd : 2 * nd], solved[:, 2 * nd :].reshape(force.shape)
     zero = jnp.zeros((nd, nd))

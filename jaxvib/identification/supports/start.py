@@ -26,6 +26,10 @@ _STRENGTH = 0.3
 """Standard deviation of the random changes of the velocities at a sample, relative to the largest velocities, for readings with
 errors of their own size."""
 
+_DECAY = 0.999
+"""Factor on the motion in each sample of the filter. Without it the filter does not exist for a free mass between stops, whose
+displacement no accelerometer observes."""
+
 _OPEN_GAP = 1.1
 """First value of a gap that is not touched, relative to the largest displacement."""
 
@@ -76,7 +80,7 @@ def _guide(problem: Problem, r: int, x: np.ndarray, linear: np.ndarray) -> np.nd
     nd, random = states.shape[1] // 2, np.zeros(len(power))
     random[nd : 2 * nd] = (_STRENGTH * np.max(np.abs(states[: len(problem.raw[r]), nd:]), axis=0)) ** 2
     noise = np.diag(np.array(channel_sizes(problem)[r]) ** 2)
-    covariance = solve_discrete_are(power.T, outputs.T, np.diag(random), noise)
+    covariance = solve_discrete_are(_DECAY * power.T, outputs.T, np.diag(random), noise)
     return covariance @ outputs.T @ np.linalg.inv(outputs @ covariance @ outputs.T + noise)
 
 

@@ -21,6 +21,7 @@ from jaxvib.equations.state import State
 from jaxvib.identification.jammed.motion import _recorded, closed_motion, linearized
 from jaxvib.identification.problem import build_problem
 from jaxvib.identification.supports.contact import HeldStop, held, switched_step
+from jaxvib.identification.supports.start import _guide
 from jaxvib.ode.dopri8_loop import LoopDopri8
 
 SHORT = TIMES[:300]
@@ -137,6 +138,17 @@ def test_recorded_readings_are_at_the_times_of_the_motion():
     values, used = _recorded(samples)
     np.testing.assert_allclose(values[:, 0], jnp.arange(8.0) - 3.5)
     assert np.all(used)
+
+
+def test_free_mass_between_stops_is_not_guided():
+    """No accelerometer observes the motion of a mass without springs."""
+    machine, t = jv.one_mass(mass=50.0, stiffness=0.0, damping=0.0), 0.008 * np.arange(200)
+    exciter = jv.Exciter(drive=jv.RunUp(60.0, acceleration=6.0), unbalance=0.05)
+    scene = jv.Scene(machine, exciters=[exciter], effects=jv.Stop(3e5, gap=1e-3))
+    run = jv.MeasuredRun.from_arrays([jv.Channel("a", "acceleration", at=1)], t, {"a": np.sin(20.0 * t)})
+    problem = build_problem(scene, [run], ["machine.mass"], {})
+    guide = _guide(problem, 0, np.zeros(problem.unknowns.count), np.array([0.05, 0.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_array_equal(guide, np.zeros((2, 1)))
 
 
 FACTORS = {"stop[0].gap": 1.2, "stop[0].stiffness": 1.3, "machine.stiffness": 1.1, "machine.damping": 0.67}
