@@ -333,7 +333,11 @@ def shapes_of(machine: Machine, at: Place = None) -> tuple[Carrier, Mount]:
     """Return the names, directions and shapes of the carrier, and of the mount of an exciter at `at`, without values."""
     platform, position = (at, None) if isinstance(at, int) else (None, at)
     leaves, rest = jax.tree.flatten((machine, position))
-    return _structure(rest, tuple(map(shape_and_dtype, leaves)), jnp.result_type(float), platform)
+    try:
+        return _structure(rest, tuple(map(shape_and_dtype, leaves)), jnp.result_type(float), platform)
+    except InputError:
+        machine.mount(at)  # raises the same error, with the place in place of its shape
+        raise
 
 
 def shape_and_dtype(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:

@@ -240,7 +240,8 @@ class Scene(Part):
                     _require_effect(effect, machine, exciter.loads)
             with within(self.prefix_of(k)):
                 machine.require_body(exciter.body)
-            _require_stations(machine, exciter)
+                levers = machine.mounting(exciter.place).levers
+            _require_stations(levers, exciter.loads)
             with within(self.prefix_of(k)):
                 _require_fit(machine, exciter)
 
@@ -327,15 +328,14 @@ def _require_anticlockwise(exciter: Exciter) -> Exciter:
     return exciter
 
 
-def _require_stations(machine: Machine, exciter: Exciter) -> None:
-    """**Raises** `InputError` for a place that the machine does not have, and if there are not as many stations as loads."""
-    loads = exciter.loads
-    for levers in machine.mounting(exciter.place).levers:
-        if levers is not None and (loads is None or levers.shape != (loads.count,)):
+def _require_stations(levers: Sequence[Array | None], loads: Loads | None) -> None:
+    """**Raises** `InputError` if there are not as many stations as loads."""
+    for lever in levers:
+        if lever is not None and (loads is None or lever.shape != (loads.count,)):
             needed = (
                 "give the exciter a place, at=..., m" if loads is None else f"one for all loads or {loads.count} are needed"
             )
-            raise InputError("machine.stations", f"has {levers.shape[0]} values; {needed}")
+            raise InputError("machine.stations", f"has {lever.shape[0]} values; {needed}")
 
 
 def _require_fit(machine: Machine, exciter: Exciter) -> None:

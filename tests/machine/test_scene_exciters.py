@@ -14,11 +14,19 @@ from jaxvib.machine.numbers.named import find_number, numbers_of, put_numbers
 LOADS, DRIVE = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0)
 MOTOR = jv.DCMotor(100.0, stall_torque=5.0, inertia=0.1)
 TWO = machines()["two_mass"]
+ROTOR = jv.rotor(
+    mass=37.0, transverse_inertia=0.5, polar_inertia=0.1, stiffness=(6e5, 5e5), damping=(400.0, 300.0), position=(0.2, -0.2)
+)
+SCREEN = jv.plane_body(mass=300.0, inertia=75.0, supports=[jv.support(at=(0.5, 0.0), stiffness=(1e5, 2e5), damping=(1, 1))])
 
 
 def two(**changes):
     clockwise = {"drive": MOTOR, "unbalance": 0.2, "at": 1, "direction": -1, "effects": jv.StaticImbalance(0.1)} | changes
     return jv.Scene(TWO, exciters=[jv.Exciter(LOADS, DRIVE), jv.Exciter(**clockwise)], effects=jv.Gravity())
+
+
+def one_on(machine, at):
+    return jv.Scene(machine, exciters=[jv.Exciter(LOADS, DRIVE, at=at)])
 
 
 def test_one_exciter_is_the_short_form():
@@ -130,7 +138,7 @@ BAD = {
     "negative unbalance": (lambda: two(unbalance=-0.2), r"unbalance is -0.2 kg m; it must be greater than 0"),
     "neither": (lambda: two(unbalance=None), r"loads is None; .* or give an unbalance"),
     "no drive": (lambda: two(drive=None), r"drive is None; it must be a Drive"),
-    "platform": (lambda: two(at=3), r"at is 3; the machine has platforms 1 to 2"),
+    "platform": (lambda: two(at=3), r"^exciters\[1\].at is 3; the machine has platforms 1 to 2"),
     "truth value": (lambda: two(at=True), r"at is True; it must be a whole number"),
     "distance": (lambda: two(at="2 mm"), r"at is a distance along a rotor's axis; name a platform instead"),
     "friction without loads": (lambda: two(effects=jv.DryFriction(0.01, 0.02)), r"acts on loads, but this exciter has none"),
@@ -143,6 +151,8 @@ BAD = {
         lambda: jv.Scene(TWO, LOADS, DRIVE, exciters=[jv.Exciter(LOADS, DRIVE)]),
         "are given together with loads or drive",
     ),
+    "point": (lambda: one_on(SCREEN, at=0.5), r"^at is .*0\.5.*; on a body in a plane give \(x, y\)"),
+    "position": (lambda: one_on(ROTOR, at=(0.5, 0.25)), r"^at is .*0\.5 *,? *0\.25.*, a point of a body; on a rotor give"),
     "body": (lambda: jv.Exciter(LOADS, DRIVE, body=0.5), r"body is 0.5; it must be a whole number, at least 0"),
     "none": (lambda: jv.Scene(TWO, exciters=[]), r"exciters is \[\]; it must be a list of exciters"),
     "replaced number": (

@@ -18,7 +18,7 @@ from jaxvib.units import count
 from jaxvib.units.known import when_known
 
 _MAX_ASYMMETRY = 1e-9
-"""Largest asymmetry of a mass or stiffness matrix, relative to its largest entry."""
+"""Largest asymmetry of a matrix, relative to its largest entry, in double precision."""
 
 
 class MatrixMachine(Machine):
@@ -85,7 +85,7 @@ def from_matrices(
     **Arguments** (numbers and arrays in SI; nd coordinates of the model, nb directions of the force)
 
     - `mass` M and `stiffness` K (nd, nd), symmetric, M positive definite, K without negative eigenvalues
-    - `damping` C (nd, nd)
+    - `damping` C (nd, nd), real; for the structural damping of a finite-element model give an equivalent viscous damping
     - `gyroscopic` G (nd, nd), skew-symmetric: the factor of the rotor speed n in the equation; None without a rotor
     - `places`: a list of points to which exciters can be attached, numbered from 1 in `Exciter(at=)`. Each is a list of the
       indices of its coordinates, [up], [horizontal, up] or [horizontal, up, rotation], or a matrix (1 to 3, nd) that gives its
@@ -96,8 +96,8 @@ def from_matrices(
 
     **Returns** `MatrixMachine`.
 
-    **Raises** `InputError` for matrices of other shapes, values that are not finite, an asymmetric or indefinite mass or
-    stiffness matrix, and coordinates that do not exist.
+    **Raises** `InputError` for matrices of other shapes, values that are complex or not finite, an asymmetric or indefinite
+    mass or stiffness matrix, a gyroscopic matrix that is not skew-symmetric, and coordinates that do not exist.
 
     >>> import jaxvib as jv, numpy as np
     >>> chain = 4e4 * (2 * np.eye(30) - np.eye(30, k=1) - np.eye(30, k=-1))
@@ -115,6 +115,8 @@ def from_matrices(
     force = None if foundation is None else _read_foundation(foundation, size)
     for name, matrix in (("machine.mass", m), ("machine.stiffness", k)):
         when_known(lambda matrix, name=name: require_definite(matrix, name, positive=name == "machine.mass"), matrix)
+    if g is not None:
+        when_known(_require_skew, g)
     limit = size if reduce is None else count(reduce, "machine.reduce")
     if size > limit:
         modes = _lowest_modes(m, k, limit)
@@ -134,6 +136,9 @@ def _lowest_modes(mass: Array, stiffness: Array, number: int) -> Array:
 
 def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:
     """Return a matrix, square if `shape` is None; a number stands for a 1 x 1 matrix."""
+    if np.iscomplexobj(value):
+        problem = "is complex; a real one is needed, structural damping as an equivalent viscous damping in machine.damping"
+        raise InputError(name, problem)
     try:
         matrix = jnp.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:
@@ -150,13 +155,25 @@ def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:
 def require_definite(matrix: np.ndarray | float, name: str, *, positive: bool) -> None:
     """**Raises** `InputError` for a matrix that is asymmetric, or has eigenvalues below 0 (if `positive`: at most 0)."""
     full = np.atleast_2d(matrix)
-    scale = float(np.max(np.abs(full), initial=1e-300))
-    if np.max(np.abs(full - full.T)) > _MAX_ASYMMETRY * scale:
+    allowed_error = _allowed_error(full)
+    if np.max(np.abs(full - full.T)) > allowed_error:
         raise InputError(name, "is not symmetric; put skew-symmetric parts into gyroscopic, or take (A + A^T)/2")
     least = float(np.min(np.linalg.eigvalsh(full)))
-    if least <= 0.0 if positive else least < -_MAX_ASYMMETRY * scale:
+    if least <= 0.0 if positive else least < -allowed_error:
         allowed = "greater than 0" if positive else "at least 0"
         raise InputError(name, f"has the eigenvalue {least:g}; all must be {allowed}")
+
+
+def _require_skew(matrix: np.ndarray | float) -> None:
+    full = np.atleast_2d(matrix)
+    if np.max(np.abs(full + full.T)) > _allowed_error(full):
+        problem = "is not skew-symmetric, G^T = -G; put symmetric parts into damping, or take (G - G^T)/2"
+        raise InputError("machine.gyroscopic", problem)
+
+
+def _allowed_error(matrix: np.ndarray) -> float:
+    """Return the error of the entries and of the eigenvalues of a matrix that counts as rounding."""
+    return max(_MAX_ASYMMETRY, len(matrix) * float(np.finfo(matrix.dtype).eps)) * float(np.max(np.abs(matrix), initial=1e-300))
 
 
 def _read_places(places: Any, size: int) -> Array:
@@ -170,19 +187,28 @@ def _read_places(places: Any, size: int) -> Array:
 
 def _read_rows(place: Any, name: str, size: int) -> Array:
     """Return the matrix that gives the displacement of a place, from the indices of its coordinates or from a matrix."""
-    if np.ndim(place) == 1 and all(is_real(each) and int(each) == each for each in place):
+    shape = _shape_of(place)
+    if len(shape) == 1 and all(is_real(each) and float(each).is_integer() for each in place):
         wrong = [int(each) for each in place if not 0 <= each < size]
         if wrong or not 1 <= len(place) <= 3:
             raise InputError(name, f"is {quoted(list(place))}; give 1 to 3 coordinates, 0 to {size - 1}")
         return jnp.asarray(np.eye(size)[[int(each) for each in place]], dtype=float)
-    number = np.shape(place)[0] if np.ndim(place) == 2 else 0
+    number = shape[0] if len(shape) == 2 else 0
     if not 1 <= number <= 3:
         raise InputError(name, f"is {quoted(place)}; give 1 to 3 indices of coordinates, or 1 to 3 rows of {size} numbers")
     return _matrix(place, name, (number, size))
 
 
 def _read_foundation(foundation: Any, size: int) -> Array:
-    if np.ndim(foundation) != 3 or np.shape(foundation)[0] != 2 or np.shape(foundation)[1] not in (1, 2):
+    shape = _shape_of(foundation)
+    if len(shape) != 3 or shape[0] != 2 or shape[1] not in (1, 2):
         raise InputError("machine.foundation", f"must be two arrays (T_K, T_C) of 1 or 2 rows of {size} numbers")
-    shape = (int(np.shape(foundation)[1]), size)
-    return jnp.stack([_matrix(each, f"machine.foundation[{k}]", shape) for k, each in enumerate(foundation)])
+    return jnp.stack([_matrix(each, f"machine.foundation[{k}]", (shape[1], size)) for k, each in enumerate(foundation)])
+
+
+def _shape_of(value: Any) -> tuple[int, ...]:
+    """Return the shape of an array or of nested lists; () if the lists have different lengths."""
+    try:
+        return np.shape(value)
+    except ValueError:
+        return ()

@@ -156,6 +156,14 @@ def test_a_body_may_move_without_a_spring():
     np.testing.assert_allclose(jv.natural_frequencies(jv.Scene(free, BALLS, DRIVE))[0], 0.0, atol=1e-6)
 
 
+def test_a_chain_without_support_is_read_in_single_precision():
+    with jax.enable_x64(False):
+        for seed in range(5):
+            springs = np.random.default_rng(seed).uniform(1e4, 1e7, 39)
+            ends = np.eye(39, 40, 1) - np.eye(39, 40)
+            jv.from_matrices(np.eye(40), 0.0 * np.eye(40), ends.T @ np.diag(springs) @ ends, places=[[0]])
+
+
 @pytest.mark.parametrize(
     ("make", "says"),
     [
@@ -175,6 +183,17 @@ def test_a_body_may_move_without_a_spring():
         (lambda: jv.from_matrices(ONE, ONE, [[1, 1], [0, 1]], places=[[0]]), "machine.stiffness is not symmetric"),
         (lambda: jv.from_matrices(ONE, ONE, ONE * np.nan, places=[[0]]), "machine.stiffness has an entry that is not finite"),
         (lambda: jv.from_matrices("a", ONE, ONE, places=[[0]]), "machine.mass is 'a'; it must be a square array"),
+        (lambda: jv.from_matrices(ONE, ONE, (1 + 0.1j) * ONE, places=[[0]]), "machine.stiffness is complex; a real one"),
+        (lambda: jv.from_matrices(ONE, ONE, ONE, ONE, places=[[0]]), "machine.gyroscopic is not skew-symmetric"),
+        (
+            lambda: jv.from_matrices(ONE, ONE, ONE, places=[[[1], [0, 1]]]),
+            r"machine.places\[0\] is \[\[1\], \[0, 1\]\]; give 1 to 3 indices",
+        ),
+        (lambda: jv.from_matrices(ONE, ONE, ONE, places=[[np.nan]]), r"machine.places\[0\] is \[nan\]; give 1 to 3 indices"),
+        (
+            lambda: jv.from_matrices(ONE, ONE, ONE, places=[[0]], foundation=([[1, 0]], [[1]])),
+            "machine.foundation must be two arrays",
+        ),
         (
             lambda: jv.from_matrices(np.array([[1.0, 2.0], [2.0, 1.0]]), ONE, ONE, places=[[0]]),
             "machine.mass has the eigenvalue -1; all must be greater than 0",
@@ -190,6 +209,10 @@ def test_a_body_may_move_without_a_spring():
         (
             lambda: jv.Scene(jv.from_matrices(ONE, ONE, ONE, places=[[0]]), exciters=[jv.Exciter(BALLS, DRIVE, at=2)]),
             "at is 2; give the number of a place, 1 to 1",
+        ),
+        (
+            lambda: jv.Scene(jv.from_matrices(ONE, ONE, ONE, places=[[0]]), exciters=[jv.Exciter(BALLS, DRIVE, at=0.5)]),
+            "^at is .*0.5.*; give the number of a place, 1 to 1",
         ),
         (
             lambda: jv.sketch(jv.Scene(jv.from_matrices(ONE, ONE, ONE, places=[[0]]), BALLS, DRIVE)),
