@@ -115,6 +115,8 @@ def test_values_of_names_have_their_unit_and_range():
         read_value("machine.stiffness_terms[2]", "3 N m") == 3.0
         and read_value("effects.cubic_support[1].stiffness", -1.0) == -1.0
     )
+    for name in ("machine.bodies[1].mass", "machine.supports[0].stiffness[1]", "exciters[0].drive.motor.inertia"):
+        assert read_value(name, 2.0) == 2.0
     for name, value in (
         ("machine.mass", 0.0),
         ("machine.damping", -1.0),

@@ -25,10 +25,18 @@ from jaxvib.machine.files import EFFECTS, suggest_name
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import PLAIN, NumberSpec, number_specs
 from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.machine.structures.plane_body import Body, PlaneSupport
 from jaxvib.units import Number, number
 
 _Path = tuple[str | int, ...]
-_SECTIONS: dict[str, type[eqx.Module]] = {"machine": Machine, "loads": Loads, "drive": Drive, "exciters": Exciter}
+_SECTIONS: dict[str, type[eqx.Module]] = {
+    "machine": Machine,
+    "machine.supports": PlaneSupport,
+    "machine.bodies": Body,
+    "loads": Loads,
+    "drive": Drive,
+    "exciters": Exciter,
+}
 
 
 class NamedNumber(NamedTuple):
@@ -121,9 +129,12 @@ class NamedNumber(NamedTuple):
         return self.path[:2] == ("machine", "supports")
 
     def _numbered(self, scene: Scene, words: str) -> str:
-        """Return `words`, with the number of the support, or of the effect if the scene has several effects of its kind."""
+        """Return `words`, with the number of the support or of the body, or of the effect if the scene has several of its
+        kind."""
         if self._is_of_support:
             return words.replace("the support", f"support {1 + int(self.path[2])}")
+        if self.path[:2] == ("machine", "bodies"):
+            return words.replace("the body", f"body {1 + int(self.path[2])}")
         if self.path[0] != "effects" or not isinstance(index := self.path[1], int):
             return words
         kinds = [effect.kind for effect in scene.effects]
@@ -289,7 +300,7 @@ def spec_of(name: str) -> NumberSpec | None:
     If several kinds have the field, the specification of an array takes precedence.
     """
     part, _, last = re.sub(r"\[\d+\]", "", str(name)).rpartition(".")
-    part = part.removeprefix("exciters.")
+    part = re.sub(r"(\.(motor|reference))+$", "", part.removeprefix("exciters."))  # a drive within a drive
     if part.startswith("effects."):
         known = EFFECTS.get(part.removeprefix("effects."))
         kinds = [known] if known else [kind for kind in _subclasses(Effect) if kind not in EFFECTS.values()]

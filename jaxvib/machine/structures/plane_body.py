@@ -78,8 +78,7 @@ def support(
 
     Source: equilibrium of two linear springs.
     """
-    for name, number in (("body", body), ("to", 0 if to is None else to)):
-        count(number, name, low=0)
+    body, to = count(body, "body", low=0), None if to is None else count(to, "to", low=0)
     if (to is None) != (at_other is None):
         raise InputError("at_other", f"is {quoted(at_other)} and to is {to}; a support between two bodies needs both")
     if to == body:

@@ -143,7 +143,7 @@ def test_file_of_a_network_is_written_and_read_again():
     assert eqx.tree_equal(jv.scene_from_toml(text), SCENE)
     assert "bodies = [" in text and "at_other = [" in text
     names = numbers_of(SCENE)
-    assert "machine.bodies[1].mass" in names and "machine.supports[2].at_other[0]" in names
+    assert "machine.supports[2].at_other[0]" in names and names["machine.bodies[1].mass"].words(SCENE) == ["mass of body 2"]
 
 
 def one(**more):
