@@ -190,10 +190,12 @@ class ExcitedModel(LinearModel):
             elastic, inertia, viscous = (complex_product(a, y) for a in (carrier.stiffness, self.mass, carrier.damping))
             return elastic - omega**2 * inertia + 1j * omega * viscous
 
-        def solve(product: Callable[[Array], Array], right: Array) -> Array:
-            return refine_solution(product, lambda rest: modal.solve(omega, rest), right, modal.norm(omega))
+        def solver(modal: ModalResponse) -> Callable[[Callable[[Array], Array], Array], Array]:
+            return lambda product, right: refine_solution(
+                product, lambda rest: modal.solve(omega, rest), right, modal.norm(omega)
+            )
 
-        return jax.lax.custom_linear_solve(product, self.force(omega), solve, symmetric=True)
+        return jax.lax.custom_linear_solve(product, self.force(omega), solver(modal), solver(modal.transposed))
 
     def forward_acceleration(self, omega: Array) -> Array:
         """Return w^2 f^H Y (complex scalar, m/s^2) at the speed `omega` of the masses.

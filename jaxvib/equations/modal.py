@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ from jaxvib.numerics.linalg import complex_product, eigenvectors_in_turn, solve_
 
 
 class ModalResponse(eqx.Module):
-    """Modal form of a symmetric dynamic stiffness D(w) = K - w^2 M + i w C of nd coordinates.
+    """Modal form of the dynamic stiffness D(w) = K - w^2 M + i w C of nd coordinates.
 
         D(w)^-1 = Z diag(1 / (i w - s)) W,      e^H B D(w)^-1 B^T e = sum_k r_k / (i w - s_k)
 
@@ -55,6 +57,11 @@ class ModalResponse(eqx.Module):
         zero = jnp.zeros(residues.shape[1:], residues.real.dtype)
         terms = -self.poles.real, self.poles.imag, residues.real, residues.imag
         return jax.lax.complex(*jax.lax.scan(add, (zero, zero), terms)[0])
+
+    @property
+    def transposed(self) -> ModalResponse:
+        """The modal form of D^T, which differs from D if the damping matrix is not symmetric."""
+        return dataclasses.replace(self, outputs=self.inputs.T, inputs=self.outputs.T)
 
     def solve(self, omega: Array, force: Array) -> Array:
         """Return D^-1 f (nd,), m, for amplitudes `force` f (nd,), N."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.equations.linear import jammed_model
 from jaxvib.equations.modal import modal_response
 
 
@@ -49,6 +50,24 @@ def test_a_carrier_that_is_free_to_drift_has_frequency_0(double):
     with jax.enable_x64(double):
         found = jv.natural_frequencies(two_masses(0.0, 1e8))
         np.testing.assert_allclose(found, closed(0.0, 1e8), rtol=1e-3)
+
+
+def test_gradients_are_right_with_asymmetric_damping():
+    """The derivative of one coordinate with respect to a spring at another, d q_0/d k = -(D^-1)_03 q_3."""
+    stiffness = np.diag([4e4, 5e4, 6e4, 7e4]) - 1e4 * (np.eye(4, k=1) + np.eye(4, k=-1))
+    damping = 40.0 * np.eye(4) + 300.0 * (np.eye(4, k=2) - np.eye(4, k=-2))
+    omega, last = 25.0, np.eye(4)[3]
+
+    def response(spring):
+        whole = stiffness + spring * jnp.diag(last)
+        machine = jv.from_matrices(50.0 * np.eye(4), damping, whole, places=[[0, 1]])
+        model = jammed_model(jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0)))
+        return model.decomposed().displacement(jnp.asarray(omega)).real[0]
+
+    mass = 50.0 * np.eye(4) + 0.5 * np.diag([1.0, 1.0, 0.0, 0.0])
+    dynamic = np.linalg.inv(stiffness + 1j * omega * damping - omega**2 * mass)
+    expected = -(dynamic[0, 3] * dynamic[3] @ (0.05 * omega**2 * np.array([1.0, -1.0j, 0.0, 0.0]))).real
+    np.testing.assert_allclose(jax.grad(response)(0.0), expected, rtol=1e-9)
 
 
 def test_the_modal_form_solves_critically_damped_modes():
