@@ -14,6 +14,7 @@ from jaxvib.boundary import is_real
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine, Mount, Place
 from jaxvib.machine.numbers import unit
+from jaxvib.numerics.linalg import hermitian_modes, relative_to
 from jaxvib.units import count
 from jaxvib.units.known import when_known
 
@@ -128,10 +129,8 @@ def from_matrices(
 
 def _lowest_modes(mass: Array, stiffness: Array, number: int) -> Array:
     """Return the lowest real normal modes (nd, number), with the modal masses 1."""
-    factor = jnp.linalg.cholesky(mass)
-    left = jnp.linalg.solve(factor, stiffness)
-    _, vectors = jnp.linalg.eigh(jnp.linalg.solve(factor, left.T))
-    return jnp.linalg.solve(factor.T, vectors[:, :number])
+    square, inverse = relative_to(mass, stiffness)
+    return inverse.T @ hermitian_modes(square)[1][:, :number]
 
 
 def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:

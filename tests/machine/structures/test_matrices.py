@@ -148,6 +148,17 @@ def test_reduced_model_has_the_lowest_frequencies():
     np.testing.assert_allclose(np.abs(machine.rows_at(1))[0], shape, rtol=1e-9)
 
 
+def test_gradients_of_reduced_models_with_equal_frequencies():
+    """Two equal planes; all squares of the frequencies are proportional to the factor of the stiffness."""
+    chain = np.kron(np.eye(2), 4e4 * (2 * np.eye(8) - np.eye(8, k=1) - np.eye(8, k=-1)))
+
+    def lowest(factor):
+        machine = jv.from_matrices(2.0 * np.eye(16), 0.0 * chain, factor * chain, places=[[3, 11]], reduce=4)
+        return machine.stiffness[0, 0] + machine.stiffness[1, 1]
+
+    np.testing.assert_allclose(jax.grad(lowest)(1.0), lowest(1.0), rtol=1e-9)
+
+
 ONE = np.eye(2)
 
 
