@@ -45,6 +45,8 @@ def read_place(at: int | Number | Sequence[Number] | None, name: str) -> int | A
     if at is None:
         return None
     if isinstance(at, (int, np.integer)):
+        if at == 0 and not isinstance(at, bool):
+            raise InputError(name, "is 0; platforms and places are numbered from 1, and a distance of 0 m is written 0.0")
         return count(at, name)
     if isinstance(at, (list, tuple)) or getattr(at, "ndim", 0) > 0:
         return numbers(at, "m", name, 2)

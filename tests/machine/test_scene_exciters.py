@@ -139,6 +139,7 @@ BAD = {
     "neither": (lambda: two(unbalance=None), r"loads is None; .* or give an unbalance"),
     "no drive": (lambda: two(drive=None), r"drive is None; it must be a Drive"),
     "platform": (lambda: two(at=3), r"^exciters\[1\].at is 3; the machine has platforms 1 to 2"),
+    "zero": (lambda: one_on(ROTOR, at=0), r"^at is 0; .* a distance of 0 m is written 0.0"),
     "truth value": (lambda: two(at=True), r"at is True; it must be a whole number"),
     "distance": (lambda: two(at="2 mm"), r"at is a distance along a rotor's axis; name a platform instead"),
     "friction without loads": (lambda: two(effects=jv.DryFriction(0.01, 0.02)), r"acts on loads, but this exciter has none"),

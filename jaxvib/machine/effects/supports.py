@@ -55,7 +55,8 @@ class CubicSupport(_Support):
     - `stiffness` k3, N/m^3, negative for a softening support; typical: 1e7 to 1e10. It stiffens a support k by 1 % at the
       amplitude a if (3/4) k3 a^2 = 0.01 k: 3e7 for 5e4 N/m and 5 mm
     - `platform` above the support, numbered from 1 (default: 1)
-    - `position` along a rotor's axis, m from the rotor's centre of mass, in place of the platform; typical: -0.5 to 0.5
+    - `position` along a rotor's axis, m from the rotor's centre of mass, in place of the platform; typical: -0.5 to 0.5;
+      default: the station of the loads, or the centre of mass if each load has a separate station
 
     **Raises** `InputError` for values that are not allowed. A scene raises it for a place that the machine does not have.
 

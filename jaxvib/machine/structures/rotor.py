@@ -200,7 +200,7 @@ def rotor(
     - `polar_inertia` C about the axis of rotation, kg m^2, loads not included, at most 2 A; typical: 0.01 to 0.5
     - `stiffness` k (2,) of the supports, N/m; typical: 1e5 to 1e6
     - `damping` (2,) of the supports, N s/m; typical: 100 to 1000; also a ratio "5 %" or a loss factor, see `one_mass`. With
-      "5 %" at both supports the translation of the rotor without tilt has this ratio
+      "5 %" at both supports the translation of the rotor without tilt has this ratio (without `stiffness_terms`)
     - `position` (2,) of the supports along the axis, m from the centre of mass, one side negative; typical: 0.1 to 0.5
     - `stations` of the loads along the axis, m from the centre of mass, one number or one for each load; typical: -0.3 to 0.3,
       default 0
