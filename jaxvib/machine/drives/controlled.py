@@ -24,12 +24,14 @@ class TorqueTable(Motor):
     **Arguments** (SI, or strings with a unit)
 
     - `speeds` of the points, rad/s, in ascending order, at least 2; typical: ["0 rpm", "1000 rpm", "1500 rpm"]
-    - `torques` at these speeds, N m: the first must be positive, the last 0 or negative; typical: -10 to 200
+    - `torques` at these speeds, N m: the first must be positive, the last 0 or negative and not above the one before it;
+      typical: -10 to 200
     - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
     **Attributes**: the arguments; the no-load `speed`, the largest speed at which the torque falls to 0.
 
-    **Raises** `InputError` for a wrong unit, speeds that do not ascend, and torques that do not fall to 0.
+    **Raises** `InputError` for a wrong unit, speeds that do not ascend, and torques that do not fall to 0 or
+    rise at the end.
 
     >>> import jaxvib as jv
     >>> motor = jv.TorqueTable([0.0, 100.0, 160.0], ["10 N m", "20 N m", "-4 N m"], inertia=0.02)
@@ -48,6 +50,8 @@ class TorqueTable(Motor):
         self.kind = "torque_table"
         problem = "must begin with a positive torque and end with 0 or a negative one, at the no-load speed of the motor"
         require_if_known(lambda torques: torques[0] > 0.0 >= torques[-1], self.torques, field="drive.torques", problem=problem)
+        problem = "rise at the end, and the last line leads to positive torques; repeat the last torque at a higher speed"
+        require_if_known(lambda torques: torques[-1] <= torques[-2], self.torques, field="drive.torques", problem=problem)
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
