@@ -342,6 +342,8 @@ class ExciterDynamics(RotorDynamics):
         added_mass, reaction = self._reaction_of_loads(of_loads, free, response_to_carrier)
         added_mass, reaction, rotor = self._add_rotor(motion, added_mass, reaction, drag_torque, coupling[0])
         part = Eliminated(free, response_to_carrier, added_mass, reaction, rotor)
+        if contact.on_rotor is not None and self.housing_row is not None:
+            drag_torque, _, coupling = self._add_friction(motion.drag_torque, contact._replace(friction=contact.on_rotor))
         return self._add_housing(motion, part, drag_torque, coupling[0])
 
     def at_loads(self, a: Sequence[Array]) -> Axes:

@@ -83,11 +83,16 @@ def contact_force(
 
 
 class ContactSolution(NamedTuple):
-    """Inertia factor `kappa`, generalised `force` and `friction` of loads, each of which either rolls or slides."""
+    """Inertia factor `kappa`, generalised `force` and `friction` of loads, each of which either rolls or slides.
+
+    `on_rotor`: the friction that brakes the rotor, if it is not `friction`. The force of a sliding contact does not brake the
+    rotor, like that of a rolling contact.
+    """
 
     kappa: Array
     force: list[Array]
     friction: list[Friction]
+    on_rotor: list[Friction] | None = None
 
 
 def resolve_contact(
@@ -132,7 +137,7 @@ def resolve_contact(
         )
         for each in friction
     ]
-    return ContactSolution(jnp.where(slides, 1.0, kappa), force, [*rolling_friction, sliding_friction])
+    return ContactSolution(jnp.where(slides, 1.0, kappa), force, [*rolling_friction, sliding_friction], list(friction))
 
 
 def slip_rates(loads: Loads, u: Coordinates, rate: Coordinates, slip: Coordinates, change: Sequence[Array]) -> Coordinates:

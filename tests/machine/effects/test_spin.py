@@ -132,6 +132,25 @@ def test_power_balances_the_energy_of_balls_that_spin_and_slide(effects):
         np.testing.assert_allclose(rate, supplied - lost, rtol=1e-9, atol=1e-9 * abs(float(supplied)))
 
 
+def test_power_balances_the_energy_of_sliding_on_a_turning_body():
+    """The torque of the drive on its housing is that of the power."""
+    springs = [jv.support(at=(x, -0.1), stiffness=(1e5, 2e5), damping=(50.0, 90.0)) for x in (-0.5, 1.0)]
+    loads = jv.balls(count=2, mass=0.2, radius=0.1, drag=0.3, ball_radius=0.02)
+    effects = (jv.Sliding(0.1), jv.RollingFriction(1e-3))
+    exciter = jv.Exciter(loads, jv.ConstantSpeed(50.0), at=(0.1, 0.2), direction=-1, effects=effects)
+    s = jv.Scene(jv.plane_body(mass=30.0, inertia=7.5, supports=springs), exciters=[exciter])
+    leaves, structure = jax.tree.flatten(jv.initial_state(s))
+    rng = np.random.default_rng(1)
+    state = jax.tree.unflatten(structure, [jnp.asarray(2.0 * rng.normal(size=leaf.shape)) for leaf in leaves])
+
+    @jax.jit
+    def growth(state):
+        return jax.jvp(lambda y: energy(s, y), (state,), (jv.vector_field(s)(0.0, state),))[1], *power(s, 0.0, state)
+
+    rate, supplied, lost = growth(state)
+    np.testing.assert_allclose(rate, supplied - lost, rtol=1e-9, atol=1e-9 * abs(float(supplied)))
+
+
 def test_derivatives_with_spin_and_sliding_are_differences():
     """Along one direction in which every number of the scene and of the state changes."""
     s = scene((*published(), *BOTH), count=1)
