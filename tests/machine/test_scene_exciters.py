@@ -79,7 +79,6 @@ def test_leaves_of_one_exciter_keep_their_order():
         jv.audit,
         lambda s: jv.jam_orbit(s, omega=9.0),
         lambda s: jv.whirl(s, [9.0]),
-        lambda s: jv.initial_state(s, "jam", mode=1),
     ],
 )
 def test_theories_refuse_several_exciters(ask):
@@ -139,6 +138,7 @@ BAD = {
     "neither": (lambda: two(unbalance=None), r"loads is None; .* or give an unbalance"),
     "no drive": (lambda: two(drive=None), r"drive is None; it must be a Drive"),
     "platform": (lambda: two(at=3), r"^exciters\[1\].at is 3; the machine has platforms 1 to 2"),
+    "jam": (lambda: jv.initial_state(two(), "jam", mode=1), "start is 'jam', but scene has 2 exciters; start at 'rest'"),
     "zero": (lambda: one_on(ROTOR, at=0), r"^at is 0; .* a distance of 0 m is written 0.0"),
     "truth value": (lambda: two(at=True), r"at is True; it must be a whole number"),
     "distance": (lambda: two(at="2 mm"), r"at is a distance along a rotor's axis; name a platform instead"),
