@@ -112,7 +112,7 @@ def test_the_figure_that_fits(sampled, tmp_path):
     assert [text.get_text() for text in modes.get_yticklabels()] == ["not jammed", "jammed, mode 1", "jammed, mode 2"]
     np.testing.assert_allclose(values.lines[0].get_ydata(), both.data["weighted"].values, rtol=1e-12)
     assert results_table(both.store)[1:] == (
-        ["rotor speed, rpm", "mode", "weighted, N"],
+        ["rotor speed, rpm", "number", "weighted, N"],
         [["286.48", "not jammed", "4.8"], ["477.46", "jammed, mode 1", "5"], ["859.44", "jammed, mode 2", "5.4"]],
     )
 
