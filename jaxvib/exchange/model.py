@@ -291,7 +291,7 @@ def named_entries(scene: Scene) -> list[NamedNumber]:
     numbers_by_index: dict[int, NamedNumber] = {}
     for parameter in (single for group in numbers_of(scene).values() for single in group.single(scene)):
         index = np.asarray(parameter.leaf(places))
-        numbers_by_index[int(index if parameter.entry is None else index[parameter.entry])] = parameter
+        numbers_by_index[int(index.ravel()[parameter.entry or 0])] = parameter
     if len(numbers_by_index) != sum(map(np.size, leaves)):
         raise InputError(
             "scene", "has a parameter without a name, which another tool could not set; give a scene of jaxvib's parts"

@@ -262,7 +262,12 @@ def _responses(scene: Scene, quantity: str, frequencies: Numbers | None, rotor_s
 def _even_frequencies(scene: Scene, frequencies: Numbers | None) -> np.ndarray:
     """Return frequencies in Hz. **Raises** `InputError` if they are not evenly spaced."""
     if frequencies is None:
-        step = _HIGHEST_FREQUENCY_RATIO * float(np.max(np.asarray(estimated_frequencies(scene)))) / (2.0 * np.pi * _LINES)
+        highest = float(np.max(np.asarray(estimated_frequencies(scene))))
+        if highest == 0.0:
+            raise InputError(
+                "frequencies", "is missing; a machine without a natural frequency above 0 has no default, give them"
+            )
+        step = _HIGHEST_FREQUENCY_RATIO * highest / (2.0 * np.pi * _LINES)
         return float(f"{step:.{_DIGITS - 1}e}") * np.arange(1, _LINES + 1)
     x = np.asarray(numbers(frequencies, "Hz", "frequencies", None, low=0.0, open_low=True), float)
     if x.ndim != 1 or x.size < 2:

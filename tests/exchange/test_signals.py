@@ -112,6 +112,15 @@ def test_inputs_turn_the_rotors():
     assert rates.rotor_angles == (-110.0, None, 3.4) and outputs.rotors == (None,) * 3
 
 
+def test_parameters_of_matrices_are_in_the_order_of_their_entries():
+    machine = jv.from_matrices(np.diag([2.0, 3.0]), 0.1 * np.eye(2), [[3e3, -1e3], [-1e3, 2e3]], places=[[0], [1]])
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(50.0), unbalance=0.1, at=2)])
+    values = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(scene)])
+    entries = named_entries(scene)
+    np.testing.assert_array_equal([each.read(scene)[0] for each in entries], values)
+    assert [each.name for each in entries if "stiffness" in each.name] == [f"machine.stiffness[{k}]" for k in range(4)]
+
+
 def test_variables_of_a_unit_follow_the_signals():
     scene = jv.Scene(
         machines()["one_mass"], jv.balls(**{**BALLS, "count": 1}), jv.DCMotor(120.0, stall_torque=8.0, inertia=0.2)

@@ -258,6 +258,12 @@ def test_wrong_arguments_of_files_raise_clear_errors(change, says, tmp_path):
     assert str(error.value).startswith(says) and list(tmp_path.iterdir()) == []
 
 
+def test_free_machine_has_no_default_frequencies(tmp_path):
+    free = jv.Scene(jv.one_mass(mass=50.0, stiffness=0.0, damping=0.0), loads()["balls"], jv.ConstantSpeed(100.0))
+    with pytest.raises(jv.InputError, match="frequencies is missing; a machine without a natural frequency above 0"):
+        jv.export_uff(free, tmp_path / "free.unv")
+
+
 def test_frequencies_in_single_precision_are_even(tmp_path):
     frequencies = np.linspace(1.0, 100.0, 991, dtype=np.float32)
     path = jv.export_uff(rotor_scene(), tmp_path / "single.unv", frequencies=frequencies)
