@@ -368,17 +368,21 @@ def label_counts(store: Store) -> list[tuple[str, int]]:
 def _theory_lines(
     store: Store, x_name: str, y_name: str, xs: np.ndarray, ys: np.ndarray
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return the lines in a map on which exact jams of the stored scene have a fold or lose their stability, by kind.
+    """Return the lines in a map on which exact jams of the scene have a fold or lose their stability, by kind.
 
-    Lines exist only if one axis is the rotor speed. If the other axis is a parameter of the initial state, which does not
-    influence steady motions, the lines are straight. If it is a parameter of the scene, the lines connect points that are
-    computed for `_THEORY_ROWS` of its values.
+    Axes that are not in the map have their middle values, as in the cases of the map. Lines exist only if one axis is the rotor
+    speed. If the other axis is a parameter of the initial state, which does not influence steady motions, the lines are
+    straight. If it is a parameter of the scene, the lines connect points that are computed for `_THEORY_ROWS` of its values.
     """
     if _SPEED not in (x_name, y_name):
         return {}
     scene = scene_from_toml(store.record["scene"])
     if not isinstance(scene.drive, ConstantSpeed):
         return {}
+    for axis in store.record["axes"]:
+        if axis not in (x_name, y_name) and not axis.startswith("start."):
+            middle = store.read(axis)[store.group[axis].shape[0] // 2]
+            scene = put(scene, (axis_of(scene, axis, [float(middle)]).target,), jnp.asarray([middle]))
     other_axis, values, speeds = (y_name, ys, xs) if x_name == _SPEED else (x_name, xs, ys)
     fixed = other_axis.startswith("start.")
     rows = values[[0, -1]] if fixed else np.quantile(values, np.linspace(0.0, 1.0, _THEORY_ROWS))

@@ -1,6 +1,7 @@
 """Figures of stores: intervals, shares, sensitivities, and which figure fits."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -142,6 +143,19 @@ def test_a_table_of_many_cases_has_their_range(grid, sampled):
 def test_what_no_figure_can_show(grid, sampled, draw, says):
     with pytest.raises(jv.InputError, match=says):
         draw(grid, sampled)
+
+
+def test_theory_lines_are_those_of_the_shown_cases(tmp_path, monkeypatch):
+    axes = {"drive.speed": [30.0, 50.0], "loads.drag": [1.0, 2.0], "machine.stiffness": [1e4, 3e4, 2e4]}
+    asked, seen = labelled(axes, ("mode",), tmp_path / "three.zarr"), []
+
+    def branches_of(scene):
+        seen.append(scene.machine.stiffness.tolist())
+        return SimpleNamespace(special=())
+
+    monkeypatch.setattr("jaxvib.sweeps.figures.exact_branches", branches_of)
+    plot_map(asked.store)
+    assert seen and all(stiffness == [3e4] for stiffness in seen)
 
 
 @pytest.mark.slow
