@@ -392,7 +392,7 @@ def scene_to_toml(scene: Scene) -> str:
 
     require_known(scene, "scene", "scene_to_toml", "write the scene outside")
     tables: Tables = {"machine": _part_table("machine", scene.machine)}
-    if len(scene.exciters) == 1 and scene.exciters[0].is_plain and scene.exciters[0].at is None:
+    if len(scene.exciters) == 1 and scene.exciters[0].is_plain and scene.exciters[0].place is None:
         tables |= {"loads": _part_table("loads", scene.loads), "drive": _part_table("drive", scene.drive)}
         return tomli_w.dumps({**tables, "effects": _effect_tables(scene.all_effects)})
     tables["exciters"] = list(map(_exciter_table, scene.exciters))

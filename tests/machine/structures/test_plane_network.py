@@ -146,6 +146,11 @@ def test_file_of_a_network_is_written_and_read_again():
     assert "machine.supports[2].at_other[0]" in names and names["machine.bodies[1].mass"].words(SCENE) == ["mass of body 2"]
 
 
+def test_file_keeps_the_body_of_loads_at_its_centre():
+    scene = jv.Scene(MACHINE, exciters=[jv.Exciter(BALLS, jv.ConstantSpeed(60.0), body=1)])
+    assert eqx.tree_equal(jv.scene_from_toml(jv.scene_to_toml(scene)), scene)
+
+
 def one(**more):
     return jv.support(**{"at": (0.0, 0.0), "stiffness": (1, 1), "damping": (0, 0), **more})
 
