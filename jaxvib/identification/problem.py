@@ -62,6 +62,10 @@ DELAY_MARGIN = 2
 """Number of steps by which both readings and model are delayed, so that the interpolation has samples on both sides."""
 
 
+_MAX_DELAY = 450
+"""Largest delay of readings in steps; the longest filter contains it and a filter to white noise."""
+
+
 class Known(NamedTuple):
     """Known number: its `value`, SI, and its standard `error`, SI, 0 if it is exact."""
 
@@ -174,6 +178,11 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     _require_torque_balance(scene, free, runs)
     nonlinear = [number for number in free.values() if number.path[-1] != "unbalance"]
     unbalances = tuple(_known_unbalance(scene, k, free, known_numbers) for k in range(len(scene.exciters)))
+
+    if not nonlinear and all(known is not None and known.is_exact for known in unbalances):
+        raise InputError(
+            "unknown", f"is {quoted(unknown)}, and all of these numbers are exactly known; nothing is left to find"
+        )
 
     values = np.array([float(number.read(scene)[0]) for number in nonlinear])
     positive = (values > 0.0) & np.array([number.spec.bounds.low == 0.0 for number in nonlinear], bool)
@@ -382,6 +391,7 @@ def _changed(scene: Scene, run: MeasuredRun) -> Scene:
     for number, action, amount in zip(numbers, actions, amounts, strict=True):
         now = np.asarray(number.read(scene))
         new = {"add": now + amount, "scale": now * amount, "set": np.full_like(now, amount)}[action]
+        number.value(float(new[0]), f"{run.source}: change of {number.name}")  # raises for a value out of bounds
         scene = put_numbers(scene, (number,), new)
     return scene
 
@@ -412,8 +422,13 @@ def _samples(
     channels = run.of_kind(*MOTIONS)
     if not channels:
         raise InputError(run.source, f"has no channel of a motion; add a channel of kind {', '.join(MOTIONS)}")
+    axes = scene.machine.mounting().axes
     for channel in channels:
         rows_of_channel(scene, channel)  # raises for a place that the machine does not have
+        if not any(channel.direction[axis] for axis in axes):
+            moves = " and ".join(("horizontally", "vertically")[axis] for axis in axes)
+            problem = f"is {channel.direction}, but the machine moves {moves} only; correct it, or leave out the channel"
+            raise InputError(f"{run.source}: channel {channel.name!r}: direction", problem)
     step = min(1.0 / run.rate(channel.name) for channel in channels)
     begin = max([min(float(run.times[c.name][0]) for c in channels), *(angle.span[0] for angle in angles)])
     end = min([max(float(run.times[c.name][-1]) for c in channels), *(angle.span[1] for angle in angles)])
@@ -556,8 +571,9 @@ def _delay_taps(delay: float) -> tuple[np.ndarray, np.ndarray]:
     """
     late = delay + DELAY_MARGIN
     base = math.floor(late) - 2
-    if base < 0:
-        raise InputError("delay", f"is {delay:g} steps; the readings cannot be ahead of the motion")
+    if not 0 <= base <= _MAX_DELAY:
+        problem = f"is {delay:g} sampling steps; it must be between 0 and {_MAX_DELAY}"
+        raise InputError("delay", f"{problem}: shift the times of the channel instead")
     nodes = np.arange(base, base + 6)
     weights = np.array([np.prod([(late - b) / (a - b) for b in nodes if b != a]) for a in nodes])
     return np.eye(DELAY_MARGIN + 1)[-1], np.concatenate([np.zeros(base), weights])

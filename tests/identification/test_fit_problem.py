@@ -195,9 +195,25 @@ def test_unknowns_with_their_known_values():
     np.testing.assert_allclose(found.runs[1].scene(found.scene).machine.link_stiffness, [9e4])
 
 
+def test_channels_that_measure_nothing_and_long_delays_are_refused():
+    run = run_with({"a": np.sin(T)}, channels=[channel("a", direction="across")])
+    with pytest.raises(jv.InputError, match=r"channel 'a': direction is \(1.0, 0.0\), but the machine moves vertically only"):
+        build_problem(scene_of(), [run], ["machine.stiffness"], {})
+    with pytest.raises(jv.InputError, match=r"delay is 451 sampling steps; it must be between 0 and 450"):
+        _delay_taps(451.0)
+
+
+def test_without_a_number_to_find_a_fit_is_refused():
+    with pytest.raises(jv.InputError, match=r"unknown is \['machine.mass'\], and all of these numbers are exactly known"):
+        build_problem(scene_of(), [run_with({"a": np.sin(T)})], ["machine.mass"], {"machine.mass": "80 kg"})
+    only = build_problem(scene_of(), [run_with({"a": np.sin(T)})], ["exciters[0].unbalance"], {})
+    assert only.unknowns.count == 0 and only.unbalances == (None,)
+
+
 @pytest.mark.parametrize(
     ("change", "known", "words"),
     [
+        ({"machine.mass[0]": "-80 kg"}, {}, r"run 3: change of machine.mass\[0\] is 0 kg; it must be greater than 0"),
         (
             {"exciters[0].unbalance": "+5 %"},
             {},
@@ -280,7 +296,7 @@ def test_delays_are_interpolated_in_the_model():
         for power in range(6):
             moved = np.convolve(x**power, taps[:, k])[20:300]
             np.testing.assert_allclose(moved, (x[20:300] - delay - 2.0) ** power, rtol=1e-9)
-    with pytest.raises(jv.InputError, match=r"delay is -2\.5 steps; the readings cannot be ahead of the motion"):
+    with pytest.raises(jv.InputError, match=r"delay is -2\.5 sampling steps; it must be between 0 and 450"):
         _delay_taps(-2.5)
 
 
