@@ -29,7 +29,7 @@ _SHORT_NAMES = {
 
 _SHARE_PATTERN = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*%")
 _RANGE = re.compile(r"(.+?)\.\.(.+)")
-_MATERIAL = re.compile(r"load(?:\[(\d+)\])?")
+_MATERIAL = re.compile(r"material(?:\[(\d+)\])?")
 
 _DEFAULT_SAMPLES = 128
 
@@ -82,7 +82,8 @@ def tolerance_ranges(
     - `tolerances`: texts of one of two forms. NAME=SHARE, such as "stiffness=5%": 95 of 100 machines are within the tolerance,
       and the deviations of all numbers are independent. NAME=LOW..HIGH, such as "machine.mass[0]=100kg..130kg": all values of
       the range are equally likely. Short names are stiffness and damping (of all springs and dampers), mass, drag and
-      unbalance. "load=0..20kg" is material on platform or body 1, at its centre of mass, "load[2]=..." on platform or body 2
+      unbalance. "material=0..20kg" is material on platform or body 1, at its centre of mass, "material[2]=..." on platform or
+      body 2
     - `samples`: number of machines; typical: 64 to 1000 (default 128)
     - `seed` of the random deviations
 

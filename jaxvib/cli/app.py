@@ -115,8 +115,8 @@ TOLERANCE = click.option(
     "tolerances",
     multiple=True,
     metavar="NAME=SHARE",
-    help="Show the ranges of the results for machines within tolerances, repeatable: stiffness=5%, damping=30%, load=0..20kg "
-    "(material on platform or body 1).",
+    help="Show the ranges of the results for machines within tolerances, repeatable: stiffness=5%, damping=30%, "
+    "material=0..20kg (on platform or body 1).",
 )
 """Option of commands that show ranges over machines within tolerances."""
 

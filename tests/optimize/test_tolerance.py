@@ -24,7 +24,7 @@ def test_range_of_a_sag_is_that_of_the_stiffness(scene):
 
 
 def test_material_on_the_platform_adds_its_weight(scene):
-    found = tolerance_ranges(scene, [static_deflection()], ["load=0..20kg"], samples=400)[0]
+    found = tolerance_ranges(scene, [static_deflection()], ["material=0..20kg"], samples=400)[0]
     lowest, highest = (9.80665 * (51.0 + 20.0 * share) / 4e4 for share in (0.025, 0.975))
     np.testing.assert_allclose([found.low, found.high], [lowest, highest], rtol=1e-3)
 
@@ -46,8 +46,8 @@ def test_modes_that_vanish_lower_the_share(scene):
 @pytest.mark.parametrize(
     "text",
     [
-        *["stiffness", "stiffness=5", "stiffness=200%", "nothing=5%", "load=20..0kg", "load=0..2m"],
-        *["machine.mass=-70..-60 kg", "load=-50..0 kg"],  # no machine has such masses
+        *["stiffness", "stiffness=5", "stiffness=200%", "nothing=5%", "material=20..0kg", "material=0..2m"],
+        *["machine.mass=-70..-60 kg", "material=-50..0 kg"],  # no machine has such masses
     ],
 )
 def test_wrong_tolerances_are_refused(scene, text):
@@ -78,7 +78,7 @@ def test_number_with_two_tolerances_is_refused(scene, texts):
         read_tolerances(scene, texts)
     with pytest.raises(jv.InputError, match="twice"):
         expected(static_deflection(), {"machine.stiffness": 0.05, "machine.stiffness[0]": 0.02})(scene)
-    assert len(read_tolerances(scene, ["mass=1%", "load=0..20kg"]).ranges) == 1
+    assert len(read_tolerances(scene, ["mass=1%", "material=0..20kg"]).ranges) == 1
 
 
 def test_short_names_of_a_body_are_all_its_springs():
@@ -90,10 +90,10 @@ def test_short_names_of_a_body_are_all_its_springs():
         "exciters[0].unbalance",
         "exciters[1].unbalance",
     ]
-    (material,) = read_tolerances(scene, ["load=0..20kg"]).ranges
+    (material,) = read_tolerances(scene, ["material=0..20kg"]).ranges
     assert (material.number.name, material.low, material.high, material.is_added) == ("machine.mass", 0.0, 20.0, True)
     with pytest.raises(jv.InputError, match=r"machine.mass\[1\]"):
-        read_tolerances(scene, ["load[2]=0..20kg"])
+        read_tolerances(scene, ["material[2]=0..20kg"])
 
 
 def test_short_names_of_a_network_of_bodies():
@@ -102,4 +102,4 @@ def test_short_names_of_a_network_of_bodies():
     scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(60.0), unbalance=0.1)])
     errors = read_tolerances(scene, ["mass=1%", "damping=30%"]).errors
     assert errors[:2] == (("machine.bodies[0].mass", 0.01), ("machine.bodies[1].mass", 0.01)) and len(errors) == 6
-    assert read_tolerances(scene, ["load[2]=0..20kg"]).ranges[0].number.name == "machine.bodies[1].mass"
+    assert read_tolerances(scene, ["material[2]=0..20kg"]).ranges[0].number.name == "machine.bodies[1].mass"
