@@ -21,7 +21,7 @@ from jaxvib.errors import ComputationError, InputError, legible, quoted
 if TYPE_CHECKING:
     from jaxvib.machine.effects.base import Effect
     from jaxvib.machine.scene import Exciter, Scene
-    from optimize import ToleranceRange
+    from optimize import Quantity, ToleranceRange
 
 
 def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = None, *, constant: bool = False) -> Scene:
@@ -122,26 +122,41 @@ TOLERANCE = click.option(
 
 
 def ranges_within(scene: Scene, modes: Sequence[int] | None, tolerances: Sequence[str]) -> list[ToleranceRange]:
-    """Return the ranges of speed, amplitudes and foundation force in jam modes, or in the working regime if `modes` is None."""
+    """Return the ranges of speed, motion and forces in jam modes, or in the working regime if `modes` is None."""
     if not tolerances:
         return []
-    from optimize import amplitude, foundation_force, jam_frequency, tolerance_ranges
+    from optimize import tolerance_ranges
+
+    groups = [_quantities_of_regime(scene)] if modes is None else [_quantities_of_jam(scene, mode) for mode in modes]
+    return tolerance_ranges(scene, [quantity for group in groups for quantity in group], list(tolerances))
+
+
+def _quantities_of_regime(scene: Scene) -> list[Quantity]:
+    """Return the quantities of the working regime: of a body in a plane, the throw at the points of the option --deck."""
+    from jaxvib.cli.document import deck_of_options
+    from optimize import foundation_force, throw_angle, throw_number, throw_stroke
     from optimize.quantities.exciters import working_amplitude, working_speed
 
-    count = len(scene.machine.structure().coordinates)
-    if modes is None:
-        quantities = [working_speed(), *(working_amplitude(scene, k) for k in range(count)), foundation_force()]
-        return tolerance_ranges(scene, quantities, list(tolerances))
-    quantities = [
-        quantity
-        for mode in modes
-        for quantity in (
-            jam_frequency(mode=mode),
-            *(amplitude(mode=mode, of=k + 1) for k in range(count)),
-            foundation_force(mode=mode),
-        )
-    ]
-    return tolerance_ranges(scene, quantities, list(tolerances))
+    if scene.machine.places != "plane":
+        count = len(scene.machine.structure().coordinates)
+        return [working_speed(), *(working_amplitude(scene, k) for k in range(count)), foundation_force()]
+    deck = deck_of_options()
+    slope = deck.get("slope", 0.0)
+    points = deck.get("at", [(0.0, 0.0)])
+    throws = [q for at in points for q in (throw_stroke(at=at), throw_angle(at=at), throw_number(at=at, slope=slope))]
+    return [working_speed(), *throws, foundation_force()]
+
+
+def _quantities_of_jam(scene: Scene, mode: int) -> list[Quantity]:
+    """Return the quantities of a jam mode: speed, strokes, forces and torque."""
+    from jaxvib.machine.structures.platforms import Platforms
+    from optimize import foundation_force, jam_frequency, shaft_torque, stroke, support_load
+
+    machine = scene.machine
+    strokes = [stroke(mode=mode, of=k + 1) for k in range(len(machine.structure().coordinates))]
+    supports = [k + 1 for k, each in enumerate(machine.stiffness) if each > 0.0] if isinstance(machine, Platforms) else []
+    loads = [support_load(mode=mode, of=k) for k in supports]
+    return [jam_frequency(mode=mode), *strokes, *loads, foundation_force(mode=mode), shaft_torque(mode=mode)]
 
 
 def require_tolerances(scene: Scene, tolerances: Sequence[str]) -> None:

@@ -70,8 +70,7 @@ def measures_of(scene: jv.Scene, motion: jv.Jam | jv.PhaseJam | jv.Orbit | jv.Vi
     import jax  # slow import, which --help does not need
 
     require_deck_options(scene)
-    meta = click.get_current_context().meta
-    deck = dict(meta.get(_DECK_KEY, {}))
+    meta, deck = click.get_current_context().meta, deck_of_options()
     if "at" in deck:
         deck["at"] = deck["at"][0] if len(deck["at"]) == 1 else deck["at"]
     measures = jax.device_get(jv.vibration_measures(scene, motion, **deck))
@@ -82,9 +81,14 @@ def measures_of(scene: jv.Scene, motion: jv.Jam | jv.PhaseJam | jv.Orbit | jv.Vi
     return measures
 
 
+def deck_of_options() -> dict[str, Any]:
+    """Return the values of the options --deck (`at`, a list of points) and --slope that the user gave."""
+    return dict(click.get_current_context().meta.get(_DECK_KEY, {}))
+
+
 def require_deck_options(scene: jv.Scene) -> None:
     """**Raises** `InputError` for the options --deck and --slope with a machine that is not a body in a plane."""
-    deck = click.get_current_context().meta.get(_DECK_KEY, {})
+    deck = deck_of_options()
     if deck and scene.machine.places != "plane":
         option = "--deck" if "at" in deck else "--slope"
         raise InputError(option, f"is for bodies in a plane, not for a machine of kind '{scene.machine.kind}'; leave it out")
@@ -94,14 +98,14 @@ def run_measures(run: jv.Run | jv.Envelope) -> jv.VibrationMeasures | None:
     """Return the measures of a run; None, with a note about --deck and --slope, for a run without vibration."""
     if not run.no_vibration:
         return measures_of(run.scene, run.vibration())
-    if click.get_current_context().meta.get(_DECK_KEY):
+    if deck_of_options():
         note("note: --deck, --slope: no stroke, throw and conveying, because the run ends without a vibration")
     return None
 
 
 def _deck_peaks(run: jv.Run) -> list[tuple[list[float], float]]:
     """Return the points of the option --deck with their largest displacements, m, during a run whose trajectory was stored."""
-    points = [] if run.trajectory is None else click.get_current_context().meta.get(_DECK_KEY, {}).get("at", [])
+    points = [] if run.trajectory is None else deck_of_options().get("at", [])
     return [(at, float(run.point(at, part="all").largest_displacement)) for at in points]
 
 

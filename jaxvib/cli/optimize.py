@@ -96,12 +96,13 @@ def _draw_working_regime(output: Output, design: Design, best: Synthesis) -> Non
 
 
 def _quantities_with_ranges(design: Design) -> list[Quantity | Demand]:
-    """Return the quantities and demands whose ranges within tolerances are shown: objective, foundation force, demands."""
+    """Return the quantities and demands whose ranges within tolerances are shown: objective, foundation force, held quantities,
+    demands."""
     from optimize import foundation_force
 
     mode = design.objective.mode
     force = [foundation_force(mode=mode)] if mode is not None or design.space.scene.machine.places == "plane" else []
-    return [design.objective, *force, *design.subject_to]
+    return [design.objective, *force, *(held.quantity for held in design.space.held), *design.subject_to]
 
 
 def _document(best: Synthesis) -> dict:

@@ -86,6 +86,8 @@ def test_settle_shows_ranges_within_tolerances(typed, tmp_path):
     ranges = json.loads(typed(*words, "--json")[1])["tolerances"]
     expected = optimize.tolerance_ranges(scene, [optimize.jam_frequency(mode=1)], ["stiffness=5%"])[0]
     assert ranges[0] == pytest.approx(expected._asdict())
+    shown = ["jam frequency", "stroke of platform 1", "force on support 1", "foundation force", "shaft torque"]
+    assert [entry["words"] for entry in ranges] == [f"{name}, mode 1" for name in shown]
     assert "machines with stiffness=5%" in typed(*words)[1]
     assert "--tolerance is 'stiffness'; write NAME=SHARE" in typed(*words[:-1], "stiffness")[2]
     assert "--step-tolerance is -1" in typed(*words[:-2], "--step-tolerance", "-1")[2]
@@ -357,8 +359,11 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     shown = float(out.split("throw number ")[1].split(",")[0])
     scene = jv.load_scene(tmp_path / "screen.toml")
     np.testing.assert_allclose(shown, jv.working_regime(scene).ellipse((0.4, 0.1), slope="-5 deg").throw_number, rtol=5e-3)
-    out = typed("regimes", "screen.toml", "--tolerance", "stiffness=5%", "--json")[1]
-    speed = json.loads(out)["tolerances"][0]
+    deck = ("--deck", "0.4,0.1", "--slope", "-5 deg")
+    out = typed("regimes", "screen.toml", "--tolerance", "stiffness=5%", *deck, "--json")[1]
+    speed, *others = json.loads(out)["tolerances"]
+    assert [each["words"].partition(" at ")[0] for each in others[:3]] == ["stroke", "throw angle", "throw number"]
+    np.testing.assert_allclose(others[2]["design"], shown, rtol=5e-3)
     assert speed["share"] == 1.0 and speed["low"] <= speed["high"] and speed["design"] == pytest.approx(regimes[0]["speed"])
     out = typed("regimes", "screen.toml", "--deck", "-0.4, 0.1", "--deck", "0.4,10 cm", "--json")[1]
     measures = json.loads(out)["regimes"][0]["measures"]
