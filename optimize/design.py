@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from jaxvib.machine.files import Tables
+from jaxvib.machine.numbers.named import find_number
+from jaxvib.machine.scene import Scene
 from optimize.quantities.quantity import Demand, Quantity
 from optimize.result import Synthesis
 from optimize.space import DesignSpace
 from optimize.synthesize import synthesize
+
+
+class Catalogue(NamedTuple):
+    """Catalogue from which a design chooses rows.
+
+    **Attributes**: `name` of the choice; `rows`: a text for each row; `columns`: values by parameter, SI. The values of the
+    first column identify the row.
+    """
+
+    name: str
+    rows: list[str]
+    columns: Mapping[str, Sequence[float]]
+
+    def chosen(self, scene: Scene) -> str:
+        """Return the text of the rows that a scene of the design contains."""
+        parameter, values = next(iter(self.columns.items()))
+        found = np.asarray(find_number(scene, parameter, "choices").read(scene))
+        places = np.argmin(np.abs(np.subtract.outer(found, values)), axis=1)
+        return f"chosen {self.name}: {'; '.join(dict.fromkeys(self.rows[k] for k in places))}"
 
 
 @dataclass(frozen=True)
@@ -19,13 +43,14 @@ class Design:
     Returned by `load_design` and by the functions of `optimize.recipes`.
 
     **Attributes**: `space`: a `DesignSpace`; `objective`: the quantity to minimize; `search`: further arguments of
-    `synthesize`, for example {"starts": 32}; `subject_to`: the demands.
+    `synthesize`, for example {"starts": 32}; `subject_to`: the demands; `catalogues` of a design file.
     """
 
     space: DesignSpace
     objective: Quantity
     search: Tables = field(default_factory=dict)
     subject_to: tuple[Demand, ...] = ()
+    catalogues: tuple[Catalogue, ...] = ()
 
     def run(self, **more: Any) -> Synthesis:
         """Search for the best machine by `synthesize`. Arguments in `more` replace those in `search`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -14,9 +15,9 @@ from jaxvib.machine.numbers.named import find_number
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.startup import start
 from jaxvib.units import count, number
-from jaxvib.units.tables import csv_column
+from jaxvib.units.tables import csv_column, row_names
 from optimize import recipes
-from optimize.design import Design
+from optimize.design import Catalogue, Design
 from optimize.quantities import exciters, jams, machine, motion, response, severity
 from optimize.quantities.cases import expected, worst
 from optimize.quantities.quantity import Demand, Quantity
@@ -90,7 +91,7 @@ def load_design(path: str | Path) -> Design:
     design = _design_from_recipe(scene, tables) if has_recipe else _design_from_tables(scene, tables, Path(path).parent)
     demands = tuple(d for k, table in enumerate(tables.get("demand", [])) for d in _demands(table, f"demand[{k}]"))
     search = {**design.search, **_search_options(tables.get("search", {}))}
-    return Design(design.space, design.objective, search, (*design.subject_to, *demands))
+    return dataclasses.replace(design, search=search, subject_to=(*design.subject_to, *demands))
 
 
 def _design_from_recipe(scene: Scene, tables: Tables) -> Design:
@@ -112,14 +113,18 @@ def _design_from_tables(scene: Scene, tables: Tables, folder: Path) -> Design:
     held = [hold(q, options.get("value")) for q, options in held_tables]
     ties = {name: tuple(v) if isinstance(v, list) else v for name, v in tables.get("ties", {}).items()}
     free, choices = dict(tables.get("free", {})), dict(tables.get("choices", {}))
-    choices = {name: _from_catalogue(scene, name, listed, folder) for name, listed in choices.items()}
+    catalogues = {name: _read_catalogue(scene, name, listed, folder) for name, listed in choices.items()}
+    for name, catalogue in catalogues.items():
+        if catalogue is not None:
+            choices[name] = catalogue.columns if "columns" in choices[name] else catalogue.columns[name]
     is_maximized = tables["objective"].get("maximize") is True
     objective, options = quantity_from_table(tables["objective"], "objective", ("maximize",), is_large_good=is_maximized)
     if not isinstance(options.get("maximize", False), bool):
         raise InputError("objective.maximize", f"is {quoted(options['maximize'])}; write true or false, without quotes")
     if is_maximized:
         objective = -objective
-    return Design(DesignSpace(scene, free, held, ties=ties, choices=choices), objective)
+    space = DesignSpace(scene, free, held, ties=ties, choices=choices)
+    return Design(space, objective, catalogues=tuple(filter(None, catalogues.values())))
 
 
 def _search_options(table: Tables) -> Tables:
@@ -141,27 +146,27 @@ def _search_options(table: Tables) -> Tables:
     return search
 
 
-def _from_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Any:
-    """Return the values of a choice: a list as it is, a column of a CSV file (a table with `file` and, if necessary, `column`),
-    or several columns, whose rows belong together (a table with `file` and `columns`)."""
+def _read_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Catalogue | None:
+    """Return the catalogue of a choice: a column of a CSV file (a table with `file` and, if necessary, `column`), or several
+    columns, whose rows belong together (a table with `file` and `columns`); None for values in the design file itself."""
     if not isinstance(values, Mapping) or any("." in parameter for parameter in values):
-        return values
+        return None
     column_names = values.get("columns", {name: values.get("column")})
     if (
         not isinstance(values.get("file"), str)
         or values.keys() - {"file", "column", "columns"}
         or not isinstance(column_names, Mapping)
+        or not column_names
     ):
         advice = (
             "write a list, or file = 'springs.csv', column = 'rate', or, for rows, columns = {'drive.power' = 'power', ...}"
         )
         raise InputError(f"choices.{name}", f"is {quoted(dict(values))}; {advice}")
     path = folder / values["file"]
-    columns = {
-        parameter: csv_column(path, find_number(scene, parameter, "choices").unit, column).tolist()
-        for parameter, column in column_names.items()
-    }
-    return columns if "columns" in values else columns[name]
+    units = {parameter: find_number(scene, parameter, "choices").unit for parameter in column_names}
+    columns = {parameter: csv_column(path, units[parameter], column).tolist() for parameter, column in column_names.items()}
+    first, column = next(iter(column_names.items()))
+    return Catalogue(name, row_names(path, units[first], column), columns)
 
 
 def _demands(table: object, section: str) -> list[Demand]:

@@ -413,14 +413,13 @@ def _table(
     values: np.ndarray,
     other: tuple[list[float], list[float]],
 ) -> tuple[Row, ...]:
-    """Return the rows of free parameters and quantities before and after the search."""
-    start, end = (np.concatenate([np.asarray(p.read(s)) for p in space.free]) for s in (space.scene, scene))
-    absent = [number.spec.zero_is_absent for number in space.free for _ in range(number.size)]
-    numbers = zip(space.words(), absent & (start == 0.0) & (end != 0.0), start, end, strict=True)
-    table = [
-        Row(f"{word} (new)" if new else word, unit, float(a), float(b), math.nan, math.nan)
-        for (word, unit), new, a, b in numbers
-    ]
+    """Return the rows of free parameters, of further columns of catalogues and of quantities, before and after the search."""
+    table = []
+    for number in (*space.free, *(column.target for column in space.columns)):
+        start, end = (np.asarray(number.read(each)) for each in (space.scene, scene))
+        is_new = number.spec.zero_is_absent & (start == 0.0) & (end != 0.0)
+        for word, new, a, b in zip(number.words(space.scene), is_new, start, end, strict=True):
+            table.append(Row(f"{word} (new)" if new else word, number.unit, float(a), float(b), math.nan, math.nan))
     if space.counts:
         counts = float(space.scene.loads.count), float(scene.loads.count)
         table.append(Row("number of loads", "", *counts, math.nan, math.nan))

@@ -68,11 +68,13 @@ def optimize(
         output.picture("history.png", best.run.plot)
         output.save_result("run.npz", best.run)
     ranges = tolerance_ranges(best.scene, _quantities_with_ranges(loaded), list(tolerances)) if tolerances else []
+    chosen = [catalogue.chosen(best.scene) for catalogue in loaded.catalogues]
     document = {
         **_document(best),
+        **({"chosen": chosen} if chosen else {}),
         **({"tolerances": [ranges_of_quantity._asdict() for ranges_of_quantity in ranges]} if tolerances else {}),
     }
-    parts = [tolerance_table(ranges, tolerances)] if tolerances else []
+    parts = [*chosen, *([tolerance_table(ranges, tolerances)] if tolerances else [])]
     output.done(document, lambda: "\n".join([_text(best), *parts]), "optimize", best)
 
 

@@ -37,6 +37,28 @@ def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.nda
     >>> jv.csv_column(path, "N/m").tolist()
     [12500.0, 20000.0]
     """
+    factor, cells = _column(path, unit, column)
+    return np.asarray([factor * _number(cell, f"{path}, row {line}") for line, cell, _ in cells])
+
+
+def row_names(path: str | Path, unit: str, column: str | None = None) -> list[str]:
+    """Return texts that identify the rows of `csv_column`: the first cell, if it is no number, with the row and the file."""
+    _, cells = _column(path, unit, column)
+    return [f"{_named(first)}row {line} of {Path(path).name}" for line, _, first in cells]
+
+
+def _named(cell: str) -> str:
+    """Return the first cell of a row as the beginning of a text, "" for a number."""
+    try:
+        float(cell or "0")
+    except ValueError:
+        return f"{cell}, "
+    return ""
+
+
+def _column(path: str | Path, unit: str, column: str | None) -> tuple[float, list[tuple[int, str, str]]]:
+    """Return the factor from a column to the SI unit, and of each row that has a cell there the number, this and the first
+    cell."""
     (_, head), *rows = _rows(path)
     names = [split_head(each, unit) for each in head]
     matching = [k for k, (name, head_unit) in enumerate(names) if _matches(head[k], name, head_unit, unit, column)]
@@ -49,10 +71,10 @@ def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.nda
     factor = 1.0 if not unit and head_unit in ("", "-") else unit_factor(head_unit, unit) if head_unit else None
     if factor is None:
         raise InputError(str(path), f"has the column {quoted(head[k])} without a unit of {unit}; write {names[k][0]} ({unit})")
-    cells = [(line, row[k]) for line, row in rows if len(row) > k and row[k]]
+    cells = [(line, row[k], row[0]) for line, row in rows if len(row) > k and row[k]]
     if not cells:
         raise InputError(str(path), f"has no number in the column {quoted(head[k])}")
-    return np.asarray([factor * _number(cell, f"{path}, row {line}") for line, cell in cells])
+    return factor, cells
 
 
 def _matches(head: str, name: str, head_unit: str, unit: str, column: str | None) -> bool:

@@ -6,6 +6,7 @@ import pytest
 import jaxvib as jv
 from jaxvib.units.columns import split_head
 from optimize import load_design
+from optimize.synthesize import _table
 
 SCENE = """[machine]
 kind = "one_mass"
@@ -101,8 +102,11 @@ def test_choices_of_a_design_come_from_a_catalogue(tmp_path):
     design = 'scene = "machine.toml"\n[choices]\n"machine.stiffness" = { file = "springs.csv", column = "rate" }\n'
     objective = '[objective]\nquantity = "foundation_force"\nmode = 1\n'
     (tmp_path / "design.toml").write_text(design + objective)
-    space = load_design(tmp_path / "design.toml").space
+    loaded = load_design(tmp_path / "design.toml")
+    space = loaded.space
     assert [list(choice.values) for choice in space.choices] == [[30e3, 40e3, 55e3]]
+    stiffest = space.scene_of(np.full(space.size, 55e3))
+    assert loaded.catalogues[0].chosen(stiffest) == "chosen machine.stiffness: row 4 of springs.csv"
     (tmp_path / "design.toml").write_text(design.replace("file =", "path =") + objective)
     with pytest.raises(jv.InputError, match=r"write a list, or file = 'springs.csv', column = 'rate'"):
         load_design(tmp_path / "design.toml")
@@ -130,8 +134,13 @@ def test_motors_are_chosen_by_rows_of_a_catalogue(tmp_path):
     design = f'scene = "machine.toml"\n[choices]\nmotor = {{ file = "motors.csv", columns = {{ {columns} }} }}\n'
     objective = '[objective]\nquantity = "foundation_force"\n'
     (tmp_path / "design.toml").write_text(design + objective)
-    space = load_design(tmp_path / "design.toml").space
+    loaded = load_design(tmp_path / "design.toml")
+    space, (catalogue,) = loaded.space, loaded.catalogues
     assert [choice.values for choice in space.choices] == [(1100.0, 1500.0, 2200.0)]
+    scene = space.scene_of(np.array([1100.0]))
+    assert catalogue.chosen(scene) == "chosen motor: 90S, row 3 of motors.csv"
+    rows = _table(space, scene, [], np.zeros((2, 0)), ([], []))
+    np.testing.assert_allclose([row.after for row in rows], [1100.0, 1430.0 * np.pi / 30.0, 2.6, 0.003])
     for power, speed, ratio, inertia in ((1100.0, 1430.0, 2.6, 0.003), (2200.0, 1450.0, 2.9, 0.0065)):
         chosen = space.scene_of(np.array([power])).drive
         found = [chosen.power, chosen.rated_speed * 30.0 / np.pi, chosen.breakdown_ratio, chosen.inertia]
