@@ -100,6 +100,17 @@ class Model(eqx.Module):
             force = force + term.force(rows @ displacement, rows @ velocity)
         return force
 
+    def known_force(self, force: Array) -> Array:
+        """Return a force on the foundation as results state it: NaN for a machine whose foundation is unknown."""
+        return force if self.scene.machine.has_foundation else jnp.full_like(force, jnp.nan)
+
+    def vibration_force(self, displacement: Array, omega: Array) -> Array:
+        """Return the complex amplitudes of the force on the foundation without effects, N, as results state them.
+
+        **Arguments**: `displacement` (nd,) or (nd, K): complex amplitudes; `omega`: their frequency, or one for each column.
+        """
+        return self.known_force(self.carrier.foundation_force(displacement, 1j * omega * displacement))
+
     def natural_force(self, unit: State) -> Array:
         """Return S n^2, N: the centrifugal force of the unbalance S at the rotor speed n.
 

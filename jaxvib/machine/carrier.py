@@ -302,6 +302,11 @@ class Machine(Part):
         return None
 
     @property
+    def has_foundation(self) -> bool:
+        """True if the force on the foundation is known, see `Carrier`; otherwise results state NaN."""
+        return True
+
+    @property
     def body_count(self) -> int:
         """Number of bodies on which a point is given by (x, y)."""
         return 1

@@ -206,7 +206,8 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
             if is_coincident or status_name(final.status) == "done" or not would_separate(run.scene, run.window):
                 return final, True
         if plan.mean_stretches is not None:
-            measured.append([drifts[-1], float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
+            force = float(np.nan_to_num(run.foundation_force))  # 0 if it is unknown
+            measured.append([drifts[-1], float(run.omega), force, *np.asarray(run.amplitude).tolist()])
             if len(measured) >= plan.mean_stretches and _steady_in_the_mean(np.array(measured[-plan.mean_stretches :])):
                 return _with_final_status(run, "beating"), True
             is_plain = plan.first.scene.is_plain

@@ -22,7 +22,6 @@ from jaxvib.machine.carrier import BodyPoint, Place, on_body, read_place
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.structures.matrices import MatrixMachine
 from jaxvib.machine.structures.plane_body import PlaneNetwork
 from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.machine.validation import validate_scene
@@ -358,10 +357,10 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
     amplitude, (displacement, w) = motion.amplitude[lengths], at_positive_speed(motion.displacement, motion.speed)
     static, dynamic, side = support_loads(model, w, displacement)
     forced = motion.exciter_force != 0.0  # True for NaN
-    force = jnp.nan * motion.foundation_force if _lacks_foundation(scene) else motion.foundation_force
+    force = model.known_force(motion.foundation_force)
     ratio = jnp.where(forced, force / jnp.where(forced, motion.exciter_force, 1.0), jnp.inf)
     each_direction = magnitude((carrier.foundation_stiffness + 1j * w * carrier.foundation_damping) @ displacement)
-    if model.supports or _lacks_foundation(scene):
+    if model.supports or not scene.machine.has_foundation:
         each_direction = force[None] if each_direction.shape == (1,) else jnp.full_like(each_direction, jnp.nan)
     measures = VibrationMeasures(
         speed=motion.speed,
@@ -435,7 +434,7 @@ def support_loads(model: LinearModel, omega: Array, displacement: Array) -> tupl
     machine = model.scene.machine
     stiffness, damping = machine.support_rows()
     forces = magnitude((stiffness + 1j * omega * damping) @ displacement)
-    if model.supports or _lacks_foundation(model.scene):
+    if model.supports or not machine.has_foundation:
         forces = jnp.full_like(forces, jnp.nan)
     sag = weight_deflection(model)
     static = jnp.full(forces.shape[0], jnp.nan) if sag is None else stiffness[:, -1] @ sag
@@ -444,11 +443,6 @@ def support_loads(model: LinearModel, omega: Array, displacement: Array) -> tupl
         static = jnp.where(between_bodies, jnp.abs(static), static)
     side = jnp.zeros_like(forces[:, 0]) if forces.shape[1] == 1 else forces[:, 0]
     return static, forces[:, -1], side
-
-
-def _lacks_foundation(scene: Scene) -> bool:
-    """Return True for a machine from matrices without a foundation, whose forces on it are unknown."""
-    return isinstance(scene.machine, MatrixMachine) and scene.machine.foundation is None
 
 
 def weight_deflection(model: LinearModel) -> Array | None:

@@ -355,7 +355,7 @@ def motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dic
     z = model.displacement(jnp.where(bounded, omega, 1.01 * omega + 1.0))
     lengths = np.flatnonzero(np.asarray(model.carrier.units) == "m")
     amplitude = magnitude(z)
-    exciter, force = peak_force(model.resultant * omega**2), peak_force(model.carrier.foundation_force(z, 1j * omega * z))
+    exciter, force = peak_force(model.resultant * omega**2), peak_force(model.vibration_force(z, omega))
     torque = model.required_torque(omega, z)
     motor = model.drive_torque(omega, torque)
     forced = exciter > 0.0

@@ -47,6 +47,11 @@ class MatrixMachine(Machine):
         force = jnp.zeros((2, 1, len(names)), self.mass.dtype) if self.foundation is None else self.foundation
         return Carrier(self.mass, self.damping, self.stiffness, force[0], force[1], names)
 
+    @property
+    def has_foundation(self) -> bool:
+        """True if the rows of the force on the foundation are given."""
+        return self.foundation is not None
+
     def mount(self, at: Place = None) -> Mount:
         """Return the mount of an exciter at the place with the number `at`."""
         rows = self._all_rows(at, "at")
@@ -92,7 +97,7 @@ def from_matrices(
       indices of its coordinates, [up], [horizontal, up] or [horizontal, up, rotation], or a matrix (1 to 3, nd) that gives its
       displacement from q; all places have the same number of directions
     - `foundation`: (T_K, T_C), two arrays (nb, nd): the force on the foundation is T_K q + T_C q', up (nb = 1) or horizontal
-      and up (nb = 2); default: the force is unknown, results state 0, and transmissibility and loads of supports are NaN
+      and up (nb = 2); default: the force is unknown, and results that depend on it are NaN
     - `reduce`: largest number of coordinates; typical: 6 to 20 (default: 12); None keeps all
 
     **Returns** `MatrixMachine`.

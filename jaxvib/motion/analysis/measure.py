@@ -106,7 +106,8 @@ class AbstractMeasured(Readable):
         structure = scene.machine.structure()
         named = zip(structure.coordinates, self.amplitude, structure.units, strict=True)
         amplitude = ", ".join(f"{name} {quantity_text(a, unit, 4)}" for name, a, unit in named)
-        return f"amplitude, zero to peak: {amplitude}; foundation force {quantity_text(self.foundation_force, 'N', 4)}"
+        force = quantity_text(self.foundation_force, "N", 4) if scene.machine.has_foundation else "unknown"
+        return f"amplitude, zero to peak: {amplitude}; foundation force {force}"
 
     def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array]) -> str:
         """Return the speeds of the turning masses, and the last `rotor_speeds` of loads, as a line of text.
@@ -132,7 +133,7 @@ class Measured(AbstractMeasured):
 
 def trajectory(model: Model, times: Array, states: State) -> Trajectory:
     """Return the trajectory of `states` at `times`, s, with foundation forces, rotor angles and rotor speeds."""
-    force = jax.vmap(model.foundation_force)(states.displacement, states.velocity)
+    force = model.known_force(jax.vmap(model.foundation_force)(states.displacement, states.velocity))
     pairs = [
         (exciter.turning_drive, exciter_state.rotor)
         for exciter, exciter_state in zip(model.scene.exciters, states.exciters, strict=True)
@@ -193,7 +194,7 @@ def measure(model: Model, field: Field, times: Array, states: State, unit: State
         omega=omega,
         load_speed=speeds,
         amplitude=whole[:nd],
-        foundation_force=whole[nd] if whole.shape[0] == nd + 1 else jnp.sqrt(jnp.sum(whole[nd:] ** 2)),
+        foundation_force=model.known_force(jnp.sqrt(jnp.sum(whole[nd:] ** 2)) if whole.shape[0] > nd + 1 else whole[nd]),
         drift=jnp.maximum(jnp.maximum(drift, force_drift), speed_drift),
     )
 
@@ -268,7 +269,7 @@ def locate_peaks(model: Model, field: Field, times: Array, states: State) -> Pea
     _, first, position = locate_extrema(jnp.sum(force**2, axis=0), 2.0 * jnp.sum(force * change, axis=0))
     at, place = first[1, 2] + jnp.arange(NODES), position[1, 2]
     largest_force = jax.vmap(lambda x, v: extremum_value(x[at], v[at], place))(force, change)
-    return Peaks(jnp.maximum(-low[2], high[2]), jnp.sqrt(jnp.sum(largest_force**2)))
+    return Peaks(jnp.maximum(-low[2], high[2]), model.known_force(jnp.sqrt(jnp.sum(largest_force**2))))
 
 
 def _sampled_outputs(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array]:

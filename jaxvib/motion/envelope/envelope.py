@@ -300,7 +300,7 @@ def _run(
         return jax.vmap(lambda t, y: _at(model, field, t, units.unpack(y, nd)))(times, flat)
 
     kept = envelopes(solution.ts[0], solution.ys[0])
-    finite = is_finite(kept)
+    finite = is_finite(solution.ys[0])
     turning = _turning(scene, field, begin, kept)
     status = _status(solution.result, exists, finite, turning)
     whole = envelopes(solution.ts[1], solution.ys[1]) if samples else None
@@ -384,7 +384,7 @@ def _at(model: Model, field: Averaged, t: Array, state: Amplitudes) -> Envelopes
         displacement=state.displacement,
         velocity=state.velocity,
         amplitude=magnitude(state.displacement),
-        foundation_force=magnitude(model.carrier.foundation_force(state.displacement, state.velocity)),
+        foundation_force=model.known_force(magnitude(model.carrier.foundation_force(state.displacement, state.velocity))),
         omega=jnp.mean(state.rate),
         load_speed=_anticlockwise(model.scene, state.rate),
         phase=state.phase,
@@ -413,6 +413,7 @@ def _measure(model: Model, window: Envelopes) -> Measured:
     drift = jnp.max(change) / jnp.maximum(jnp.max(amplitude), MIN_CHANGE_SCALE * unit.displacement)
     force_change = jnp.abs(jnp.max(window.foundation_force[half:], axis=0) - jnp.max(window.foundation_force[:half], axis=0))
     force_drift = jnp.max(force_change) / jnp.maximum(jnp.max(force), MIN_CHANGE_SCALE * model.natural_force(unit))
+    force_drift = jnp.nan_to_num(force_drift)  # of an unknown force
     speed_drift = jnp.max(jnp.abs(late - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
     return Measured(
         omega=omega,

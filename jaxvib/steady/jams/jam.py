@@ -398,7 +398,7 @@ def jam_at(
         slope=slope,
         displacement=displacement,
         amplitude=magnitude(displacement),
-        foundation_force=peak_force(model.carrier.foundation_force(displacement, 1j * omega * displacement)),
+        foundation_force=peak_force(model.vibration_force(displacement, omega)),
         coordinates=model.carrier.coordinates,
         units=model.carrier.units,
     )

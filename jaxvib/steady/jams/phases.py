@@ -187,7 +187,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     turn, response = jnp.exp(1j * angles), response_of(balance, w)
     torque = torques_at(balance.unbalance, balance.direction.conj() @ response, w, turn)
     z = w**2 * response @ (balance.unbalance * turn)
-    force = balance.model.carrier.foundation_force(z, 1j * w * z)
+    force = balance.model.vibration_force(z, w)
     residual = jnp.max(jnp.abs(balance.drag * (balance.speed - w) + torque)) / jnp.max(balance.drag * balance.speed)
     tiny = jnp.sqrt(jnp.finfo(w.dtype).eps)
     lag = (frozen.speed - w) / frozen.speed

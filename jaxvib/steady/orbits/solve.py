@@ -331,7 +331,6 @@ class Harmonics(NamedTuple):
 
 def harmonics_of(model: JammedBodies, grid: Grid, motion: PeriodicSolution, response: Array | None = None) -> Harmonics:
     """Return harmonics of psi and of the carrier's motion; `response`: its `unbalance_response`, if known."""
-    carrier = model.linear.carrier
     point, _ = model.circle(grid.theta[None] + motion.deviation)
     force = analyzed(jnp.einsum("g,agi->ai", model.unbalance, point), grid.analysis)
     if response is None:
@@ -342,7 +341,7 @@ def harmonics_of(model: JammedBodies, grid: Grid, motion: PeriodicSolution, resp
         analyzed(motion.deviation, deviation_analysis(grid)),
         displacement,
         -(model.linear.mount.rows[0] @ displacement) * w[None] ** 2,
-        carrier.foundation_force(displacement, 1j * w[None] * displacement),
+        model.linear.vibration_force(displacement, w[None]),
     )
 
 

@@ -419,7 +419,7 @@ def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: A
     vibration = torques_at(balance.unbalance, balance.direction.conj() @ response, w, turn)
     driving = jnp.where(balance.is_prescribed, -vibration, balance.driving_torque(w))
     z = w**2 * response @ (balance.unbalance * turn)
-    force = peak_force(balance.model.carrier.foundation_force(z, 1j * w * z))
+    force = peak_force(balance.model.vibration_force(z, w))
     scale = vibration_scale(balance, w)
     residual = jnp.max(jnp.abs(driving + vibration) / jnp.where(scale > 0.0, scale, 1.0))
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from optimize import amplitude, foundation_force, transmissibility
 
 BALLS = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
 DRIVE = jv.ConstantSpeed(60.0)
@@ -238,3 +239,21 @@ def test_a_chain_without_support_is_read_in_single_precision():
 def test_wrong_input_ends_in_one_sentence(make, says):
     with pytest.raises(jv.InputError, match=says):
         make()
+
+
+def test_forces_on_an_unknown_foundation_are_nan():
+    stiffness = np.array([[9e4, -4e4], [-4e4, 7e4]])
+    machine = jv.from_matrices(np.diag([100.0, 80.0]), 2e-3 * stiffness, stiffness, places=[[0]])
+    scene = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed(60.0))
+    run = jv.simulate(scene, 3.0, save="window")
+    assert np.all(np.isnan(run.window.foundation_force)) and np.isnan(run.foundation_force) and np.isnan(run.largest_force)
+    assert np.all(np.isfinite(run.amplitude)) and np.isfinite(run.drift)
+    assert "foundation force unknown" in run.summary()
+    jam = jv.jam_modes(scene)
+    assert np.all(np.isnan(jam.foundation_force)) and float(amplitude(mode=5)(scene)) == float(jam.amplitude[jam.row(5), 0])
+    for quantity in (foundation_force(mode=5), transmissibility(mode=5)):
+        with pytest.raises(jv.InputError, match=r"^machine.foundation is not given, so that the force on the foundation is"):
+            quantity(scene)
+    turning = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(60.0), unbalance=0.1)])
+    found = jv.response(turning, [20.0])
+    assert np.isnan(found.foundation_force[0]) and np.isnan(found.transmissibility[0]) and found.exciter_force[0] == 40.0
