@@ -86,8 +86,8 @@ class Sliding(Effect):
 
     with F_r of the motion in which the load rolls. If F_t exceeds the limit, its size is reduced to the limit and its direction
     is kept. The remaining slip then decays as exp(- kappa/(kappa-1) mu |N| t/(m width)). Steps must resolve this decay:
-    about kappa/(kappa-1) mu R w^2/width steps per second. `RollingFriction` still acts against the motion of the centre of a
-    sliding load.
+    about kappa/(kappa-1) mu R w^2/width steps per second. The moment of a `RollingFriction` acts on the rotation of a sliding
+    load; its direction is still that against the motion of the centre.
 
     **Arguments** (SI, or strings with a unit)
 
