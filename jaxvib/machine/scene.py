@@ -165,7 +165,7 @@ def read_unbalance(drive: Drive, unbalance: Number | None, unbalance_mass: Numbe
 
 
 def _require_inertia(unbalance: float, mass: float, inertia: float) -> None:
-    smallest = unbalance**2 / mass
+    smallest = unbalance * unbalance / mass  # a power of a large float raises an OverflowError
     if inertia < smallest * (1.0 - 1e-12):
         problem = f"is {inertia:g} kg m^2, less than that of the unbalance alone, S^2/m = {smallest:g} kg m^2"
         raise InputError("drive.inertia", f"{problem}; it must include the unbalance")

@@ -516,7 +516,8 @@ class SwitchedOff(MotorWrapper):
 
         T = torque of the motor  (t < at),    T = -bearing theta'  (t >= at)
 
-    `simulate` ends a step at that time. In analyses of steady motions the motor is off: `torque` is the friction.
+    `simulate` ends a step at that time. In analyses of steady motions the motor is off: `torque` is the friction. States of the
+    motor, such as currents, have no effect and no meaning after that time.
 
     **Arguments** (SI, or strings with a unit)
 

@@ -147,8 +147,9 @@ def _require_plate(rated: float, frequency: float, ratio: float, synchronous: fl
     if not rated < frequency * (1.0 - 1e-6):
         problem = f"{speed}; it must be below {speed_text(frequency)}, the synchronous speed of one pole pair"
         raise InputError("drive.rated_speed", f"{problem}; a plain number is in rad/s, write for example '1440 rpm'")
-    if frequency / synchronous > _MAX_POLE_PAIRS + 0.5:
-        problem = f"{speed}, which needs {frequency / synchronous:.0f} pole pairs; motors have 1 to {_MAX_POLE_PAIRS}"
+    pole_pairs = frequency / synchronous if synchronous > 0.0 else np.inf
+    if pole_pairs > _MAX_POLE_PAIRS + 0.5:
+        problem = f"{speed}, which needs {pole_pairs:.0f} pole pairs; motors have 1 to {_MAX_POLE_PAIRS}"
         raise InputError("drive.rated_speed", f"{problem}; give the speed of the name plate, and the supply's frequency")
     if not breakdown_slip < 1.0:
         slip = f"{100.0 * (1.0 - rated / synchronous):.3g} % below the synchronous speed of {speed_text(synchronous)}"

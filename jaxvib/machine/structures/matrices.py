@@ -140,13 +140,14 @@ def _lowest_modes(mass: Array, stiffness: Array, number: int) -> Array:
 
 def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:
     """Return a matrix, square if `shape` is None; a number stands for a 1 x 1 matrix."""
-    if np.iscomplexobj(value):
+    try:
+        is_complex = np.iscomplexobj(value)
+        matrix = jnp.asarray(value, dtype=None if is_complex else float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(name, f"is {quoted(value)}; it must be a square array of numbers, in SI units") from error
+    if is_complex:
         problem = "is complex; a real one is needed, structural damping as an equivalent viscous damping in machine.damping"
         raise InputError(name, problem)
-    try:
-        matrix = jnp.asarray(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(name, f"is {quoted(value)}; it must be a square array of numbers, in SI units") from error
     matrix = matrix[None, None] if matrix.ndim == 0 else matrix
     if matrix.ndim != 2 or matrix.shape != (matrix.shape[:1] * 2 if shape is None else shape) or matrix.size == 0:
         needed = "a square matrix" if shape is None else " x ".join(map(str, shape))
@@ -181,7 +182,7 @@ def _allowed_error(matrix: np.ndarray) -> float:
 
 
 def _read_places(places: Any, size: int) -> Array:
-    if not isinstance(places, (list, tuple, np.ndarray, Array)) or len(places) == 0:
+    if not isinstance(places, (list, tuple, np.ndarray, Array)) or getattr(places, "ndim", 1) == 0 or len(places) == 0:
         raise InputError("machine.places", f"is {quoted(places)}; it must be a list of places such as [[0, 1]]")
     rows = [_read_rows(place, f"machine.places[{k}]", size) for k, place in enumerate(places)]
     if len({each.shape for each in rows}) > 1:

@@ -195,6 +195,9 @@ def test_a_chain_without_support_is_read_in_single_precision():
         (lambda: jv.from_matrices(ONE, ONE, [[1, 1], [0, 1]], places=[[0]]), "machine.stiffness is not symmetric"),
         (lambda: jv.from_matrices(ONE, ONE, ONE * np.nan, places=[[0]]), "machine.stiffness has an entry that is not finite"),
         (lambda: jv.from_matrices("a", ONE, ONE, places=[[0]]), "machine.mass is 'a'; it must be a square array"),
+        (lambda: jv.from_matrices([[1, 2], [3]], ONE, ONE, places=[[0]]), r"machine.mass is \[\[1, 2\], \[3\]\]; it must be a"),
+        (lambda: jv.from_matrices(10**400, ONE, ONE, places=[[0]]), "machine.mass is a whole number of 1329 bits; it must"),
+        (lambda: jv.from_matrices(ONE, ONE, ONE, places=np.array("x")), "machine.places is .*; it must be a list of places"),
         (lambda: jv.from_matrices(ONE, ONE, (1 + 0.1j) * ONE, places=[[0]]), "machine.stiffness is complex; a real one"),
         (lambda: jv.from_matrices(ONE, ONE, ONE, ONE, places=[[0]]), "machine.gyroscopic is not skew-symmetric"),
         (
