@@ -135,7 +135,10 @@ def test_numbers_of_several_exciters_have_names():
 BAD = {
     "direction": (lambda: two(direction=0), r"direction is 0; it must be 1 \(anticlockwise\) or -1"),
     "negative unbalance": (lambda: two(unbalance=-0.2), r"unbalance is -0.2 kg m; it must be greater than 0"),
-    "huge unbalance": (lambda: two(unbalance=1e308, unbalance_mass=1.0), "less than that of the unbalance alone, .* = inf kg m"),
+    "huge unbalance": (
+        lambda: two(unbalance=1e308, unbalance_mass=1.0),
+        "less than that of the unbalance alone, .* = inf kg m",
+    ),
     "neither": (lambda: two(unbalance=None), r"loads is None; .* or give an unbalance"),
     "no drive": (lambda: two(drive=None), r"drive is None; it must be a Drive"),
     "platform": (lambda: two(at=3), r"^exciters\[1\].at is 3; the machine has platforms 1 to 2"),

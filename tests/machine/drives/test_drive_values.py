@@ -172,7 +172,10 @@ REFUSED = {
         lambda: jv.TorqueTable([0.0, 5.0], [0.0, -1.0], 0.1),
         "drive.torques must begin with a positive",
     ),
-    "tiny speed": (lambda: jv.NamePlateMotor(4e3, 5e-324, 2.8, 0.1), "drive.rated_speed is 4.9407e-323 rpm, which needs inf pole"),
+    "tiny speed": (
+        lambda: jv.NamePlateMotor(4e3, 5e-324, 2.8, 0.1),
+        "drive.rated_speed is 4.9407e-323 rpm, which needs inf pole",
+    ),
     "rise at the end": (lambda: jv.TorqueTable([0.0, 5.0, 9.0], [2.0, -2.0, 0.0], 0.1), "drive.torques rise at the end"),
     "torque at the end": (lambda: jv.TorqueTable([0.0, 5.0], [2.0, 1.0], 0.1), "drive.torques must begin with a positive"),
     "profile at rest": (lambda: jv.SpeedProfile([0.0, 1.0], [0.0, 0.0]), "drive.speeds are all 0; at least one must be"),
