@@ -210,7 +210,8 @@ def _with_requested_modes(problem: Problem, point: Point) -> Point:
         return point
     same = np.ones(len(point.z), bool)
     for key, followed, on_branch in zip(problem.keys, point.speeds, find_speeds(problem, point.z), strict=True):
-        near = np.abs(followed / on_branch - 1.0) < 1e-6
+        with np.errstate(invalid="ignore"):  # a fold that does not exist is infinite
+            near = np.abs(followed / on_branch - 1.0) < 1e-6
         is_same_jam = near if key[1][0] == "jam" else near | ~np.isfinite(on_branch)
         same &= np.all(is_same_jam.reshape(len(same), -1), axis=1)
     return point._replace(values=np.where(same[:, None], point.values, np.nan))

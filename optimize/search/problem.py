@@ -178,7 +178,9 @@ class Point(NamedTuple):
         guess = []
         for k, r in zip(self.speeds, self.speed_slopes, strict=True):
             extrapolated = k + np.einsum("s...d,sd->s...", r, step)
-            guess.append(np.where(np.isfinite(extrapolated) & (np.abs(extrapolated / k - 1.0) < 0.2), extrapolated, k))
+            with np.errstate(invalid="ignore"):  # a fold that does not exist is infinite
+                is_near = np.isfinite(extrapolated) & (np.abs(extrapolated / k - 1.0) < 0.2)
+            guess.append(np.where(is_near, extrapolated, k))
         return tuple(guess)
 
 

@@ -70,6 +70,13 @@ def test_jam_with_another_mode_number_is_rejected():
     np.testing.assert_array_equal(kept.slopes, point.slopes)
 
 
+def test_fold_that_does_not_exist_rejects_no_design(monkeypatch):
+    none = (np.array([np.inf]),)
+    monkeypatch.setattr(find_module, "find_speeds", lambda *_: none)
+    point = point_of(np.zeros((1, 2)), np.ones((1, 1)), np.ones((1, 1, 2)))._replace(speeds=none)
+    assert _with_requested_modes(SimpleNamespace(keys=(((), ("above", 5)),)), point).values == 1.0
+
+
 def test_tolerances_are_found_in_nested_quantities():
     space, off = DesignSpace(SCENE, FREE), {"machine.stiffness": 0.05}
     mean = expected(NEAR, off, samples=4)

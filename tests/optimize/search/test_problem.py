@@ -127,6 +127,12 @@ def test_extrapolation_beyond_a_fifth_is_rejected():
     np.testing.assert_allclose(two, [[10.15, 19.85], [10.0, 17.0], [10.0, 20.0], [np.nan, np.nan]])
 
 
+def test_a_fold_that_does_not_exist_stays_infinite():
+    z = np.zeros((2, 2))
+    point = Point(z, z, z, (np.array([np.inf, -np.inf]),), (np.zeros((2, 2)),), z, z)
+    np.testing.assert_array_equal(point.extrapolate_speeds(z + 0.1)[0], [np.inf, -np.inf])
+
+
 def test_points_are_combined_by_design():
     values, slopes = np.arange(6.0).reshape(3, 2), np.arange(12.0).reshape(3, 2, 2)
     point = point_of(np.zeros((3, 2)), values.copy(), slopes.copy())
