@@ -126,7 +126,8 @@ class Vibration(NamedTuple):
     - `speed` w, rad/s
     - `displacement` (nd,): complex amplitudes, and `amplitude` (nd,), zero to peak, m (rad for rotations)
     - `foundation_force` and `exciter_force`, N zero to peak: force on the foundation, and resultant of the centrifugal forces
-    - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive
+    - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive; `power` is the mean of torque times
+      speed, which differs from the product of the means if both vary within a turn
     """
 
     speed: Array
@@ -154,12 +155,15 @@ class VibrationMeasures(Readable):
       forces is unknown
     - `foundation_load` (directions,), N zero to peak: force on the foundation in each direction, across and up for a body in a
       plane or a rotor
+    - `static_deflection` (nt,), m: downward displacement of each coordinate under the weight of machine and loads, NaN and 0 as
+      in `weight_deflection`; typical: 5 to 30 mm for screens
     - `static_load` (ns,), N: weight that each support carries, negative if a support on the foundation is pulled up; NaN if the
       supports cannot carry the weight, and if the directions of the coordinates are unknown
     - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on a support.
       They are NaN, as is `foundation_load` in two directions, for a scene with supports that are effects (`CubicSupport`,
       `Stop`), and for matrices without a foundation
-    - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive
+    - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive; `power` is the mean of torque times
+      speed, which differs from the product of the means if both vary within a turn
     - `point` (2,) of a body in a plane, its `point_stroke`, m peak to peak along the long axis of its path, its
       `point_acceleration`, g, `throw_angle`, rad, and `throw_number`, see `Ellipse`, and `conveying_speed`, m/s, the estimate
       of `jaxvib.conveying_speed`; with a leading axis if several points were requested; None for other machines
@@ -173,6 +177,7 @@ class VibrationMeasures(Readable):
     exciter_force: Array = eqx.field(metadata=in_unit("N"))
     transmissibility: Array = eqx.field(metadata=in_unit(""))
     foundation_load: Array = eqx.field(metadata=in_unit("N", "direction"))
+    static_deflection: Array = eqx.field(metadata=in_unit("m", "translation"))
     static_load: Array = eqx.field(metadata=in_unit("N", "support"))
     dynamic_load: Array = eqx.field(metadata=in_unit("N", "support"))
     side_load: Array = eqx.field(metadata=in_unit("N", "support"))
@@ -224,6 +229,11 @@ class VibrationMeasures(Readable):
             for k, name in enumerate(self.coordinates)
             if not float(self.stroke[k]) < _NEGLIGIBLE * float(np.max(self.stroke))
         ]
+        sag, most = np.asarray(self.static_deflection), np.nanmax(np.abs(self.static_deflection), initial=0.0)
+        sagging = [k for k, each in enumerate(sag) if abs(each) > _NEGLIGIBLE * most]
+        if sagging:
+            named = ", ".join(f"{self.coordinates[k]} {quantity_text(sag[k], 'm', 4)}" for k in sagging)
+            lines.append(f"static deflection{of}, down: {named}")
         loads = np.stack([np.asarray(each) for each in (self.static_load, self.dynamic_load, self.side_load)], axis=1)
         for k, each in enumerate(loads):
             named = zip(each, ("static", "dynamic", "to the sides"), strict=True)
@@ -237,7 +247,9 @@ class VibrationMeasures(Readable):
         if ratio < _LARGEST_TRANSMISSIBILITY:
             passed = f"of the exciter's {quantity_text(self.exciter_force, 'N', 4)}, {100.0 * ratio:.3g} % reach the foundation"
             lines.append(passed + (f" (isolation {100.0 * (1.0 - ratio):.3g} %)" if ratio < 1.0 else ""))
-        shafts = [f"{float(t):.4g} N m, {float(p):.4g} W" for t, p in zip(self.torque, self.power, strict=True)]
+        shafts = [
+            f"mean torque {float(t):.4g} N m, mean power {float(p):.4g} W" for t, p in zip(self.torque, self.power, strict=True)
+        ]
         number = [""] if len(shafts) == 1 else [f" of exciter {k + 1}" for k in range(len(shafts))]
         lines += [f"shaft{k}: {text}" for k, text in zip(number, shafts, strict=True) if "nan" not in text]
         return "\n".join([*lines, *self._throw_text()])
@@ -297,9 +309,10 @@ def vibration_measures(
     ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
     >>> print(vibration_measures(scene, jv.jam_modes(scene).select(1)).summary())
     y1: stroke 17.11 mm peak to peak, 0.638 g, 163.6 mm/s RMS (zone D)
+    static deflection, down: y1 12.5 mm
     support 1: 500.1 N static, 349.1 N dynamic
     of the exciter's 73.14 N, 477 % reach the foundation
-    shaft: 0.2969 N m, 12.43 W
+    shaft: mean torque 0.2969 N m, mean power 12.43 W
     """
     scene = validate_scene(scene)
     along, kind = known_number(slope, "rad", "slope"), scene.machine.kind
@@ -355,7 +368,8 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
     carrier = model.carrier
     lengths = np.flatnonzero(np.asarray(carrier.units) == "m")
     amplitude, (displacement, w) = motion.amplitude[lengths], at_positive_speed(motion.displacement, motion.speed)
-    static, dynamic, side = support_loads(model, w, displacement)
+    sag = weight_deflection(model)
+    static, dynamic, side = support_loads(model, w, displacement, sag)
     forced = motion.exciter_force != 0.0  # True for NaN
     force = model.known_force(motion.foundation_force)
     ratio = jnp.where(forced, force / jnp.where(forced, motion.exciter_force, 1.0), jnp.inf)
@@ -370,6 +384,7 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
         exciter_force=motion.exciter_force,
         transmissibility=ratio,
         foundation_load=each_direction,
+        static_deflection=jnp.full_like(amplitude, jnp.nan) if sag is None else sag[lengths],
         static_load=static,
         dynamic_load=dynamic,
         side_load=side,
@@ -425,18 +440,17 @@ def shaft_torque(model: JammedModel, omega: Array, displacement: Array) -> Array
     return jnp.where(is_close, power / omega, torque)
 
 
-def support_loads(model: LinearModel, omega: Array, displacement: Array) -> tuple[Array, Array, Array]:
+def support_loads(model: LinearModel, omega: Array, displacement: Array, sag: Array | None) -> tuple[Array, Array, Array]:
     """Return the static, the vertical dynamic and the horizontal dynamic force on each support, (ns,) N each.
 
-    Dynamic forces are zero to peak, NaN for a scene with supports that are effects. The static force is NaN if the supports
-    cannot carry the weight, and if the directions of the coordinates are unknown.
+    `sag`: the `weight_deflection`. Dynamic forces are zero to peak, NaN for a scene with supports that are effects. The static
+    force is NaN if the supports cannot carry the weight, and if the directions of the coordinates are unknown.
     """
     machine = model.scene.machine
     stiffness, damping = machine.support_rows()
     forces = magnitude((stiffness + 1j * omega * damping) @ displacement)
     if model.supports or not machine.has_foundation:
         forces = jnp.full_like(forces, jnp.nan)
-    sag = weight_deflection(model)
     static = jnp.full(forces.shape[0], jnp.nan) if sag is None else stiffness[:, -1] @ sag
     if isinstance(machine, PlaneNetwork):  # the order of the ends of a support between two bodies has no meaning
         between_bodies = np.array([each.to is not None for each in machine.supports])

@@ -7,7 +7,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError
 from jaxvib.steady import measures
-from jaxvib.steady.measures import acceleration_of, exciter_force, rms_velocity_of, support_loads
+from jaxvib.steady.measures import acceleration_of, exciter_force, rms_velocity_of, support_loads, weight_deflection
 from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.jams import jam_amplitude, jam_force, jam_quantity, jam_speed, pair_of, pair_text
@@ -167,7 +167,7 @@ def support_load(*, mode: int, of: int) -> Quantity:
 
 def _support_load(evaluation: Evaluation, tier: Tier, mode: int, of: int) -> Array:
     jam = evaluation.jam(mode)
-    static, dynamic, _ = support_loads(evaluation.jammed, jam.omega, jam.displacement)
+    static, dynamic, _ = support_loads(evaluation.jammed, jam.omega, jam.displacement, weight_deflection(evaluation.jammed))
     if of > static.shape[0]:
         raise InputError("of", f"is {of}; the machine has supports 1 to {static.shape[0]}")
     return static[of - 1] + dynamic[of - 1]

@@ -281,7 +281,7 @@ def test_response_lists_operating_points_peaks_and_folds(typed, tmp_path):
     head, *rows = read(tmp_path / "curve.csv")
     np.testing.assert_allclose(float(rows[9][head.index("torque (N m)")]), found.torque[9, 0], rtol=1e-7)
     power = [each["measures"]["power"] for each in document["operating_points"] if each["stable"]]
-    shown = [float(line.split()[4]) for line in out.splitlines() if line.startswith("  shaft: ")]
+    shown = [float(line.split()[8]) for line in out.splitlines() if line.startswith("  shaft: ")]
     np.testing.assert_allclose(np.ravel(power), shown, rtol=1e-3)
     assert typed("response", "machine.toml")[0] == 2
     code, _, err = typed("response", "table.toml", "--deck", "1,0")

@@ -205,6 +205,8 @@ def test_one_mass_has_the_measures_of_the_closed_form():
         np.testing.assert_allclose(measures.power, [c * (w * y) ** 2 / 2.0], rtol=1e-3)
         np.testing.assert_allclose(measures.torque, measures.power / w, rtol=1e-6)
         np.testing.assert_allclose(measures.static_load, [m * G], rtol=1e-12)
+        np.testing.assert_allclose(measures.static_deflection, [m * G / k], rtol=1e-12)
+        assert f"static deflection, down: y1 {1e3 * m * G / k:.4g} mm" in measures.summary()
         np.testing.assert_allclose(measures.dynamic_load, [abs(k + 1j * w * c) * y], rtol=1e-4)
         np.testing.assert_allclose(measures.transmissibility, abs(k + 1j * w * c) * y / (unbalance * w**2), rtol=1e-4)
 
