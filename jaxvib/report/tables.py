@@ -5,7 +5,10 @@ from __future__ import annotations
 import html
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TypeAlias, TypeGuard, cast
+
+import equinox as eqx
 
 from jaxvib.display import shown_unit
 from jaxvib.machine.files import EFFECTS, scene_to_toml
@@ -103,7 +106,7 @@ def parameter_tables(scene: Scene) -> str:
     if "exciters" in tables:
         owners = [(f"exciter {k}, ", t, e) for k, (t, e) in enumerate(zip(tables["exciters"], scene.exciters, strict=True), 1)]
     kind = str(tables["machine"].pop("kind"))
-    parts.append((f"machine: {_words(kind)}", tables["machine"], _units(type(scene.machine))))
+    parts.append((f"machine: {_words(kind)}", tables["machine"], _units_of(scene.machine)))
     for prefix, table, exciter in owners:
         own_fields = {name: table[name] for name in ("at", "direction", "unbalance") if name in table}
         units = dict(_units(Exciter))
@@ -112,7 +115,7 @@ def parameter_tables(scene: Scene) -> str:
         parts += [(prefix.removesuffix(", "), own_fields, units)] if own_fields else []
         for section in [name for name in ("loads", "drive") if name in table]:
             kind = str(table[section].pop("kind"))
-            parts.append((f"{prefix}{section}: {_words(kind)}", table[section], _units(type(getattr(exciter, section)))))
+            parts.append((f"{prefix}{section}: {_words(kind)}", table[section], _units_of(getattr(exciter, section))))
     for prefix, table in [("", tables), *((prefix, table) for prefix, table, _ in owners if prefix)]:
         for name, value in table.get("effects", {}).items():
             for effect_table in value if isinstance(value, list) else [value]:
@@ -121,8 +124,17 @@ def parameter_tables(scene: Scene) -> str:
     return "".join(f"<h3>{escaped(title)}</h3>{_pair_table(list(table.items()), units)}" for title, table, units in shown)
 
 
-def _units(part: type) -> Units:
+def _units(part: type) -> dict[str, str]:
     return {name: spec.unit for name, spec in number_specs(part).items()}
+
+
+def _units_of(part: object) -> dict[str, str]:
+    """Return the units of the numbers of a part, and of the parts within it such as supports and motors, by name."""
+    units: dict[str, str] = {}
+    for value in vars(part).values():
+        for each in value if isinstance(value, tuple) else (value,):
+            units |= _units_of(each) if isinstance(each, eqx.Module) else {}
+    return units | _units(type(part))
 
 
 def _entries(value: Plain) -> TypeGuard[list[Mapping[str, Plain]]]:
@@ -147,10 +159,10 @@ def _unit_of(name: str, units: Units) -> str:
 def _pair_table(pairs: Sequence[tuple[str, Plain]], units: Units) -> str:
     if not pairs:
         return ""
-    rows = "".join(
-        f"<tr><th>{escaped(_words(name))}</th><td>{_cell(value)}</td><td class='unit'>{escaped(units.get(name, ''))}</td></tr>"
-        for name, value in pairs
-    )
+    rows = ""
+    for name, value in pairs:
+        unit = f"<td class='unit'>{escaped(units.get(name, ''))}</td>"
+        rows += f"<tr><th>{escaped(_words(name))}</th><td>{_cell(value, units)}</td>{unit}</tr>"
     return f"<div class='wide'><table>{rows}</table></div>"
 
 
@@ -164,10 +176,14 @@ def _row_table(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
     heads = "".join(f"<th{_column_class(rows, name)}>{escaped(_words(name))}{_unit_of(name, units)}</th>" for name in names)
     body = ""
     for row in rows[:_MAX_ROWS]:
-        body += "<tr>" + "".join(f"<td{_column_class(rows, name)}>{_cell(row.get(name))}</td>" for name in names) + "</tr>"
+        body += (
+            "<tr>" + "".join(f"<td{_column_class(rows, name)}>{_cell(row.get(name), units)}</td>" for name in names) + "</tr>"
+        )
         for name in long_names:
             if row.get(name):
-                body += f"<tr><td class='below' colspan='{len(names)}'>{escaped(_words(name))}: {_cell(row[name])}</td></tr>"
+                body += (
+                    f"<tr><td class='below' colspan='{len(names)}'>{escaped(_words(name))}: {_cell(row[name], units)}</td></tr>"
+                )
     return f"<div class='wide'><table><tr>{heads}</tr>{body}</table></div>{_more_rows_note(len(rows))}"
 
 
@@ -196,7 +212,8 @@ def _more_rows_note(count: int) -> str:
     return f"<p>{count - _MAX_ROWS} more rows; see the output of --json or --out</p>" if count > _MAX_ROWS else ""
 
 
-def _cell(value: Plain) -> str:
+def _cell(value: Plain, units: Units = MappingProxyType({})) -> str:
+    """Return a value as HTML; `units`: those of numbers in tables within it."""
     if value is None:
         return "none"
     if isinstance(value, bool):
@@ -204,9 +221,11 @@ def _cell(value: Plain) -> str:
     if isinstance(value, float):
         return escaped(f"{value:.6g}")
     if _entries(value):
-        return _row_table(value, {})
+        return _row_table(value, units)
     if isinstance(value, list):
-        return ", ".join(_cell(x) for x in value) or "none"
+        return ", ".join(_cell(x, units) for x in value) or "none"
     if isinstance(value, Mapping):
-        return ", ".join(f"{escaped(_words(k))} {_cell(v)}" for k, v in value.items())
+        return ", ".join(
+            f"{escaped(_words(k))} {_cell(v, units)} {escaped(units.get(k, ''))}".rstrip() for k, v in value.items()
+        )
     return escaped(value)

@@ -61,5 +61,8 @@ def test_a_report_shows_what_the_terminal_would(tmp_path):
 def test_exciters_are_numbered_and_placed_with_a_unit():
     text = parameter_tables(jv.scene_from_toml(SCREENS["feeder"]))
     assert [head for head in cells(text, "h3") if head.startswith("exciter") and ":" not in head] == ["exciter 1", "exciter 2"]
+    heads = [head for head in cells(text, "th") if "," in head]
+    assert heads == ["at, mm", "stiffness, N/mm", "damping, N s/m", "angle, deg"]
+    assert "<td>-800, -150</td><td>80, 126</td><td>300, 400</td>" in text
     table = text.partition("exciter 2<")[2]
     assert cells(table)[:2] == ["-481, -390", "mm"]
