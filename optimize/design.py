@@ -11,7 +11,7 @@ import numpy as np
 from jaxvib.machine.files import Tables
 from jaxvib.machine.numbers.named import find_number
 from jaxvib.machine.scene import Scene
-from optimize.quantities.quantity import Demand, Quantity
+from optimize.quantities.quantity import Demand, Quantity, walk
 from optimize.result import Synthesis
 from optimize.space import DesignSpace
 from optimize.synthesize import synthesize
@@ -51,6 +51,17 @@ class Design:
     search: Tables = field(default_factory=dict)
     subject_to: tuple[Demand, ...] = ()
     catalogues: tuple[Catalogue, ...] = ()
+
+    def notes(self) -> list[str]:
+        """Return a sentence for a throw angle that is asked of exciters which all turn in one direction."""
+        asked = (self.objective, *(held.quantity for held in self.space.held), *(demand.quantity for demand in self.subject_to))
+        directions = {exciter.direction for exciter in self.space.scene.exciters}
+        if len(directions) > 1 or not any(part.name == "throw_angle" for quantity in asked for part in walk(quantity)):
+            return []
+        return [
+            "all exciters turn in one direction, so that points of the body move on ellipses; a straight throw needs two "
+            "directions: write direction = -1 for one of two equal motors"
+        ]
 
     def run(self, **more: Any) -> Synthesis:
         """Search for the best machine by `synthesize`. Arguments in `more` replace those in `search`.

@@ -185,7 +185,8 @@ def linear_screen(
 
     - `scene`: a body in a plane with at least two exciters; typical: two equal motors that turn in opposite directions
     - `points` of the deck, (x, y), m or text, from the centre of mass; typical: feed end and discharge end
-    - `angle` of throw, rad or text; typical: "40 deg" to "50 deg" (default 45)
+    - `angle` of throw from the horizontal, rad or text; typical: "40 deg" to "50 deg" (default 45). If the deck descends in the
+      direction of x, it is the angle to the deck minus the angle of descent
     - `stroke`, m peak to peak; typical: 6 to 12 mm; default: that of the scene
     - `reach`: distance by which each coordinate of an exciter may change, m; typical: 0.1 to 0.5 (default 0.3)
 
@@ -241,7 +242,7 @@ def feeder(
     **Arguments**
 
     - `scene`, `points`, `stroke`, `reach` as for `linear_screen`
-    - `angle` of throw, rad or text; typical: "20 deg" to "35 deg" (default 25)
+    - `angle` of throw from the horizontal, rad or text; typical: "20 deg" to "35 deg" (default 25)
     - `range_`: factor by which the stiffness of a support may differ; typical: 1.2 to 2 (default 1.5)
     - `spread`: largest spread of the motions over the points (`motion_spread`); typical: 0.05 to 0.2 (default 0.1)
 

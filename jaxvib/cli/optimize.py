@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from jaxvib.cli.app import TOLERANCE, Output, app, require_tolerances, shared, table, tolerance_table
-from jaxvib.cli.output import fields_of, write_file
+from jaxvib.cli.output import fields_of, note, write_file
 
 if TYPE_CHECKING:
     from optimize import Demand, Design, Quantity, Synthesis
@@ -44,6 +44,8 @@ def optimize(
 
     loaded = load_design(design)
     require_tolerances(loaded.space.scene, tolerances)
+    for each in loaded.notes():
+        note(f"note: {each}")
     overrides = {"starts": starts, "seed": seed, "searcher": searcher}
     options = {**loaded.search, **{name: value for name, value in overrides.items() if value is not None}}
     with output.progress() as progress:

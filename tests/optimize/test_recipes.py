@@ -12,7 +12,16 @@ import jaxvib as jv
 from jaxvib.machine.files import SCREENS
 from jaxvib.machine.numbers.named import find_number, put_numbers
 from optimize import DesignSpace, Quantity, amplitude, fold_margin, force_per_amplitude, pareto, recipes
-from optimize.recipes import anti_resonance, antiphase, feeder, lightest_exciter, linear_screen, retune, widest_range
+from optimize.recipes import (
+    anti_resonance,
+    antiphase,
+    circular_screen,
+    feeder,
+    lightest_exciter,
+    linear_screen,
+    retune,
+    widest_range,
+)
 
 SCENE = scene("two_mass", speed=120.0)
 SCREEN = jv.scene_from_toml(SCREENS["linear_screen"])
@@ -84,6 +93,15 @@ def test_recipes_have_their_objective_and_held_values():
     wide = widest_range(SCENE, mode=3, keep=0.5, of=1)
     assert wide.objective == -fold_margin(mode=3) and wide.subject_to[0].sense == "at least"
     np.testing.assert_allclose(wide.subject_to[0].constant, 0.5 * float(amplitude(mode=3, of=1)(SCENE)))
+
+
+def test_a_straight_throw_needs_two_directions():
+    points = [(-1.5, 0.1), (1.5, 0.1)]
+    alike = jv.scene_from_toml(SCREENS["linear_screen"].replace("direction = -1", "direction = 1"))
+    assert linear_screen(SCREEN, points=points, stroke="7 mm").notes() == []
+    (note,) = linear_screen(alike, points=points, stroke="7 mm").notes()
+    assert note.startswith("all exciters turn in one direction") and "direction = -1" in note
+    assert circular_screen(alike, points=points, stroke="7 mm").notes() == []
 
 
 def test_recipes_create_no_absent_springs():
