@@ -188,7 +188,8 @@ def ensemble(
     - `equations`: a function of a scene that returns its equations of motion, as `vector_field` (the default) does; with
       another function, for example, the equations of a paper can be compared with those of the scene
 
-    **Returns** `Ensemble`. Derivatives exist in forward mode only.
+    **Returns** `Ensemble`. Derivatives exist in forward mode only; those with respect to the times of jumps of a drive are 0,
+    because steps do not end there.
 
     **Raises** `InputError` for values that are not allowed, or leading axes that differ.
 

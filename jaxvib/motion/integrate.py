@@ -93,7 +93,7 @@ def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeControlle
     jump_ts = [t for exciter in scene.exciters for t in exciter.drive.jump_ts()]
     if not jump_ts or isinstance(controller, diffrax.ConstantStepSize):
         return controller
-    return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(jump_ts)))
+    return diffrax.ClipStepSizeController(controller, jump_ts=jnp.stack(jump_ts))
 
 
 def effects_rate(scene: Scene) -> Array:

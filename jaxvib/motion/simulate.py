@@ -94,7 +94,8 @@ def simulate(
     - `Accuracy(1e-4)`: the `error` of the result; typical: 1e-3 to 1e-8. The run is repeated with smaller tolerances, in at
       most 6 runs, until its estimated error is at most this value; otherwise the status is `not_accurate`. An error of 1e-8
       takes about twice the time of an error of 1e-4
-    - `EqualSteps(2000)`: a number of equal steps; typical: 4 for each radian of the fastest motion
+    - `EqualSteps(2000)`: a number of equal steps; typical: 4 for each radian of the fastest motion. The steps do not end at the
+      jumps of a drive: derivatives with respect to the times of jumps are then 0
     - a step size controller of diffrax
 
     **Returns** `Run`, with its estimated `error` and its cost.

@@ -20,8 +20,9 @@ from jaxvib.ode.types import Args, Y
 from jaxvib.runtime.compat import fast_diffrax_loop_end, no_host_checks
 from jaxvib.runtime.primitive import CAN_DEFINE_PRIMITIVES, primitive
 
-_Inputs: TypeAlias = tuple[Array, Array | None, Y, Args, diffrax.SaveAt, diffrax.ODETerm]
-"""Differentiated arguments: the end, the first step, the initial state, the arguments, the saved times, the equations."""
+_Inputs: TypeAlias = tuple[Array, Array | None, Y, Args, diffrax.SaveAt, diffrax.ODETerm, Array | None]
+"""Differentiated arguments: the end, the first step, the initial state, the arguments, the saved times, the equations, and the
+times at which the field jumps."""
 
 _Rest: TypeAlias = tuple[diffrax.AbstractSolver, int, diffrax.AbstractProgressMeter]
 """Other arguments: the method, the largest number of steps, the progress meter."""
@@ -51,8 +52,9 @@ def solve(
         (y_i+1, dense_i) = step(y_i, t_i, t_i+1, numbers),    saved(t) = within(dense_i, t_i, t_i+1, t)
 
     Here dense_i interpolates step i, and numbers are the arrays in the arguments and in the equations. The ends of steps are
-    constants, with two exceptions: the last step ends at `end`, and constant steps depend on `end` and `first_step`. A run
-    without derivatives is computed once, and records nothing.
+    constants, with three exceptions: the last step ends at `end`, steps end at the jumps of the field (`jump_ts` of the
+    controller), and constant steps depend on `end` and `first_step`. A run without derivatives is computed once, and records
+    nothing.
 
     **Arguments**: `adjoint`: an adjoint of diffrax in place of the replay, such as `diffrax.ForwardMode()` for forward
     derivatives. Functions among the arguments must not contain traced arrays; pass these in `args`. `saveat` saves states at
@@ -60,7 +62,7 @@ def solve(
 
     **Returns** diffrax's `Solution`.
     """
-    inputs = (end, first_step, y0, args, saveat, term)
+    inputs = (end, first_step, y0, args, saveat, term, _jump_times(controller))
     rest = (solver, max_steps, diffrax.NoProgressMeter() if progress is None else progress)
     if adjoint is not None:
         return _solve(inputs, controller, adjoint, *rest)
@@ -79,7 +81,7 @@ def _solve(
     max_steps: int,
     progress: diffrax.AbstractProgressMeter,
 ) -> diffrax.Solution:
-    end, first_step, y0, args, saveat, term = inputs
+    end, first_step, y0, args, saveat, term, _ = inputs
     return diffrax.diffeqsolve(
         term,
         solver,
@@ -155,12 +157,14 @@ class _Record(NamedTuple):
 
 class _Slopes(NamedTuple):
     """State of the backward pass: derivatives with respect to the state, the arrays of equations and arguments, the end, the
-    first step and the saved times; and the index of the last saved time that the pass has not reached yet."""
+    first step, the jumps of the field and the saved times; and the index of the last saved time that the pass has not reached
+    yet."""
 
     state: Y
     numbers: PyTree[Array | None]
     end: Array
     first_step: Array
+    jumps: Array | None
     times: Array
     ahead: Array
 
@@ -170,10 +174,10 @@ def _forward(
     perturbed: PyTree[bool], inputs: _Inputs, controller: diffrax.AbstractStepSizeController, *rest: *_Rest
 ) -> tuple[diffrax.Solution, _Record]:
     """Integrate, and record the run."""
-    end, first_step, y0, args, saveat, term = inputs
+    end, first_step, y0, args, saveat, term, jumps = inputs
     ends = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: None)
     states = diffrax.SubSaveAt(steps=_spacing(y0, rest[1]))
-    recorded_inputs = (end, first_step, y0, args, diffrax.SaveAt(subs=[saveat.subs, ends, states]), term)
+    recorded_inputs = (end, first_step, y0, args, diffrax.SaveAt(subs=[saveat.subs, ends, states]), term, jumps)
     solution = _solve(recorded_inputs, controller, diffrax.ForwardMode(), *rest)
     assert solution.ts is not None and solution.ys is not None
     record = _Record(solution.stats["num_accepted_steps"], solution.ts[1], solution.ys[2])
@@ -195,7 +199,7 @@ def _backward(
     controller: diffrax.AbstractStepSizeController,
     *rest: *_Rest,
 ) -> PyTree[Array | None]:
-    end, _, y0, _, saveat, _ = inputs
+    end, _, y0, _, saveat, _, _ = inputs
     differentiable, fixed = eqx.partition(inputs, perturbed)
     backward = _BackwardPass(
         record=record,
@@ -230,13 +234,14 @@ class _BackwardPass:
 
     def slopes(self, zero: Array) -> _Slopes:
         """Return the derivatives after the whole backward pass; `zero` has the type of times."""
-        times = self.saved.times
+        times, jumps = self.saved.times, _jump_times(self.controller)
         reached = self.span(self.record.steps - 1)[1]
         slopes = _Slopes(
             state=self.saved.last,
             numbers=jax.tree.map(jnp.zeros_like, self.numbers),
             end=zero,
             first_step=zero,
+            jumps=None if jumps is None else jnp.zeros_like(jumps),
             times=jnp.zeros_like(times),
             ahead=jnp.searchsorted(times, reached, side="right") - 1,
         )
@@ -247,6 +252,13 @@ class _BackwardPass:
         """Start and end of step i."""
         start = self.record.ends[jnp.maximum(i - 1, 0)]
         return jnp.where(i == 0, 0.0, start), _end_before(self.controller, self.record.ends[i])
+
+    def share_of_jumps(self, j: Array) -> Array:
+        """Return the derivatives of the start of step j with respect to the jumps of the field, (jumps,): 1 for the jump at
+        this time, or equal parts of 1 for several."""
+        start = self.record.ends[jnp.maximum(j - 1, 0)]
+        is_at = (j > 0) & (jnp.nextafter(start, -jnp.inf) == _jump_times(self.controller))
+        return is_at.astype(self.record.ends.dtype) / jnp.maximum(jnp.sum(is_at), 1)
 
     def step(self, y: Y, t0: Array, t1: Array, numbers: PyTree[Array | None]) -> tuple[Y, PyTree[Array]]:
         """Return the state after a step, and the data of the interpolation within it."""
@@ -269,6 +281,7 @@ class _BackwardPass:
             numbers=jax.tree.map(jnp.add, slopes.numbers, by_numbers),
             end=slopes.end + sum(_share_of_end(self.controller, steps, j) * by for j, by in by_bounds),
             first_step=slopes.first_step + sum(jnp.where((j == 1) & (steps > 1), by, 0.0) for j, by in by_bounds),
+            jumps=None if slopes.jumps is None else slopes.jumps + sum(self.share_of_jumps(j) * by for j, by in by_bounds),
             times=by_times,
             ahead=ahead,
         )
@@ -342,11 +355,16 @@ def _share_of_end(controller: diffrax.AbstractStepSizeController, count: Array, 
 def _end_before(controller: diffrax.AbstractStepSizeController, start: Array) -> Array:
     """Return the end of the step before the one that begins at `start`: the same time, or the time just before a jump of the
     field."""
-    jumps = getattr(controller, "jump_ts", None)
+    jumps = _jump_times(controller)
     if jumps is None:
         return start
     jump = jnp.nextafter(start, -jnp.inf)
     return jnp.where(jnp.any(jump == jumps), jnp.nextafter(jump, -jnp.inf), start)
+
+
+def _jump_times(controller: diffrax.AbstractStepSizeController) -> Array | None:
+    """Return the times at which the field jumps, (jumps,); None for a controller without jumps."""
+    return getattr(controller, "jump_ts", None)
 
 
 class _Saved(NamedTuple):
@@ -396,7 +414,7 @@ def _by_inputs(
             by_end = by_end + by_ts[-1]
     if cotangents.t1 is not None:
         by_end = by_end + cotangents.t1
-    end, first_step, _, _, saves, _ = differentiable
+    end, first_step, _, _, saves, _, jumps = differentiable
     constant = isinstance(controller, diffrax.ConstantStepSize)
     where = [k for k, sub in enumerate(saveat.subs) if sub.ts is not None and saves.subs[k].ts is not None]
     given = dict(zip([k for k, sub in enumerate(saveat.subs) if sub.ts is not None], by_times, strict=True))
@@ -409,4 +427,5 @@ def _by_inputs(
         slopes.numbers[0],
         saves,
         slopes.numbers[1],
+        None if jumps is None else slopes.jumps,
     )

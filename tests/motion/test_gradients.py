@@ -210,6 +210,19 @@ def test_reverse_gradient_through_time_is_the_forward_one():
     np.testing.assert_allclose(relative(reverse), relative(forward), atol=1e-11)
 
 
+@pytest.mark.parametrize("integrate", [jv.simulate, jv.envelope])
+def test_a_run_depends_on_the_time_of_switching_off(integrate):
+    """A motor that no load brakes keeps the speed n (1 - exp(-at/T)) at which it is switched off; T is 1 s."""
+    machine = jv.one_mass(mass=1e4, stiffness=1e6, damping=1e4)
+
+    def final_speed(at):
+        motor = jv.SwitchedOff(jv.DCMotor(100.0, stall_torque=50.0, inertia=0.5), at=at)
+        scene = jv.Scene(machine, exciters=[jv.Exciter(drive=motor, unbalance=1e-4)])
+        return integrate(scene, 3.0, save="window", stepsize_controller=jv.Tolerance(1e-7)).omega
+
+    np.testing.assert_allclose(jax.grad(final_speed)(jnp.asarray(0.8)), 100.0 * np.exp(-0.8), rtol=1e-4)
+
+
 def test_reverse_gradient_of_many_loads_is_the_forward_one():
     """Their state is held as it is, on arrays, and has parts that are None."""
     s = scene("one_mass", "balls")

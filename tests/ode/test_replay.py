@@ -91,6 +91,23 @@ def test_steps_end_where_the_field_jumps():
     np.testing.assert_allclose(reverse, forward, atol=1e-10)
 
 
+@pytest.mark.parametrize("mode", ["reverse", "forward"])
+def test_states_depend_on_the_times_of_jumps(mode):
+    """y' = 2 until the first jump, then -1, and 2 again after the second: each later state changes by 3 and -3 per second."""
+    one, save = jnp.ones(()), diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=jnp.asarray([0.5, 2.0, 4.5]), t1=True)])
+
+    def value(jumps):
+        term = diffrax.ODETerm(lambda t, y, jumps: jnp.where((t < jumps[0]) | (t > jumps[1]), 2.0, -1.0) + 0.0 * y)
+        control = diffrax.ClipStepSizeController(PIController(jnp.asarray(1e-7), one, one), jump_ts=jumps)
+        adjoint = diffrax.ForwardMode() if mode == "forward" else None
+        solution = solve(term, LoopDopri8(reuse=True), end=jnp.asarray(5.0), first_step=jnp.asarray(0.1), y0=one, args=jumps,
+                         saveat=save, controller=control, adjoint=adjoint, max_steps=64)  # fmt: skip
+        return solution.ys[0]
+
+    slopes = eqx.filter_jit(jax.jacfwd(value) if mode == "forward" else jax.jacrev(value))(jnp.asarray([1.0, 4.0]))
+    np.testing.assert_allclose(slopes, [[0.0, 0.0], [3.0, 0.0], [3.0, -3.0], [3.0, -3.0]], atol=1e-12)
+
+
 @pytest.mark.parametrize("solver", [diffrax.Dopri8(), LoopDopri8(), LoopDopri8(reuse=True)])
 def test_every_lane_of_a_batch_has_its_own_steps(solver):
     """Lanes that have come to their end wait for the others in steps of no length; no derivative of theirs may be lost."""
