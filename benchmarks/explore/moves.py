@@ -1,7 +1,7 @@
 """Time from a key press that moves a slider of the explorer until its page is updated, in headless Chromium.
 
     pip install selenium                    # and Chromium with ChromeDriver
-    python benchmarks/explore/moves.py two_mass planar_rotor --moves 20 --picture out/page.png
+    python benchmarks/explore/moves.py two_mass linear_screen --moves 20 --picture out/page.png
 
 For each template, each slider is moved by the arrow keys. A move ends at the last change of the page (in all shadow trees), if
 half a second without a change follows. Prints median and maximum of each template in seconds.
@@ -22,7 +22,7 @@ from selenium.common.exceptions import WebDriverException
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
-from jaxvib.machine.files import TEMPLATES
+from jaxvib.machine.templates import SCREENS, TEMPLATES
 
 FLAGS = (
     "headless no-sandbox disable-gpu disable-quic no-first-run disable-background-networking disable-component-update "
@@ -71,7 +71,7 @@ def measure(kind: str, moves: int, port: int, command: str, picture: str) -> lis
         options.add_argument(f"--{flag}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "machine.toml"
-        path.write_text(TEMPLATES[kind])
+        path.write_text({**TEMPLATES, **SCREENS}[kind])
         started = [command, "explore", str(path), "--port", str(port), "--no-browser"]
         server = subprocess.Popen(started, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         driver = webdriver.Chrome(options=options)
@@ -103,7 +103,7 @@ def measure(kind: str, moves: int, port: int, command: str, picture: str) -> lis
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("kinds", nargs="*", choices=[*TEMPLATES], default=["two_mass"])
+    parser.add_argument("kinds", nargs="*", choices=[*TEMPLATES, *SCREENS], default=["two_mass"])
     parser.add_argument("--moves", type=int, default=20)
     parser.add_argument("--port", type=int, default=27300)
     parser.add_argument("--command", default=str(Path(sys.executable).with_name("jaxvib")), help="jaxvib to be measured")
