@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.results.estimate import Estimate, interval
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -197,6 +197,12 @@ def _longest_regular_sequence(t: np.ndarray, peaks: list[int]) -> list[int]:
     return peaks[cuts[longest] : cuts[longest + 1] + 1] if len(peaks) > 2 else peaks
 
 
+def require_uncertainty(instrument: object) -> None:
+    """**Raises** `InputError` for a relative uncertainty of J that is not a number from 0 to 1."""
+    if not isinstance(instrument, (int, float)) or not 0.0 <= instrument < 1.0:
+        raise InputError("instrument", f"is {quoted(instrument)}; the relative uncertainty of J is at least 0 and less than 1")
+
+
 @validated
 def ten_periods(
     pendulum: BearingPendulum, record: Record, *, periods: int = 10, instrument: float = 0.0, turns: TurningPoints | None = None
@@ -237,6 +243,7 @@ def ten_periods(
 
     Source: Artyunin, Sumenkov 2019, equation (3).
     """
+    require_uncertainty(instrument)
     n = 2 * count(periods, "periods")
     turns = turning_points(record) if turns is None else turns
     a, middles = turns.amplitude, (turns.time[1:] + turns.time[:-1]) / 2.0

@@ -14,12 +14,12 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto
-from jaxvib.errors import ComputationError, InputError, quoted
+from jaxvib.errors import ComputationError, InputError
 from jaxvib.numerics.noise import colored_covariance
 from jaxvib.results.estimate import Estimate, interval, shown, student_quantile
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
-from jaxvib.study.bearing.decrement import Decrement, TurningPoints, ten_periods, turning_points
+from jaxvib.study.bearing.decrement import Decrement, TurningPoints, require_uncertainty, ten_periods, turning_points
 from jaxvib.study.bearing.fit import TOLERANCE, Fit, Unknowns, first_guess, fit_swing, steps_for
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, Friction
@@ -159,8 +159,7 @@ def identify_bearing(
     """
     if dry:
         _ = pendulum.diameter  # raises if it is missing
-    if not isinstance(instrument, (int, float)) or not 0.0 <= instrument < 1.0:
-        raise InputError("instrument", f"is {quoted(instrument)}; the relative uncertainty of J is at least 0 and less than 1")
+    require_uncertainty(instrument)
     turns = turning_points(record)
     half = float(np.median(np.diff(turns.time)))
     released = turns.time[0] - record.time[0] <= _MAX_HALF_PERIODS * half

@@ -124,6 +124,8 @@ def test_wrong_records(tmp_path):
         jv.identify(ROD, (t, t))
     with pytest.raises(jv.InputError, match=r"instrument is 2.0; the relative uncertainty of J"):
         jv.identify(ROD, jv.Record(t, 0.01 * t), instrument=2.0)
+    with pytest.raises(jv.InputError, match=r"instrument is -1.0; the relative uncertainty of J"):
+        jv.ten_periods(ROD, jv.Record(t, 0.01 * t), instrument=-1.0)
     with pytest.raises(jv.InputError, match=r"pendulum.bearing is missing"):
         jv.identify(jv.BearingPendulum(0.3, 0.2), jv.Record(t, 0.01 * t), dry=True)
 
