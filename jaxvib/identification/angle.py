@@ -190,7 +190,7 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
         raise InputError(field, f"has {time.size} {what}; at least {_MIN_PULSES} are needed, record more turns")
     time = time - channel.delay
     notes: list[str] = []
-    marks, spread = np.zeros(time.size, int), np.ones(time.size)
+    marks, spread, marked = np.zeros(time.size, int), np.ones(time.size), channel.kind == "angle"
     if channel.kind == "speed":
         value = np.abs(value)
         speed, scatter = fit_spline(time, value)
@@ -199,7 +199,9 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
         value = value * np.sign(value[-1] - value[0])
         spline, scatter = fit_spline(time, value)
     else:
-        marks = value.astype(int) % channel.per_turn
+        tooth = _tooth_after_gap(value, channel.per_turn)
+        value, marked = value - (tooth or 0), channel.per_turn == 1 or tooth is not None
+        marks = np.unique(value % channel.per_turn, return_inverse=True)[1]  # without those of missing teeth
         value = 2.0 * np.pi * value / channel.per_turn
         rough_speed = np.convolve(np.pad(np.gradient(value, time), 2, mode="edge"), np.full(5, 0.2), mode="valid")
         spread = np.maximum(rough_speed, _MIN_SPEED * np.max(rough_speed))  # the errors of pulses are errors of their times
@@ -218,7 +220,21 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
     span = float(time[0]), float(time[-1])
     knots, samples = np.unique(spline.t), RotorSamples(channel.kind, time, value, marks, spread, scatter)
     drive = recorded_drive(knots, [spline(knots, order) for order in range(3)])
-    return RotorAngle(drive, spline, span, channel.kind != "speed", error, left_out, tuple(notes), samples)
+    return RotorAngle(drive, spline, span, marked, error, left_out, tuple(notes), samples)
+
+
+def _tooth_after_gap(number: np.ndarray, per_turn: int) -> int | None:
+    """Return the number, 0 to `per_turn` - 1, of the tooth after the gap of a wheel; None without a gap, if no tooth differs
+    from the others.
+
+    **Arguments**: `number` (n,) of the pulses, of at least two turns.
+
+    >>> _tooth_after_gap(np.array([0.0, 1.0, 3.0, 4.0, 5.0, 7.0, 8.0]), 4), _tooth_after_gap(np.arange(9.0), 4)
+    (3, None)
+    """
+    is_missing = ~np.isin(np.arange(per_turn), number % per_turn)
+    after = np.flatnonzero(np.roll(is_missing, 1) & ~is_missing)
+    return int(after[0]) if after.size == 1 and number[-1] - number[0] >= 2 * per_turn else None
 
 
 def recorded_drive(time: np.ndarray, columns: Sequence[np.ndarray]) -> RecordedDrive:

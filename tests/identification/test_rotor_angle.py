@@ -32,7 +32,20 @@ def test_pulses_give_the_angle_and_the_speed():
     np.testing.assert_allclose(found.at(t), angle_at(t), rtol=1e-9)
     for each in t:
         assert float(found.drive.speed_at(each)) == pytest.approx(10.0 + RATE * each, rel=1e-7)
-    assert found.marked and found.span == (0.0, edges[-1]) and found.notes == ()
+    assert found.span == (0.0, edges[-1]) and found.notes == ()
+    assert not found.marked and measured("pulses", *pulses(1)[::-1]).marked  # no tooth of a wheel without a gap is special
+
+
+@pytest.mark.parametrize("first", [0, 3, 5])
+def test_zero_of_a_wheel_with_a_gap_is_the_tooth_after_it(first):
+    """Tooth 4 of 6 is missing; the record begins at any tooth, which has the number 0."""
+    numbers, edges = pulses(6)
+    is_tooth = (numbers % 6 != 4) & (numbers >= first)
+    found = measured("pulses", edges[is_tooth], numbers[is_tooth] - first, per_turn=6)
+    t = np.linspace(2.0, 18.0, 9)
+    away = (found.at(t) - angle_at(t) + 2.0 * np.pi * 5 / 6) / (2.0 * np.pi)
+    np.testing.assert_allclose(away, np.rint(away[0]), atol=1e-6)
+    assert found.marked and found.error < 1e-6
 
 
 def test_uneven_marks_are_estimated():
