@@ -40,6 +40,9 @@ class CaseStatus(eqx.Enumeration):
 CASE_STATUSES = enumeration_names(CaseStatus)
 """Names of the statuses in the order of their numbers in a store."""
 
+WITH_RESULTS = tuple(CASE_STATUSES.index(name) for name in ("done", "absent"))
+"""Numbers of the statuses of cases whose results are valid; those of an absent quantity are NaN."""
+
 
 class SweepStatus(eqx.Enumeration):
     """Progress of a study. The value of each member is the message shown to the user."""

@@ -18,6 +18,7 @@ from jaxvib.machine.numbers.named import find_number
 from jaxvib.results.estimate import wilson
 from jaxvib.steady.orbits.diagram import exact_branches
 from jaxvib.sweeps.axes import SAMPLE, axis_of, put
+from jaxvib.sweeps.definition import WITH_RESULTS
 from jaxvib.sweeps.store import Store
 
 if TYPE_CHECKING:
@@ -345,7 +346,7 @@ def case_labels(store: Store, region: slice | tuple[slice, ...]) -> _Labels:
     """Return the labels of the cases of a region: the name of the regime, and the jam mode of jammed loads."""
     words: list[str] = str(store.group["regime"].attrs["flag_meanings"]).split() if "regime" in store.names else ["not jammed"]
     first = len(words)
-    done = store.read("status", region) == 1
+    done = np.isin(store.read("status", region), WITH_RESULTS)
     modes = store.read("mode", region) if "mode" in store.names else np.zeros(done.shape, int)
     codes = store.read("regime", region).astype(int) if "regime" in store.names else np.zeros(done.shape, int)
     codes = np.where(modes > 0, first + modes - 1, codes)

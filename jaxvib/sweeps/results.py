@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxvib.sweeps.axes import SAMPLE
+from jaxvib.sweeps.definition import WITH_RESULTS
 from jaxvib.sweeps.figures import axis_label, case_labels, display_unit, is_label, measure_label
 from jaxvib.sweeps.store import Store
 
@@ -23,13 +24,14 @@ _MAX_READ = 1_000_000
 def results_table(store: str | Path) -> tuple[str, list[str], list[list[str]]]:
     """Return the results of a study as title, heads and rows of a table, in display units.
 
-    A study with at most 40 cases has a row for each case. For more cases the table has a row for each measure with numbers:
-    least value, median and largest value. The table of more than a million cases is empty.
+    A study with at most 40 cases has a row for each finished case, in which absent quantities are empty. For more cases the
+    table has a row for each measure with numbers: least value, median and largest value. The table of more than a million cases
+    is empty.
     """
     opened = Store(Path(store))
     if np.prod(opened.shape, dtype=np.int64) > _MAX_READ:
         return "", [], []
-    done = opened.read("status") == 1
+    done = np.isin(opened.read("status"), WITH_RESULTS)
     named = [name for name in opened.names if not (name == "mode" and "regime" in opened.names)]
     if done.size <= _MAX_CASES:
         axes = list(opened.record["axes"])
@@ -57,8 +59,10 @@ def _case_texts(store: Store, name: str) -> list[str]:
     values = display_unit(store, name)[1] * store.read(name).astype(float)
     entries = values.reshape(int(np.prod(store.shape)), -1)
     if entries.shape[1] > _MAX_ENTRIES:
-        return [f"{np.min(row):.4g} to {np.max(row):.4g}" for row in entries]
-    return [" ".join(f"{x:.4g}" for x in row) for row in entries]
+        texts = [f"{np.min(row):.4g} to {np.max(row):.4g}" for row in entries]
+    else:
+        texts = [" ".join(f"{x:.4g}" for x in row) for row in entries]
+    return ["" if np.all(np.isnan(row)) else text for text, row in zip(texts, entries, strict=True)]
 
 
 def _summary(store: Store, name: str, done: np.ndarray) -> list[str]:

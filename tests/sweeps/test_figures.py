@@ -3,6 +3,7 @@
 import dataclasses
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
@@ -116,6 +117,14 @@ def test_the_figure_that_fits(sampled, tmp_path):
         ["rotor speed, rpm", "number", "weighted, N"],
         [["286.48", "not jammed", "4.8"], ["477.46", "jammed, mode 1", "5"], ["859.44", "jammed, mode 2", "5.4"]],
     )
+
+
+def test_an_absent_quantity_hides_no_other_result(tmp_path):
+    root = Quantity("root", "", lambda scene: jnp.sqrt(scene.drive.speed - 40.0))
+    asked = study(SCENE, {"drive.speed": [30.0, 56.0, 90.0]}, [Quantity("number", "", number), root], chunk=16)
+    found = run_study(dataclasses.replace(asked, names=("mode", "root")), tmp_path / "root.zarr")
+    assert dict(found.counts) == {"done": 2, "absent": 1} and dict(found.regimes)["not jammed"] == 1
+    assert results_table(found.store)[2][:2] == [["286.48", "not jammed", ""], ["534.76", "jammed, mode 1", "4"]]
 
 
 def test_a_table_of_many_cases_has_their_range(grid, sampled):
