@@ -135,11 +135,11 @@ def _require_balance(effects: tuple[Effect, ...]) -> None:
 
 
 def friction_on_light_loads(loads: CircularLoads, effects: tuple[Effect, ...], omega: Array, speed: Array) -> Array:
-    """Return the sum of the torques of dry friction on light loads that turn at `omega` in a rotor of this `speed`, N m.
+    """Return the torques of dry friction on light loads that turn at `omega` in a rotor of this `speed`, (count,) N m.
 
     The motion of the carrier is too small to change the normal force on the loads, and the mean contribution of the weight over
     a turn is 0.
     """
     phi, rate = (jnp.zeros((loads.count,)),), (jnp.full((loads.count,), omega),)
     frictions = (term.friction(loads, phi, rate, speed, {}) for term in terms_of(effects, ContactFriction))
-    return sum((jnp.sum(friction.torque({})) for friction in frictions), jnp.zeros_like(omega))
+    return sum((friction.torque({}) for friction in frictions), jnp.zeros_like(omega))

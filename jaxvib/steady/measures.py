@@ -432,7 +432,7 @@ def shaft_torque(model: JammedModel, omega: Array, displacement: Array) -> Array
     n = scene.drive.speed
     torque = loads.drag_sum() * (n - omega)
     if has_term(scene.all_effects, ContactFriction):
-        torque = torque + friction_on_light_loads(loads, scene.all_effects, omega, n)
+        torque = torque + jnp.sum(friction_on_light_loads(loads, scene.all_effects, omega, n))
     # With strong drag n - Omega has few correct digits. The torque then follows from the dissipation of the carrier, which has
     # all digits.
     is_close = n - omega < _MIN_SLIP * n

@@ -128,7 +128,7 @@ def _speed_from_acceleration(model: ExcitedModel, omega: Array, acceleration: Ar
         return free
 
     def residual(n: Array) -> Array:
-        return model.drag * (n - omega) + friction_on_light_loads(model.loads, effects, omega, n) - torque
+        return model.drag * (n - omega) + jnp.sum(friction_on_light_loads(model.loads, effects, omega, n)) - torque
 
     return bracketed_root(residual, omega, free)
 

@@ -16,8 +16,11 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit, quantity_text, shown_unit, speed_text, speed_unit
+from jaxvib.equations.jammed_bodies import friction_on_light_loads
 from jaxvib.equations.linear import JammedModel, jammed_loads, jammed_model, peak_force, require_drag
 from jaxvib.errors import ComputationError, InputError, quoted
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import ContactFriction
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import magnitude
@@ -408,13 +411,16 @@ def _can_stay_together(model: JammedModel, omega: Array, rotor_speed: Array, dis
     """Return True if the torque of the vibration can balance the drag of every load; always True for equal loads.
 
     This is the case if the torque of the vibration on each load at its best phase, S w^2 |e^H B Y| / 2, reaches the torque
-    b_W R^2 (n - w) of its drag. The vibration is largest for coincident loads.
+    b_W R^2 (n - w) of its drag and that of its dry friction. The vibration is largest for coincident loads.
     """
     loads = model.loads
     if loads.alike:
         return True
     available = loads.mass * loads.radius * omega**2 * magnitude(jnp.sum(model.force_direction.conj() * displacement)) / 2.0
     needed = loads.drag * loads.radius**2 * (rotor_speed - omega)
+    effects = model.scene.all_effects
+    if has_term(effects, ContactFriction):
+        needed = needed + friction_on_light_loads(loads, effects, omega, rotor_speed)
     return jnp.all(~(available < (1.0 - 1e-6) * needed))
 
 

@@ -233,6 +233,16 @@ def test_loads_too_unlike_to_stay_together_are_not_called_stable():
         assert ("stable by slope" in jam.summary()) == holds and ("cannot stay together" in jam.summary()) != holds
 
 
+def test_dry_friction_needs_torque_of_the_vibration_too():
+    """Pendulums that the vibration holds against their drag, or against their dry friction, but not against both."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
+    for drag, holds in (([0.12, 0.02], True), ([0.12, 0.12], False)):
+        hung = jv.pendulums(count=2, mass=[0.5, 0.1], radius=0.1, drag=drag)
+        scene = jv.Scene(machine, hung, jv.ConstantSpeed(60.0), jv.DryFriction(0.1, diameter="40 mm"))
+        assert jv.jam_modes(scene).select(1).status_name == ("found" if holds else "cannot_stay_together")
+        assert jv.jam_orbit(scene, mode=1, throw=False).status_name == ("found" if holds else "absent")
+
+
 @pytest.mark.parametrize("friction", [False, True], ids=["drag", "friction"])
 def test_derivatives_at_known_jams_equal_those_of_the_search(friction):
     """Derivatives of all jams, some of them absent, by every number of the scene; then of a fold as well."""
