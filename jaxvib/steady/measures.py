@@ -333,7 +333,8 @@ def vibration_measures(
     elif isinstance(motion, Orbit):
         first = motion.displacement_harmonics[:, motion.orders.index(1)]
         vibration = (first, motion.amplitude, motion.foundation_force)
-        motion = _vibration_at_phases(scene, motion.rotor_speed, motion.omega, motion.offsets, *vibration, motion.power)
+        phase = motion.offsets + motion.deviation_harmonics[:, 0].real  # of loads that differ
+        motion = _vibration_at_phases(scene, motion.rotor_speed, motion.omega, phase, *vibration, motion.power)
     return _measures(scene, motion, places if has_list else places[0], along)
 
 

@@ -252,6 +252,19 @@ def test_an_exact_jam_has_the_measures_of_its_period(jam):
     np.testing.assert_allclose(measures.exciter_force, 3 * 0.8 * 0.12 * w**2, rtol=1e-9)
 
 
+def test_exact_jam_of_unlike_loads_has_the_force_of_their_phases():
+    table = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
+    loads = jv.balls(count=2, mass=[0.5, 0.3], radius=0.1, drag=[0.1, 0.3])
+    unlike = jv.Scene(table, loads, jv.ConstantSpeed(60.0))
+    orbit = jv.jam_orbit(unlike, mode=1)
+    turns = jnp.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    phases = np.mean(np.asarray(jax.vmap(orbit.at)(turns)[2][0]) - turns[:, None], axis=0)
+    assert abs(phases[0] - phases[1]) > 0.3
+    resultant = abs(0.05 * np.exp(1j * phases[0]) + 0.03 * np.exp(1j * phases[1]))
+    found = jv.vibration_measures(unlike, orbit)
+    np.testing.assert_allclose(found.exciter_force, resultant * float(orbit.omega) ** 2, rtol=1e-9)
+
+
 def test_jams_with_phases_have_the_measures_of_their_resultant():
     machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     rotor = jv.Scene(machine, jv.pendulums(count=3, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
