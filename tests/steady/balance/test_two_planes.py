@@ -35,6 +35,12 @@ def test_forces_and_moments_cancel_in_all_arrangements():
     assert len(pairs) == 1  # equal loads: the arrangements differ by exchanges
 
 
+def test_stations_that_differ_by_rounding_are_in_one_plane():
+    states = jv.balanced_states(scene(machine=rotor(stations=(np.nextafter(0.2, 1.0), 0.2, -0.15, -0.15))))
+    np.testing.assert_allclose(states.angles, jv.balanced_states(scene()).angles, atol=1e-9)
+    assert states.stability().is_decided
+
+
 def test_planes_of_a_balanced_rotor_turn_separately():
     states = jv.balanced_states(scene(effects=()))
     assert states.names == ("turn in plane 1", "turn in plane 2") and states.dimension == 2
