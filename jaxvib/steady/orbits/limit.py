@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,22 +14,25 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto
 from jaxvib.errors import InputError
-from jaxvib.machine.numbers.named import find_number, put_numbers
+from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.numerics.linalg import solve_in_turn
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.balance.monodromy import at_constant_speed
 from jaxvib.steady.orbits.solve import Linearized, newton
 from jaxvib.steady.orbits.synchronous import HasSpeedAndPhases, synchronous_orbit
 from jaxvib.steady.orbits.whole import (
     PeriodicScene,
     body_counts,
     collocation,
-    is_forced,
+    forcing_exciters,
     linear_start,
+    means_of_exciters,
     periodic_scene,
     residual_of,
 )
@@ -129,13 +131,15 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
 
     Source: Blekhman 1988: a synchronous motion exists while the differences of the torques are below the vibrational torque.
     """
+    scene = at_constant_speed(validate_scene(scene))
     number = find_number(scene, over, "over")
     if number.size != 1:
         raise InputError(f"over.{over}", f"has {number.size} entries; name one, for example {over}[0]")
-    counts, forced = body_counts(scene), is_forced(scene)
+    counts, forced = body_counts(scene), bool(forcing_exciters(scene))
     free = [k for k, count in enumerate(counts) if count][not forced :]
     if not free and forced:
         raise InputError("scene", "has no exciter whose speed or phase is free; give an exciter with a motor, or with loads")
+    _require_one_period(scene, number)
     own = number.path[1] if number.path[0] == "exciters" else None
     exciter = (own if own in free else free[0]) if free else None
     orbit = synchronous_orbit(scene, regime)
@@ -169,6 +173,14 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
         branch_speeds=np.array([float(point.speed) for point in branch]),
         over=over,
     )
+
+
+def _require_one_period(scene: Scene, number: NamedNumber) -> None:
+    """**Raises** `InputError` for the speed of one of several ideal drives with unbalances, whose speeds must be equal."""
+    forcing = forcing_exciters(scene)
+    if len(forcing) > 1 and any(number.path[:3] == ("exciters", k, "drive") for k in forcing):
+        problem = "changes the speed of one of several ideal drives, so that no motion repeats; name another parameter"
+        raise InputError(f"over.{number.name}", problem)
 
 
 class _Point(NamedTuple):
@@ -242,8 +254,8 @@ def _branch_point(
     **Returns** the fields of `_Point` without `along`; `slope` is the derivative with respect to the phase or the speed.
     """
     value, speed, phases = jnp.asarray(value), jnp.asarray(speed), jnp.asarray(phases)
-    number, grid, forced = find_number(scene, over, "over"), grid_of(points, False), is_forced(scene)
-    counts = body_counts(scene)
+    number, grid, counts = find_number(scene, over, "over"), grid_of(points, False), body_counts(scene)
+    forced = bool(forcing_exciters(scene))
     unit = jnp.maximum(jnp.abs(value), 1e-6)
 
     def scene_at(share: Array) -> PeriodicScene:
@@ -251,6 +263,7 @@ def _branch_point(
 
     start = value / unit
     whole = scene_at(start)
+    speed = _forced_speed(whole, speed)
     x, nd = linear_start(whole, grid, speed), whole.coordinates
     size, weight = x.size, jnp.minimum(whole.feedback, 1.0)
     pin = np.zeros(x.shape)
@@ -258,8 +271,12 @@ def _branch_point(
         pin[nd + sum(counts[:exciter])] = 1.0 / grid.theta.size
 
     def equations(x: Array, w: Array, share: Array) -> tuple[Array, Array, Array]:
-        system = collocation(scene_at(share), grid, x, w, forced=forced)
-        by_value = jax.jvp(lambda s: residual_of(scene_at(s), grid, x, w), (share,), (jnp.ones_like(share),))[1]
+        def residual(whole: PeriodicScene) -> Array:
+            return residual_of(whole, grid, x, _forced_speed(whole, w))
+
+        whole = scene_at(share)
+        system = collocation(whole, grid, x, _forced_speed(whole, w), forced=forced)
+        by_value = jax.jvp(lambda s: residual(scene_at(s)), (share,), (jnp.ones_like(share),))[1]
         rest = system.matrix.shape[0] - size
         column = jnp.concatenate([by_value.ravel(), jnp.zeros(rest)])[:, None]
         row = jnp.asarray(np.concatenate([pin.ravel(), [0.0 if exciter is not None else 1.0] * rest, [0.0]]))[None]
@@ -284,8 +301,12 @@ def _branch_point(
     x, w, share = newton(linearize, move, (x, speed, start), change, jnp.ones_like(start))
     residual, scale, matrix = equations(x, w, share)
     slope = solve_in_turn(matrix, jnp.zeros(matrix.shape[0]).at[-1].set(1.0))[-1] * unit
-    means = jnp.mean(x[nd:], axis=1)
-    ends = np.cumsum([0, *counts])
-    moved = [jnp.mean(means[a:b]) if b > a else jnp.zeros_like(w) for a, b in itertools.pairwise(ends)]
+    moved = means_of_exciters(scene, jnp.mean(x[nd:], axis=1))
     met = jnp.max(jnp.abs(residual)) < 4096.0 * jnp.finfo(x.dtype).eps * scale
-    return share * unit, w, phases + jnp.stack(moved), slope, met
+    return share * unit, _forced_speed(scene_at(share), w), phases + moved, slope, met
+
+
+def _forced_speed(whole: PeriodicScene, w: Array) -> Array:
+    """Return the speed of a motion: that of an ideal drive with an unbalance, or else the unknown `w`."""
+    forcing = forcing_exciters(whole.model.scene)
+    return whole.model.scene.exciters[forcing[0]].drive.speed if forcing else w

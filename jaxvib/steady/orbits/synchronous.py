@@ -5,7 +5,6 @@ Choices that depend on parameters of a scene are made on the host (`plan_synchro
 
 from __future__ import annotations
 
-import itertools
 from typing import NamedTuple, Protocol
 
 import equinox as eqx
@@ -30,13 +29,14 @@ from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.balance.monodromy import at_constant_speed
 from jaxvib.steady.orbits.describe import half_range, judgement_of, plot_period
 from jaxvib.steady.orbits.whole import (
     PeriodicScene,
     WholeMotion,
-    body_counts,
     collocation_error,
-    is_forced,
+    forcing_exciters,
+    means_of_exciters,
     multipliers_of,
     periodic_scene,
     solve_whole,
@@ -286,8 +286,8 @@ def plan_synchronous(
     require_terms(scene.all_effects, _SYNCHRONOUS_TERMS, "is|are not part of a synchronous motion")
     for k, exciter in enumerate(scene.exciters):
         _require_one_body(exciter, scene.prefix_of(k))
-        scene = eqx.tree_at(lambda s, k=k: s.exciters[k].drive, scene, exciter.drive.settled())
-    prescribed = [e for e in scene.exciters if e.drive.ideal and e.loads is None]
+    scene = at_constant_speed(scene)
+    prescribed = [scene.exciters[k] for k in forcing_exciters(scene)]
     motors = [e.drive.speed for e in scene.exciters if not e.drive.ideal and not isinstance(e.drive, SwitchedOff)]
     if prescribed:
         start = prescribed[0].drive.speed
@@ -354,7 +354,8 @@ def _solve_program(
 
     `max_steps`: limit of the integration steps in a period for the multipliers, with which they have reverse derivatives.
     """
-    whole, grid, forced = periodic_scene(scene, phases), grid_of(points, False), is_forced(scene)
+    whole, grid, forcing = periodic_scene(scene, phases), grid_of(points, False), forcing_exciters(scene)
+    forced = bool(forcing)
     motion = solve_whole(whole, grid, speed, forced=forced)
     residual, error = collocation_error(whole, grid, motion, forced=forced)
     multipliers, trivial = multipliers_of(whole, grid, motion, max_steps, forced=forced)
@@ -362,9 +363,8 @@ def _solve_program(
     largest = jnp.max(jnp.abs(multipliers))
     is_met = residual < 4096.0 * eps
     equal = jnp.asarray(True)
-    for exciter in scene.exciters:
-        if exciter.drive.ideal and exciter.loads is None:
-            equal = equal & (jnp.abs(exciter.drive.speed / speed - 1.0) < 64.0 * eps)
+    for k in forcing:
+        equal = equal & (jnp.abs(scene.exciters[k].drive.speed / speed - 1.0) < 64.0 * eps)
     status = SynchronousStatus.where(error <= accuracy, SynchronousStatus.found, SynchronousStatus.under_resolved)
     nearest = jnp.min(jnp.abs(multipliers - 1.0))
     status = SynchronousStatus.where(nearest < eps**0.4, SynchronousStatus.at_fold, status)
@@ -391,12 +391,9 @@ def _quantities(scene: PeriodicScene, grid: Grid, motion: WholeMotion) -> dict[s
     bodies = x.shape[0]
     displacement, deviation, forces = harmonics[:nd], harmonics[nd:bodies].at[:, 0].add(scene.phases), harmonics[bodies:]
     ranges = half_range(grid.deviation_orders, jnp.concatenate([displacement, forces]))
-    counts = body_counts(scene.model.scene)
-    ends = np.cumsum([0, *counts])
-    means = [jnp.mean(deviation[a:b, 0].real) if b > a else jnp.zeros_like(omega) for a, b in itertools.pairwise(ends)]
     return {
         "speed": omega,
-        "phases": jnp.stack(means),
+        "phases": means_of_exciters(scene.model.scene, deviation[:, 0].real),
         "torque": jnp.mean(torque, axis=0),
         "power": jnp.mean(power, axis=0),
         "amplitude": ranges[:nd],

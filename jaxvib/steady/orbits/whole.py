@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from typing import NamedTuple, cast
 
 import equinox as eqx
@@ -31,6 +32,13 @@ def body_counts(scene: Scene) -> tuple[int, ...]:
     return tuple(int(not e.drive.ideal) if e.loads is None else e.loads.count for e in scene.exciters)
 
 
+def means_of_exciters(scene: Scene, values: Array) -> Array:
+    """Return the mean of the values (bodies,) over the bodies of each exciter, (N,); 0 for an exciter without bodies."""
+    ends = np.cumsum([0, *body_counts(scene)])
+    none = jnp.zeros((), values.dtype)
+    return jnp.stack([jnp.mean(values[a:b]) if b > a else none for a, b in itertools.pairwise(ends)])
+
+
 def unbalance_of(exciter: Exciter) -> Array:
     """Return the static moment of an exciter's rotor, or of its loads at one angle, kg m."""
     if exciter.loads is None:
@@ -48,9 +56,10 @@ def _inertia_of(exciter: Exciter) -> Array:
     return jnp.sum(jnp.broadcast_to(loads.inertia_factor() * loads.mass * loads.radius**2, (loads.count,)))
 
 
-def is_forced(scene: Scene) -> bool:
-    """Return True if an ideal drive turns an unbalance, and therefore determines the period of the motion."""
-    return any(e.drive.ideal and e.loads is None for e in scene.exciters)
+def forcing_exciters(scene: Scene) -> list[int]:
+    """Return the numbers of the exciters whose ideal drive turns an unbalance, and therefore determines the period of the
+    motion."""
+    return [k for k, each in enumerate(scene.exciters) if each.drive.ideal and each.loads is None]
 
 
 class PeriodicScene(eqx.Module):

@@ -332,6 +332,29 @@ def test_motion_near_a_fold_says_so(general, orbit):
     assert found.status_name in ("at_fold", "under_resolved") and not bool(found.error < 1e-9)
 
 
+def test_limit_over_the_speed_of_an_ideal_drive_is_its_fold():
+    """The spin-up is over in a steady motion; the motor follows the ideal drive within the limits only."""
+
+    def scene_at(speed, *more):
+        drives = (jv.SpinUp(speed, duration="5 s"), motor(), *more)
+        places, directions = ((-0.3, 0.0), (0.3, 0.0), (0.0, 0.1)), (1, -1, 1)
+        parts = list(zip(drives, places, directions, strict=False))
+        machine = body((4e5, 4e5), (2e3, 2e3), places=((-1.0, 0.0), (1.0, 0.0)))
+        return jv.Scene(machine, exciters=[jv.Exciter(drive=d, unbalance=1.5, at=p, direction=way) for d, p, way in parts])
+
+    over = "exciters[0].drive.speed"
+    start = jv.synchronous_orbit(scene_at(100.0), phases=[0.0, 3.1], points=17)
+    limit = jv.synchronization_limit(scene_at(100.0), start, over=over)
+    np.testing.assert_allclose(limit.speed, limit.value, rtol=1e-12)
+    assert 98.0 < limit.value[0] < 100.0 < limit.value[1] < 102.0
+    for value, phases, outward in zip(limit.value, limit.phases, (-1e-5, 1e-5), strict=True):
+        changed = [scene_at(float(value) * (1.0 + share)) for share in (-outward, outward)]
+        found = [jv.synchronous_orbit(each, phases=phases, points=17, throw=False).status_name for each in changed]
+        assert found == ["found", "not_converged"]
+    with pytest.raises(jv.InputError, match="the speed of one of several ideal drives"):
+        jv.synchronization_limit(scene_at(100.0, jv.ConstantSpeed(100.0)), start, over=over)
+
+
 def test_limit_needs_a_number_and_a_free_motion(general, orbit):
     with pytest.raises(jv.InputError, match="is not a parameter of this scene"):
         jv.synchronization_limit(general, orbit, over="exciters[1].drive.torque")
