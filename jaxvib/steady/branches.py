@@ -97,7 +97,7 @@ def branches(
     points: int = 2000,
     most: Number | None = None,
     least: Number | None = None,
-    accuracy: float = 1e-8,
+    accuracy: float | None = None,
 ) -> ExactBranches: ...
 
 
@@ -109,7 +109,7 @@ def branches(
     points: int = 2000,
     most: Number | None = None,
     least: Number | None = None,
-    accuracy: float = 1e-8,
+    accuracy: float | None = None,
 ) -> Branches | ExactBranches:
     """Return the branch n(Omega) of jams of coincident loads, through all its folds: in the limit of light loads, or `exact`.
 
@@ -126,11 +126,12 @@ def branches(
     - `most`: the greatest load speed, rad/s or text; default: 4/3 of the scene's rotor speed
     - `exact`: True for the periodic motions of the full equations in place of their limit for light loads, with Floquet
       multipliers and all special points
-    - `least`: the lowest load speed, with `exact`; default: a fifth of the lowest resonance
-    - `accuracy` of the rotor speeds, relative, with `exact`; typical: 1e-4 to 1e-8 (the default)
+    - `least`: the lowest load speed, with `exact`; default: a fifth of the lowest resonance or of the scene's rotor speed, if
+      this is lower
+    - `accuracy` of the rotor speeds, relative, with `exact`; typical: 1e-4 to 1e-8 (the default; in single precision 1e-3)
 
-    **Returns** `Branches`, or `ExactBranches` if `exact`. **Raises** `InputError` for fewer than 2 points or a speed that is
-    not positive.
+    **Returns** `Branches`, or `ExactBranches` if `exact`. **Raises** `InputError` for fewer than 2 points, a speed that is
+    not positive, and an accuracy that the precision does not allow.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -150,6 +151,8 @@ def branches(
         return exact_branches(scene, points=points, least=least, most=most, accuracy=accuracy)
     if least is not None:
         raise InputError("least", "is only for exact=True; leave it out, because branches of light loads begin at speed 0")
+    if accuracy is not None:
+        raise InputError("accuracy", "is only for exact=True; leave it out, because branches of light loads are explicit")
     count(points, "points", low=2, each=1e3)
     top = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
     per_side = max(2, math.ceil(points / (2 * scene.machine.structure().mass.shape[0])))
@@ -159,7 +162,7 @@ def branches(
 @cached
 def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
     model = jammed_model(scene).decomposed()
-    crowded, resonances = fold_points(model, per_side)
+    crowded, resonances = fold_points(model, per_side, top)
     jams, folds = branch_points(model, spread_points(crowded, points, top))
     fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
     return Branches(**fields, resonances=resonances, folds=folds, scene=scene)

@@ -313,7 +313,7 @@ def _common_torques(scene: Scene) -> tuple[Array, Array]:
 @cached
 def _default_speeds(scene: Scene, top: Array, points: int) -> Array:
     model = unbalanced_model(scene, jnp.zeros(len(scene.exciters), top.dtype)).decomposed()
-    crowded, _ = fold_points(model, _POINTS_PER_SIDE)
+    crowded, _ = fold_points(model, _POINTS_PER_SIDE, top)
     return spread_points(crowded, points, top)
 
 

@@ -33,7 +33,7 @@ def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], s
     determined.
     """
     omega, stable = np.asarray(branch.omega), np.asarray(branch.stable)
-    ends = speed_text([np.min(omega), np.max(omega)], 6, " to ")
+    ends = speed_text([np.fmin.reduce(omega), np.fmax.reduce(omega)], 6, " to ")
     lines = [
         f"{omega.size} points from {ends}, {np.mean(stable):.1%} of them stable {stability_text}; "
         f"resonances {speed_text(estimated_frequencies(branch.scene), 6)}"

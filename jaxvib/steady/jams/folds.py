@@ -28,6 +28,10 @@ Excited = TypeVar("Excited", bound=ExcitedModel)
 _GRID_POINTS = 64
 """Number of grid points on each side of each pole in the search for folds."""
 
+_SLOWEST = 1e-3
+"""Lower limit of the largest pole, rad/s, by which the grid of load speeds is scaled: a free body without damping has the pole
+0 only."""
+
 _BLOCK_SIZE = 1024
 """Number of load speeds whose sums over the poles fit into the processor's first cache."""
 
@@ -292,17 +296,19 @@ def without_ripples(speeds: Array, count: Array, count_left: int) -> Array:
     return jax.lax.fori_loop(0, count_left // 2, without_smallest, (index, count))[0][:count_left]
 
 
-def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
+def fold_points(model: LinearModel, per_side: int, highest: Array | None = None) -> tuple[Array, Array]:
     """Return a grid of load speeds for the search for folds, and the resonances; only the resonances have derivatives.
 
     The grid has `per_side` points on each side of each pole s of det(K + s^2 M + s C) = 0, with a density that follows the
-    width of its peak. Undamped resonances are not sufficient: a strong damper between two platforms locks them into one body,
-    whose sharp peak is at neither of their resonances.
+    width of its peak. It reaches five times the largest |s|, and at least the speed `highest`. Undamped resonances are not
+    sufficient: a strong damper between two platforms locks them into one body, whose sharp peak is at neither of their
+    resonances.
     """
     resonances, _ = model.modes()
     fixed = jax.lax.stop_gradient(resonances)
     poles = _poles(*jax.lax.stop_gradient(model.peak_matrices())) if model.modal is None else model.modal.poles
-    top = jnp.maximum(jnp.max(fixed), jnp.max(jnp.abs(poles)))
+    top = jnp.maximum(jnp.max(fixed), jnp.max(jnp.abs(poles), initial=_SLOWEST))
+    beyond = 5.0 * top if highest is None else jnp.maximum(5.0 * top, highest)
     tiny = jnp.finfo(top.dtype).eps * 16.0
     width = jnp.maximum(jnp.abs(poles.real), tiny * top)[:, None]
     low = 1e-3 * jnp.min(jnp.where(fixed > 0.0, fixed, top))
@@ -313,7 +319,7 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
 
     # One pole of a conjugate pair gets the points above, the other the points below; a real pole has no points below.
     centre = jnp.abs(poles.imag)[:, None]
-    below, above = centre - crowded(jnp.maximum(centre - low, 0.0)), centre + crowded(jnp.full_like(width, 5.0 * top))
+    below, above = centre - crowded(jnp.maximum(centre - low, 0.0)), centre + crowded(jnp.full_like(width, beyond))
     points = jnp.where(poles.imag[:, None] >= 0.0, above, below)
     return jnp.sort(jnp.maximum(points.ravel(), low)), resonances
 

@@ -30,7 +30,7 @@ from jaxvib.steady.jams.folds import fold_points, light_rotor_speed
 from jaxvib.steady.orbits.describe import OrbitStatus, orbits
 from jaxvib.steady.orbits.jam_orbit import collocation_points
 from jaxvib.steady.orbits.stability import Floquet, is_stiff, steps_for
-from jaxvib.units import Number, count, number
+from jaxvib.units import Number, count, number, validate_tolerance
 
 _ORBITS_PER_BATCH = 32
 """Number of orbits in a batch: enough to fill vector registers, few enough for the cache."""
@@ -110,7 +110,12 @@ class ExactBranches(Result):
 
 
 def exact_branches(
-    scene: Scene, *, points: int = 2000, least: Number | None = None, most: Number | None = None, accuracy: float = 1e-8
+    scene: Scene,
+    *,
+    points: int = 2000,
+    least: Number | None = None,
+    most: Number | None = None,
+    accuracy: float | None = None,
 ) -> ExactBranches:
     """Compute the branch n(Omega) of exact jams with its stability and the points of stability changes.
 
@@ -127,9 +132,9 @@ def exact_branches(
     **Arguments**
 
     - `points`: number of points along Omega, denser near the resonances
-    - `least`, `most`: limits of the load speed, rad/s or text; default: a fifth of the lowest resonance, and 4/3 of the scene's
-      rotor speed
-    - `accuracy` of the rotor speeds, relative
+    - `least`, `most`: limits of the load speed, rad/s or text; default: a fifth of the lowest resonance or of the scene's rotor
+      speed, if this is lower, and 4/3 of the rotor speed
+    - `accuracy` of the rotor speeds, relative; default: 1e-8, in single precision 1e-3
 
     **Returns** `ExactBranches`; a point that could not be solved has NaN and a status. **Raises** `InputError`.
 
@@ -141,15 +146,20 @@ def exact_branches(
     [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
     """
     count(points, "points", low=2, each=1e4)
-    if not _search_grid.is_ready(scene):
-        load_speeds = np.ones(_ORBITS_PER_BATCH, scene.drive.speed.dtype)
+    dtype = scene.drive.speed.dtype
+    if accuracy is None:
+        accuracy = 1e-8 if dtype.itemsize >= 8 else 1e-3
+    accuracy = validate_tolerance(accuracy, "accuracy", dtype, 1e3)
+    speed = scene.drive.speed
+    top = speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
+    if not _search_grid.is_ready(scene, top):
+        load_speeds = np.ones(_ORBITS_PER_BATCH, dtype)
         fewest = collocation_points(scene, _COLLOCATION_POINTS[0])
         in_background(functools.partial(_values.prepare, scene, load_speeds, fewest, accuracy, False))
-    grid, resonances = map(np.asarray, _search_grid(scene))
-    lowest = np.min(resonances[resonances > 0.0], initial=np.max(resonances))
+    grid, resonances = map(np.asarray, _search_grid(scene, top))
+    lowest = np.min(resonances[resonances > 0.0], initial=float(speed))
     low = float(0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True))
-    speed = float(scene.drive.speed)
-    high = speed * 4.0 / 3.0 if most is None else float(number(most, "rad/s", "most", low=0.0, open_low=True))
+    high = float(top)
     if not high > low:
         raise InputError("most", f"is {high:.6g} rad/s; it must be above the lowest load speed (least), {low:.6g} rad/s")
     grid = np.concatenate([[low], grid[(grid > low) & (grid < high)], [high]])
@@ -209,9 +219,9 @@ def _replaced_rows(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.nd
 
 
 @cached
-def _search_grid(scene: Scene) -> tuple[Array, Array]:
-    """Return the grid of load speeds for the search for folds, and the resonances."""
-    return fold_points(jammed_model(scene), 64)
+def _search_grid(scene: Scene, highest: Array) -> tuple[Array, Array]:
+    """Return the grid of load speeds for the search for folds, up to at least the speed `highest`, and the resonances."""
+    return fold_points(jammed_model(scene), 64, highest)
 
 
 @cached

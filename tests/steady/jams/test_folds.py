@@ -186,6 +186,13 @@ def test_samples_of_a_branch_have_the_numbers_of_its_pieces(begin):
     np.testing.assert_array_equal(modes_of(omega, failed, np.asarray(branch.resonances))[away], modes[away])
 
 
+def test_a_diagram_reaches_a_speed_far_above_all_resonances():
+    branch = jv.branches(published().scene(), points=2000, most=80.0)
+    omega = np.asarray(branch.omega)
+    np.testing.assert_allclose(omega[-1], 80.0, rtol=1e-12)
+    assert np.max(np.diff(omega[omega > 0.1]) / omega[omega > 0.1][1:]) < 0.02 and np.sum(omega < 1.0) > 800
+
+
 def test_the_ripples_that_span_least_are_left_out():
     speeds = jnp.array([9.0, 1.0, 1.1, 1.05, 8.0, 2.0, 2.1, 2.09])
     np.testing.assert_array_equal(without_ripples(speeds, jnp.asarray(8), 4), [0, 1, 4, 5])

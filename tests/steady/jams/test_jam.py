@@ -178,6 +178,13 @@ def test_a_machine_free_to_drift_has_frequency_zero():
     assert float(jv.jam_modes(s).select(5).foundation_force) == 0.0
 
 
+def test_loads_of_a_free_undamped_mass_turn_with_the_rotor():
+    loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
+    modes = jv.jam_modes(jv.Scene(jv.one_mass(mass=50.0, stiffness=0.0, damping=0.0), loads, jv.ConstantSpeed(100.0)))
+    assert modes.mode_numbers() == [3]
+    np.testing.assert_allclose([modes.omega[2], modes.amplitude[2, 0]], [100.0, 0.1 / 51.0], rtol=1e-12)
+
+
 def test_loads_without_drag_are_refused():
     s = jv.Scene(machines()["two_mass"], jv.balls(count=2, mass=0.1, radius=0.1, drag=0.0), jv.ConstantSpeed(10.0))
     with pytest.raises(jv.InputError, match=r"loads\.drag is 0"):

@@ -1,13 +1,16 @@
 """Parts of the search for exact jams."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import published
 
 import jaxvib as jv
+from jaxvib.display import speed_text
 from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_model
+from jaxvib.steady.jams.branch_plot import branch_summary
 from jaxvib.steady.orbits import diagram, search
 from jaxvib.steady.orbits.describe import half_range
 from jaxvib.steady.orbits.search import _interpolated
@@ -55,6 +58,21 @@ def test_the_diagram_begins_at_a_fifth_of_the_lowest_resonance(monkeypatch):
     lowest = float(jnp.min(jv.jam_modes(scene).resonances))
     np.testing.assert_allclose([omega[0], omega[-1]], [0.2 * lowest, 4.0], rtol=1e-12)
     assert omega.size == 50 and np.all(np.diff(omega) > 0.0)
+    slow = eqx.tree_at(lambda s: s.drive.speed, scene, jnp.asarray(0.1))
+    with pytest.raises(Asked) as caught:
+        jv.branches(slow, exact=True, points=50)
+    np.testing.assert_allclose(caught.value.args[0][[0, -1]], [0.02, 0.4 / 3.0], rtol=1e-12)
+    for accuracy, exact, problem in ((-1.0, True, "at least"), (1e-20, True, "at least"), (1e-6, False, "only")):
+        with pytest.raises(jv.InputError, match=f"^accuracy is .*{problem}"):
+            jv.branches(scene, exact=exact, points=50, accuracy=accuracy)
+
+
+def test_summary_of_a_branch_leaves_out_points_without_a_jam():
+    class Branch:
+        omega, stable = np.array([np.nan, 2.0, 3.0, np.nan]), np.array([False, True, True, False])
+        scene = published().scene()
+
+    assert branch_summary(Branch, [], "here").startswith(f"4 points from {speed_text(np.array([2.0, 3.0]), 6, ' to ')}, 50.0% ")
 
 
 def test_swings_are_half_of_what_lies_between_the_extremes():
