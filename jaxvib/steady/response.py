@@ -63,7 +63,7 @@ class AbstractResponse(Readable):
     - `torque` (exciter,), N m: mean torque that each rotor needs to sustain the vibration; `power` (exciter,), W
     - `motor_torque` (exciter,), N m: torque of each motor at this speed. That of an ideal drive is equal to `torque`, plus an
       equal share of the torque that the motors of other exciters lack
-    - `torque_share`: the sum of `torque` divided by that of `motor_torque`
+    - `torque_share`: the sum of `torque` divided by that of `motor_torque`; inf above the no-load speed, where the motors brake
 
     Values at an undamped resonance are infinite. Values at speed 0 are the limits at low speeds: the transmissibility of a
     machine on springs is 1, and the amplitude of one without supports is S/M.
@@ -351,7 +351,7 @@ def motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dic
     # Within a few units in the last place of an undamped resonance the amplitude consists of rounding errors.
     size = jnp.max(magnitude(model.force_direction)) / jnp.min(jnp.diagonal(model.mass))
     trial = magnitude(jax.lax.stop_gradient(model).displacement(jax.lax.stop_gradient(omega)))
-    bounded = jnp.all(trial * 100.0 * jnp.finfo(size.dtype).eps < size)
+    bounded = jnp.all(trial * 100.0 * jnp.finfo(size.dtype).eps <= size)  # both are 0 if the forces cancel
     z = model.displacement(jnp.where(bounded, omega, 1.01 * omega + 1.0))
     lengths = np.flatnonzero(np.asarray(model.carrier.units) == "m")
     amplitude = magnitude(z)
@@ -360,7 +360,9 @@ def motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dic
     motor = model.drive_torque(omega, torque)
     forced = exciter > 0.0
     ratio = jnp.where(forced, force / jnp.where(forced, exciter, 1.0), jnp.inf)
-    share = jnp.sum(torque) / model.motor_torque(omega) if model.highest_speed is not None else jnp.ones_like(omega)
+    share, needed = jnp.ones_like(omega), jnp.sum(torque)
+    if model.highest_speed is not None:
+        share = jnp.where((jnp.sum(motor) < 0.0) & (needed > 0.0), jnp.inf, needed / model.motor_torque(omega))
     fields = {
         "displacement": z,
         "amplitude": amplitude,
@@ -400,6 +402,8 @@ def _balanced_speeds(model: UnbalancedModel, pieces: Pieces) -> tuple[Array, Arr
     high = jax.lax.stop_gradient(jnp.where(pieces.high < pieces.high[-1], pieces.high, top))
     gaps = (jax.vmap(partial(_torque_gap, model))(w) for w in (pieces.low, high))
     low_gap, high_gap = (jax.lax.stop_gradient(gap) for gap in gaps)
+    # At speed 0 no vibration needs a torque; the amplitude of a machine without supports is 0/0 there.
+    low_gap = jnp.where(pieces.low > 0.0, low_gap, -jnp.sum(model.balance.driving_torque(jnp.zeros_like(top))))
     high_gap = jnp.where(high < top, high_gap, jnp.maximum(high_gap, 0.0))
     root = partial(branch_root, model, _torque_gap, _scanned_gap)
     exists = (pieces.high > pieces.low) & (low_gap * high_gap <= 0.0)

@@ -7,6 +7,7 @@ import pytest
 import scipy.optimize
 
 import jaxvib as jv
+from jaxvib.results.status import status_names
 
 MASS, SPRING, DAMPER, S = 200.0, 8e5, 600.0, 0.2
 SPEEDS = np.array([5.0, 40.0, 63.0, 90.0, 160.0])
@@ -105,6 +106,8 @@ def test_many_platforms_are_a_dense_solution():
     exact = np.stack([np.linalg.solve(k - w**2 * m + 1j * w * c, w**2 * force) for w in SPEEDS])
     np.testing.assert_allclose(found.displacement, exact, rtol=1e-10, atol=1e-15)
     np.testing.assert_allclose(found.torque[:, 0], -0.15 * SPEEDS**2 * np.imag(1j * exact[:, 2]), rtol=1e-8)
+    share = np.where(50.0 * np.pi > SPEEDS, found.torque[:, 0] / found.motor_torque[:, 0], np.inf)
+    np.testing.assert_allclose(found.torque_share, share, rtol=1e-9)
 
 
 def test_a_gyroscopic_rotor_is_a_dense_solution():
@@ -335,6 +338,34 @@ def test_an_undamped_machine_lets_its_motor_idle():
     assert not np.any(found.folds.exists) and found.operating.exists.sum() == 1
     speed = found.operating.speed[np.asarray(found.operating.exists)][0]
     np.testing.assert_allclose(speed, 50.0 * np.pi, rtol=1e-12)
+
+
+def test_default_speeds_reach_beyond_the_working_speed():
+    """The working speed is 31 times the resonance; resonance and working speed are equally well covered."""
+    soft = jv.one_mass(mass=MASS, stiffness=MASS * 5.0**2, damping=100.0)
+    speeds = np.asarray(jv.response(jv.Scene(soft, exciters=[jv.Exciter(drive=motor(), unbalance=S)])).speed)
+    np.testing.assert_allclose(speeds[-1], 4.0 / 3.0 * 50.0 * np.pi, rtol=1e-12)
+    assert np.all(np.diff(speeds) >= 0.0) and np.max(np.diff(speeds) / speeds[1:], where=speeds[1:] > 1.0, initial=0.0) < 0.1
+
+
+@pytest.mark.parametrize("damping", [0.0, 100.0])
+def test_a_free_machine_has_an_operating_point(damping):
+    """Without a spring the vibration needs the torque c S^2 w^3 / (2 (M^2 w^2 + c^2))."""
+    free = jv.one_mass(mass=MASS, stiffness=0.0, damping=damping)
+    found = jv.response(jv.Scene(free, exciters=[jv.Exciter(drive=motor(), unbalance=S)]))
+    w = float(found.operating.speed[0])
+    needed = damping * S**2 * w**3 / (2.0 * (MASS**2 * w**2 + damping**2))
+    assert np.asarray(found.operating.exists).tolist() == [True, False, False] and w > 150.0
+    np.testing.assert_allclose(needed, 12.0 * (1.0 - w / (50.0 * np.pi)), atol=1e-12)
+
+
+def test_forces_that_cancel_cause_no_vibration():
+    drive = jv.ConstantSpeed("1500 rpm")
+    machine = jv.one_mass(mass=MASS, stiffness=SPRING, damping=DAMPER)  # moves up only
+    exciters = [jv.Exciter(drive=drive, unbalance=S, direction=way) for way in (1, -1)]
+    found = jv.response(jv.Scene(machine, exciters=exciters), SPEEDS)
+    assert status_names(found.status).tolist() == ["done"] * SPEEDS.size
+    assert not np.any(found.amplitude) and not np.any(found.torque) and np.all(np.isinf(found.transmissibility))
 
 
 def test_a_batch_is_its_scenes():
