@@ -49,6 +49,7 @@ from jaxvib.units.reading import _FACTORS, in_own_unit, to_float, unit_ratio
         ("3 m rad^2/s^2", "m/s^2", 3.0),
         ("40 Ns/m", "N s/m", 40.0),
         ("2 kNm", "N m", 2e3),
+        ("42 kgcm", "kg m", 0.42),
         ("5 kgm^2", "kg m^2", 5.0),
         ("5 %", "", 0.05),
         ("4.4e4", "N/m", 4.4e4),

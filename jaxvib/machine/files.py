@@ -294,7 +294,8 @@ def _build_exciter(table: object, k: int) -> Exciter:
         values = {name: value for name, value in table.items() if name not in ("loads", "drive", "effects")}
         parts = {name: build_kind(table[name], name, SECTIONS[name]) for name in ("loads", "drive") if name in table}
         if isinstance(values.get("unbalance"), Mapping):
-            values["unbalance"] = build_part(unbalance, values["unbalance"], "unbalance")
+            with within("unbalance."):
+                values["unbalance"] = build_part(unbalance, values["unbalance"], "")
         effects = _build_effects(table.get("effects", {}))
         return build_part(Exciter, {**values, **parts, "effects": effects}, "")
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import is_real
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine, Mount, Place, on_body, read_place, shapes_of
 from jaxvib.machine.drives.drive import Directed, Drive
@@ -20,7 +21,10 @@ from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.machine.shapes import require_drive, require_forces, require_loads, require_machine, require_terms
 from jaxvib.units import Number, count, number
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_if_known, when_known
+
+MAX_USUAL_SPEED = 700.0
+"""Largest usual speed of a rotor, rad/s. A larger plain number was probably intended in rpm."""
 
 _MIN_RATIO = 1e-15
 """Ratio of two numbers below which a sum in double precision loses the smaller one."""
@@ -150,6 +154,9 @@ def unbalance(*, force: Number, at: Number) -> Array:
     1.8238
     """
     speed = number(at, "rad/s", "at", low=0.0, open_low=True)
+    if is_real(at):
+        problem = "is {0:g}, and a plain number is in rad/s; write '{0:g} rpm' or '{0:g} rad/s'"
+        require_if_known(lambda speed: speed <= MAX_USUAL_SPEED, speed, field="at", problem=problem)
     return number(force, "N", "force", low=0.0, open_low=True) / speed**2
 
 

@@ -21,7 +21,7 @@ from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drives.drive import Motor
 from jaxvib.machine.effects.base import static_imbalances, total_gravity
 from jaxvib.machine.files import rebuild_part
-from jaxvib.machine.scene import Exciter, Scene, read_unbalance, require_comparable
+from jaxvib.machine.scene import MAX_USUAL_SPEED, Exciter, Scene, read_unbalance, require_comparable
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.units import conditions_of_traced_values
@@ -124,9 +124,9 @@ _MAX_MASS, _MAX_LEVERS = 1e5, 3.0
 """Largest usual mass of a machine, kg, and largest usual distance of an exciter from the centre of mass, relative to that of
 the farthest support."""
 
-_MAX_SPEED, _MAX_RADIUS, _MAX_SAG, _MIN_MASS = 700.0, 5.0, 1.0, 10.0
-"""Largest usual rotor speed, rad/s, largest usual radius of loads, m, largest usual sag of a machine under its own weight, m,
-and smallest mass, kg, of machines whose sag is examined. Machines with dimensionless parameters have masses of about 1."""
+_MAX_RADIUS, _MAX_SAG, _MIN_MASS = 5.0, 1.0, 10.0
+"""Largest usual radius of loads, m, largest usual sag of a machine under its own weight, m, and smallest mass, kg, of machines
+whose sag is examined. Machines with dimensionless parameters have masses of about 1."""
 
 
 def _largest_lever(machine: Machine) -> float:
@@ -152,7 +152,7 @@ def implausible_numbers(scene: Scene) -> list[str]:
     for k, exciter in enumerate(scene.exciters):
         place, loads = scene.prefix_of(k), exciter.loads
         speed = float(exciter.drive.speed)
-        if speed > _MAX_SPEED:
+        if speed > MAX_USUAL_SPEED:
             note(f"{place}drive.speed", speed_text(speed), "rad/s", f"{speed:g} rpm")
         radius = 0.0 if loads is None else float(np.max(getattr(loads, "radius", 0.0)))
         if radius > _MAX_RADIUS:

@@ -70,6 +70,7 @@ _JOINED = {
     "Nmm": "N mm",
     "kgm": "kg m",
     "kgmm": "kg mm",
+    "kgcm": "kg cm",
 }
 """Products that are often written without a space. Without this list, pint would read "Nm" as `number_meter`, meters per
 gram."""

@@ -8,6 +8,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.equations.linear import linear_model
+from jaxvib.machine.files import SCREENS
 from jaxvib.machine.numbers.named import numbers_of
 
 SPRINGS = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e3, 4e3)) for x in (-1.2, 1.2)]
@@ -112,6 +113,11 @@ def exciter(**more):
         (lambda: jv.Scene(SCREEN, exciters=[exciter(body=1)]), "body is 1; the machine has one body, number 0"),
         (lambda: jv.Scene(SCREEN, exciters=[exciter(), exciter(body=-1)]), "body is -1; it must be a whole number, at least 0"),
         (lambda: jv.unbalance(force=0.0, at="1000 rpm"), "force is 0 N; it must be greater than 0"),
+        (
+            lambda: jv.scene_from_toml(SCREENS["feeder"].replace('force = "10 kN"', 'force = "10 kg"', 1)),
+            r"exciters\[0\]\.unbalance\.force is '10 kg', which is not in N",
+        ),
+        (lambda: jv.unbalance(force="10 kN", at=1450), "at is 1450, and a plain number is in rad/s; write '1450 rpm' or"),
         (lambda: jv.SwitchedOff(jv.ConstantSpeed(9.0)), "drive.motor is .*; it must be a motor, for example InductionMotor"),
         (lambda: jv.SwitchedOff(MOTOR, bearing=-1.0), "drive.bearing is -1 N m s; it must be at least 0"),
         (
