@@ -22,7 +22,7 @@ from jaxvib.equations.dynamics import Dynamics, dynamics_of
 from jaxvib.equations.exciter import ExciterDynamics, RotorDynamics
 from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.sliding import contact_force, dot, kinematics
-from jaxvib.equations.state import ExciterState, State
+from jaxvib.equations.state import ExciterState, State, require_motion, require_state
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Mount
 from jaxvib.machine.effects.base import Effect, static_imbalances, terms_of, total_gravity
@@ -37,6 +37,7 @@ from jaxvib.machine.effects.terms import (
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
+from jaxvib.runtime.devices import float_dtype
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, numbers
 
@@ -66,7 +67,8 @@ def foundation_force(scene: Scene, state: State) -> Array:
 
     Source: the antiphase paper, equation (7).
     """
-    return assemble(validate_scene(scene)).foundation_force(state.displacement, state.velocity)
+    require_motion(scene := validate_scene(scene), state, "state")
+    return assemble(scene).foundation_force(jnp.asarray(state.displacement), jnp.asarray(state.velocity))
 
 
 @validated
@@ -98,7 +100,8 @@ def foundation_moment(scene: Scene, state: State, about: Sequence[Number] = (0.0
     Source: equilibrium of the foundation.
     """
     rows = validate_scene(scene).machine.moment_rows(numbers(about, "m", "about", 2))
-    return rows[0] @ state.displacement + rows[1] @ state.velocity
+    require_motion(scene, state, "state")
+    return rows[0] @ jnp.asarray(state.displacement) + rows[1] @ jnp.asarray(state.velocity)
 
 
 @validated
@@ -134,7 +137,18 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
 
     Source: the energy of the equations in `vector_field`, derived here.
     """
-    return _energy(validate_scene(scene), state, _at_time(t, state))
+    scene, state = _validated(scene, state)
+    return _energy(scene, state, _at_time(t, state))
+
+
+def _validated(scene: Scene, state: State) -> tuple[Scene, State]:
+    """Return the scene and the state with arrays in the precision of JAX. **Raises** `InputError` if they do not fit."""
+
+    def array(leaf: Any) -> Array:
+        return leaf if isinstance(leaf, Array) and leaf.dtype == float_dtype() else jnp.asarray(leaf, dtype=float)
+
+    require_state(scene := validate_scene(scene), state, "state")
+    return scene, jax.tree.map(array, state)
 
 
 def _at_time(t: Array | float, state: State) -> Any:
@@ -227,7 +241,8 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
 
     Source: derived here from `vector_field`; the drag of loads on machines with platforms: the antiphase paper, equation (2).
     """
-    return _power(validate_scene(scene), _at_time(t, state), state)
+    scene, state = _validated(scene, state)
+    return _power(scene, _at_time(t, state), state)
 
 
 @cached
@@ -380,7 +395,8 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
 
     Source: Strautmanis et al. 2018, equation (10), with the acceleration of the rotor.
     """
-    return _normal_force(validate_scene(scene), _at_time(t, state), state)
+    scene, state = _validated(scene, state)
+    return _normal_force(scene, _at_time(t, state), state)
 
 
 @cached

@@ -7,9 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted, within
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.readable import Readable
 
@@ -149,3 +152,57 @@ class State(Readable):
     def azimuth_rate(self) -> Array:
         """Rates of the azimuths, (..., count) rad/s."""
         return self.rate[0]
+
+
+def require_state(scene: Scene, state: State, name: str) -> None:
+    """Require that a user's state fits the scene.
+
+    **Raises** `InputError` for a state of another scene, and for several states in one. `name`: the state in messages.
+    """
+    require_motion(scene, state, name)
+    if len(state.exciters) != len(scene.exciters):
+        raise InputError(f"{name}.exciters", f"are {len(state.exciters)}; this scene needs {len(scene.exciters)}")
+    for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
+        with within(scene.prefix_of(k)):
+            _require_rotor(exciter, own, f"{name}.rotor")
+            if (loads := exciter.loads) is not None:
+                count = 1 if loads.circular else len(jax.eval_shape(loads.rest))
+                _require_shapes(f"{name}.angle", own.angle, (loads.count,), count)
+                _require_shapes(f"{name}.rate", own.rate, (loads.count,), count)
+            elif own.angle or own.rate:
+                raise InputError(f"{name}.angle", "is given, but this exciter has no loads; leave angle and rate out")
+
+
+def require_motion(scene: Scene, state: State, name: str) -> None:
+    """**Raises** `InputError` if the displacement and the velocity of a state do not have an entry for each coordinate."""
+    size = scene.machine.structure().mass.shape[:1]
+    _require_shapes(f"{name}.displacement", state.displacement, size)
+    _require_shapes(f"{name}.velocity", state.velocity, size)
+
+
+def _require_rotor(exciter: Exciter, state: ExciterState, field: str) -> None:
+    """**Raises** `InputError` if the states of the rotor are not those of the drive."""
+    rotor, kind = state.rotor, quoted(exciter.drive.kind)
+    if exciter.drive.ideal and rotor is not None:
+        needed = "it must be None, because the drive prescribes the motion of the rotor"
+        raise InputError(field, f"is {quoted(rotor)}; under the drive {kind} {needed}")
+    if exciter.drive.ideal:
+        return
+    if rotor is None:
+        needed = "it must be (angle, speed), because the angle and speed of a motor's rotor are part of the state"
+        raise InputError(field, f"is None; under the drive {kind} {needed}")
+    size = 2 + len(jax.eval_shape(exciter.drive.state_units))
+    if len(rotor) != size:
+        raise InputError(field, f"has {len(rotor)} entries; {size} are needed: angle, speed and the states of the motor")
+    _require_shapes(field, rotor, (), size)
+
+
+def _require_shapes(field: str, values: object, shape: tuple[int, ...], count: int = 1) -> None:
+    """**Raises** `InputError` unless there are `count` arrays of this `shape`."""
+    shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(values)]
+    wrong = [each for each in shapes if each != shape]
+    if wrong:
+        several = "; for the states of a trajectory use jax.vmap" if len(wrong[0]) > len(shape) else ""
+        raise InputError(field, f"has shape {wrong[0]}; this scene needs {shape}{several}")
+    if len(shapes) != count:
+        raise InputError(field, f"has {len(shapes)} arrays; {count} of shape {shape} are needed, one for each coordinate")

@@ -15,7 +15,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.sliding import dot, kinematics
-from jaxvib.equations.state import ExciterState, Spin, State
+from jaxvib.equations.state import ExciterState, Spin, State, require_state
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.drives.drive import SpinUp
 from jaxvib.machine.effects.base import has_term, terms_of, total_gravity
@@ -268,41 +268,9 @@ def _validate_state(scene: Scene, state: State, mode: int | None, separation: Nu
         )
     if mode is not None:
         raise InputError("mode", f"is {quoted(mode)}; it is used only with start='jam': leave it out if start is a State")
-    if len(state.exciters) != len(scene.exciters):
-        raise InputError("start.exciters", f"are {len(state.exciters)}; this scene needs {len(scene.exciters)}")
-    nd = scene.machine.structure().mass.shape[0]
-    _require_shapes(state, displacement=nd, velocity=nd)
-    for k, (exciter, exciter_state) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
-        with within(scene.prefix_of(k)):
-            if exciter.drive.ideal != (exciter_state.rotor is None):
-                motor, ideal = (
-                    "(angle, speed), because the angle and speed of a motor's rotor are part of the state",
-                    "None, because the drive prescribes the motion of the rotor",
-                )
-                problem = (
-                    f"under the drive {quoted(exciter.drive.kind)} it must be {motor if exciter_state.rotor is None else ideal}"
-                )
-                raise InputError("start.rotor", f"is {quoted(exciter_state.rotor)}; {problem}")
-            needed = 2 + len(exciter.drive.state_units())
-            if exciter_state.rotor is not None and len(exciter_state.rotor) != needed:
-                problem = (
-                    f"has {len(exciter_state.rotor)} entries; {needed} are needed: angle, speed and the states of the motor"
-                )
-                raise InputError("start.rotor", problem)
-            if exciter.loads is not None:
-                _require_shapes(exciter_state, angle=exciter.loads.count, rate=exciter.loads.count)
-            elif exciter_state.angle or exciter_state.rate:
-                raise InputError("start.angle", "is given, but this exciter has no loads; leave angle and rate out")
+    require_state(scene, state, "start")
     require_start(scene, state)
     return with_spin(scene, jax.tree.map(partial(jnp.asarray, dtype=float), state))
-
-
-def _require_shapes(state: State | ExciterState, **lengths: int) -> None:
-    """**Raises** `InputError` if arrays of a state do not have these lengths."""
-    for name, length in lengths.items():
-        shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(getattr(state, name))]
-        if not shapes or any(shape != (length,) for shape in shapes):
-            raise InputError(f"start.{name}", f"has shape {shapes[0] if shapes else ()}; this scene needs ({length},)")
 
 
 def require_start(scene: Scene, state: State) -> None:

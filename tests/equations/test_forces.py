@@ -34,3 +34,40 @@ def test_every_support_pushes_on_the_bed():
     s = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0), supports)
     state = jv.State(jnp.array([3e-4, -2e-4]), jnp.array([0.02, 0.05]), (jnp.ones(1),), (jnp.zeros(1),))
     np.testing.assert_allclose(jv.foundation_force(s, state), [10.8 - 16.0 + 200.0 + 10.0], rtol=1e-12)
+
+
+MOTOR = jv.Exciter(drive=jv.DCMotor(100.0, stall_torque=5.0, inertia=0.1), unbalance=0.1)
+BALLS = jv.Exciter(jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+BOTH = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0), exciters=[BALLS, MOTOR])
+
+
+def state_of_both(coordinates=(1,), loads=2, rotor=(0.0, 0.0)):
+    q, angle = jnp.zeros(coordinates), (jnp.zeros(loads),)
+    return jv.State(q, q, exciters=[jv.ExciterState(angle, angle), jv.ExciterState(rotor=rotor)])
+
+
+@pytest.mark.parametrize(
+    ("state", "says"),
+    [
+        (state_of_both((2,)), r"state.displacement has shape \(2,\); this scene needs \(1,\)"),
+        (
+            state_of_both((5, 1)),
+            r"state.displacement has shape \(5, 1\); .* of a trajectory use jax.vmap",
+        ),
+        (state_of_both(loads=3), r"exciters\[0\].state.angle has shape \(3,\); this scene needs \(2,\)"),
+        (
+            state_of_both(rotor=None),
+            r"exciters\[1\].state.rotor is None; .* it must be \(angle, speed\)",
+        ),
+        (state_of_both(rotor=(0.0,) * 3), r"exciters\[1\].state.rotor has 3 entries; 2 are needed"),
+        (jv.State(jnp.zeros(1), jnp.zeros(1)), "state.exciters are 1; this scene needs 2"),
+    ],
+)
+def test_states_of_other_scenes_are_refused_in_one_sentence(state, says):
+    asked = [lambda: jv.energy(BOTH, state), lambda: jv.power(BOTH, 0.0, state), lambda: jv.normal_force(BOTH, 0.0, state)]
+    for ask in asked:
+        with pytest.raises(jv.InputError, match=says):
+            ask()
+    if "displacement" in says:
+        with pytest.raises(jv.InputError, match=says):
+            jv.foundation_force(BOTH, state)
