@@ -102,7 +102,7 @@ def test_remedy_gives_the_predicted_errors(case):
 
 @functools.cache
 def fitted():
-    return jv.identify(first_scene(), run_of(0), unknown=NAMES)
+    return jv.identify(first_scene(), run_of(20), unknown=NAMES)
 
 
 LIMITS = {"speed": 110.0, "acceleration": 15.0}
