@@ -88,10 +88,10 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
 
 
 def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
-    """Return a controller whose steps end at the jumps of the drives' accelerations; a controller of equal steps is
+    """Return a controller whose steps end at the jumps of the drives' accelerations; a controller of given steps is
     unchanged."""
     jump_ts = [t for exciter in scene.exciters for t in exciter.drive.jump_ts()]
-    if not jump_ts or isinstance(controller, diffrax.ConstantStepSize):
+    if not jump_ts or not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         return controller
     return diffrax.ClipStepSizeController(controller, jump_ts=jnp.stack(jump_ts))
 

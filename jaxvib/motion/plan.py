@@ -127,6 +127,15 @@ def require(chosen: object, *kinds: type) -> None:
         raise InputError("stepsize_controller", f"is {quoted(chosen)}; it must be one of: {allowed}")
 
 
+def require_error_estimate(solver: diffrax.AbstractSolver | None, control: object) -> None:
+    """**Raises** `InputError` for a `solver` without an error estimate if the `control` of its steps needs one."""
+    is_given = isinstance(control, diffrax.AbstractStepSizeController)
+    is_given = is_given and not isinstance(control, diffrax.AbstractAdaptiveStepSizeController)
+    if solver is not None and not is_given and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        problem = f"is {type(solver).__name__}, which does not estimate the error of a step"
+        raise InputError("solver", f"{problem}; give another solver such as diffrax.Dopri5(), or equal steps")
+
+
 @dataclass(frozen=True)
 class RunPlan:
     """Plan of a run.
@@ -186,6 +195,8 @@ def plan_run(
     fastest, slowest = map(numpy_of_known, frequency_bounds(scene))
     stiff = stiff_solver(scene, state, fastest) if solver is None and known else None
     control = _step_control(end, steps, estimate)
+    if not (isinstance(control, StepControl) and control.tolerance is None):
+        require_error_estimate(solver, control)
     if samples is None:
         samples = _enough_samples(speed, end)
     else:

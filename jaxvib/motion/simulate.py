@@ -295,20 +295,23 @@ def _compare_runs(
     **Arguments**: `earlier_evaluations`: number of evaluations of the earlier runs.
     """
     coarse_states, evaluation_counts = (coarse.window.state, coarse.status), (fine.evaluations, earlier_evaluations)
+    solver = plan.integration.solver
+    order = 8 if solver is None else solver.order(None) or 1
     error, evaluations = _estimate_error(
-        plan.scene, plan.fastest, fine.window, fine.steps, *coarse_states, control, coarser, evaluation_counts
+        plan.scene, plan.fastest, fine.window, fine.steps, *coarse_states, control, coarser, evaluation_counts, order
     )
     return dataclasses.replace(fine, error=error, evaluations=evaluations)
 
 
-def _error_share(fine: StepControl, coarse: StepControl) -> Array | np.ndarray:
+def _error_share(fine: StepControl, coarse: StepControl, order: int) -> Array | np.ndarray:
     """Return the error of the finer of two runs of a smooth motion, as a share of the difference between both runs.
 
     With a method of order 8 the error falls with the power 8/9 of the tolerance and the power 8 of the number of steps. The
-    powers used here are 0.45 and 3, which makes the estimate conservative.
+    powers used here are 0.45 and 3, which makes the estimate conservative. With a method of an `order` p up to 3 and r times as
+    many steps, the share is 1/(r^p - 1).
     """
     if fine.steps is not None and coarse.steps is not None:
-        return (coarse.steps / fine.steps) ** 3
+        return 1.0 / ((fine.steps / coarse.steps) ** order - 1.0) if order <= 3 else (coarse.steps / fine.steps) ** 3
     assert fine.tolerance is not None and coarse.tolerance is not None
     return (fine.tolerance / coarse.tolerance) ** 0.45
 
@@ -324,11 +327,12 @@ def _estimate_error(
     control: StepControl,
     coarser: StepControl,
     evaluations: tuple[Array, Array | np.ndarray],
+    order: int,
 ) -> tuple[Array, Array]:
     """Return the estimated error of a run, and the sum of the `evaluations`.
 
     **Arguments**: `window` of the run; `coarse_states` of the window and `status` of a run with larger steps; `fastest`: see
-    `frequency_bounds`.
+    `frequency_bounds`; `order` of the method.
     """
     # The error is unknown if the second run failed, or if it has the same steps.
     is_known = status == RunStatus.done
@@ -338,7 +342,9 @@ def _estimate_error(
     coarse_states = with_nearest_turns(coarse_states, states) if angle_wrapping(scene, window.time.dtype)[0] else coarse_states
     difference = scaled_error(states, coarse_states, error_scale(states, natural_units(scene)))
     radians, ends_at_jumps = fastest * window.time[-1], control.steps is None
-    error = estimated_error(difference, _error_share(control, coarser), scene, steps, radians, ends_at_jumps=ends_at_jumps)
+    error = estimated_error(
+        difference, _error_share(control, coarser, order), scene, steps, radians, ends_at_jumps=ends_at_jumps
+    )
     return jnp.where(is_known & jnp.isfinite(error), error, jnp.inf), evaluations[0] + evaluations[1]
 
 

@@ -1,5 +1,6 @@
 """Steps, estimates of the error and the accuracy asked for."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from scenes import published, scene, some_state
 
 import jaxvib as jv
-from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error
+from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
 
 
 def test_equal_steps_are_of_order_8():
@@ -57,6 +58,16 @@ def test_the_estimate_is_slightly_above_the_error():
         assert bool(run.status == jv.RunStatus.done) and apart(run) <= float(run.error) <= accuracy
         before = int(run.evaluations) - 13 * int(run.steps)  # of the runs to larger tolerances, each with fewer steps
         assert 13 * int(run.steps) // 3 < before and before % 13 == 0
+
+
+def test_estimate_knows_the_order_of_the_method():
+    """The error of Euler's method halves for twice the number of steps, so that it equals the difference of both runs."""
+    s = scene("one_mass", "rollers", speed=60.0)
+    many = dict(solver=diffrax.Euler(), save="window", max_steps=2**20)
+    run, best = (jv.simulate(s, 0.2, **many, stepsize_controller=jv.EqualSteps(n)) for n in (1000, 100_000))
+    scale = error_scale(run.window.state, natural_units(s))
+    error = float(scaled_error(run.window.state, best.window.state, scale))
+    assert 0.9 * error < float(run.error) < 1.2 * error
 
 
 def test_an_accuracy_missed_at_first_is_not_overshot():

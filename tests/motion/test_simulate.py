@@ -14,7 +14,7 @@ from scenes import published, scene, some_state
 from small_machine import small_machine, small_run, small_start
 
 import jaxvib as jv
-from jaxvib.motion.integrate import StepControl, effects_rate, frequency_bounds, integrate
+from jaxvib.motion.integrate import StepControl, effects_rate, frequency_bounds, integrate, on_jumps
 from jaxvib.motion.plan import _enough_samples, _sample_size, _step_control, enough_steps
 from jaxvib.motion.simulate import _error_share
 from jaxvib.ode.dopri8_loop import LoopDopri8
@@ -40,6 +40,10 @@ from jaxvib.ode.dopri8_loop import LoopDopri8
         (dict(samples=1), "samples is 1; it must be a whole number, at least 2"),
         (dict(window_periods=0), "window_periods is 0"),
         (dict(max_steps=0), "max_steps is 0"),
+        (
+            dict(solver=diffrax.Euler()),
+            "solver is Euler, which does not estimate the error of a step; give another solver such as diffrax.Dopri5(), or",
+        ),
     ],
 )
 def test_wrong_arguments_raise_clear_errors(arguments, sentence):
@@ -135,8 +139,16 @@ def test_default_tolerance_depends_on_the_precision():
 def test_estimate_assumes_less_than_order_8():
     """An eighth is left where steps are half as long, 100^-0.45 where the tolerance is a hundredth."""
     equal, adaptive = ((lambda n: StepControl(steps=jnp.asarray(n))), (lambda x: StepControl(tolerance=jnp.asarray(x))))
-    np.testing.assert_allclose(_error_share(equal(200.0), equal(100.0)), 0.125, rtol=1e-12)
-    np.testing.assert_allclose(_error_share(adaptive(1e-8), adaptive(1e-6)), 100.0**-0.45, rtol=1e-12)
+    np.testing.assert_allclose(_error_share(equal(200.0), equal(100.0), 8), 0.125, rtol=1e-12)
+    np.testing.assert_allclose(_error_share(equal(200.0), equal(100.0), 2), 1.0 / 3.0, rtol=1e-12)
+    np.testing.assert_allclose(_error_share(adaptive(1e-8), adaptive(1e-6), 8), 100.0**-0.45, rtol=1e-12)
+
+
+def test_given_steps_are_not_moved_to_jumps():
+    run_up = eqx.tree_at(lambda s: s.exciters[0].drive, scene(), jv.RunUp(60.0, acceleration=40.0))
+    for given in (diffrax.StepTo(jnp.asarray([0.0, 1.0])), diffrax.ConstantStepSize()):
+        assert on_jumps(run_up, given) is given
+    assert isinstance(on_jumps(run_up, diffrax.PIDController(1e-6, 1e-6)), diffrax.ClipStepSizeController)
 
 
 def test_a_comparison_run_is_not_measured(monkeypatch):

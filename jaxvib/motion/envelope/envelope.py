@@ -40,7 +40,7 @@ from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.analysis.separation import MIN_SEPARATION_GROWTH, nearly_coincident_pairs
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite, on_jumps
-from jaxvib.motion.plan import Tolerance, require
+from jaxvib.motion.plan import Tolerance, require, require_error_estimate
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.motion.start import Start, initial_state, start_state, with_spin_up_drive
 from jaxvib.numerics.linalg import magnitude
@@ -206,6 +206,7 @@ def envelope(
     count(window_periods, "window_periods")
     chosen = Tolerance(1e-4) if stepsize_controller is None else stepsize_controller
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)
+    require_error_estimate(solver, chosen)
     if isinstance(chosen, Tolerance):
         chosen = np.asarray(validate_tolerance(chosen.tolerance, "tolerance", end.dtype, 10.0), end.dtype)
     given_scene, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
