@@ -345,7 +345,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         displacement = displacement[last_periods(np.asarray(self.window.time), displacement)]
         named = {"axis of the loads": mount.rows[0]}
         if not mount.at_one_point:
-            stations = sorted({float(s) for s in mount.distances(self.scene.loads.count)})
+            stations = sorted({float(s) for s in mount.distances(self.window.state.azimuth.shape[1])})
             named = {f"axis at {1e3 * s:+.4g} mm": machine.rows_at(jnp.asarray(s)) for s in stations}
         paths = {name: tuple((displacement @ np.asarray(rows).T).T) for name, rows in named.items()}
         return path_chart({name: (path[0], path[1]) for name, path in paths.items()}, ax=ax)

@@ -230,6 +230,15 @@ def test_the_path_of_a_rotors_axis(run):
     assert axis.get_aspect() == 1.0 and (axis.get_xlabel(), axis.get_ylabel()) == ("horizontal, mm", "vertical, mm")
 
 
+def test_a_clockwise_rotor_has_a_path_for_each_station(run):
+    bearings = dict(stiffness=(6e5, 6e5), damping=(400.0, 400.0), position=(-0.2, 0.2))
+    rotor = jv.rotor(mass=37.0, transverse_inertia=0.5, polar_inertia=0.1, stations=(-0.1, 0.3), **bearings)
+    scene = jv.Scene(rotor, exciters=[jv.Exciter(SCENE.loads, SCENE.drive, direction=-1)])
+    moved = np.tile(np.asarray(run.window.state.displacement), (1, 4))
+    turned = eqx.tree_at(lambda r: (r.scene, r.window.state.displacement), run, (scene, moved))
+    assert len(turned.plot_path().axes[0].lines) == 2
+
+
 def test_sketches_of_all_machines_have_one_scale():
     """Inches to a unit of the drawing, from machines of different height with titles of equal length."""
     heights, spans = [], []
