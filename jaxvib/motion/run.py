@@ -155,9 +155,12 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def largest_force(self) -> Array:
-        """Largest force on the foundation during the run, N, among the stored states; for two directions the root of the sum of
-        the squares of both peaks, as for `foundation_force`."""
-        return jnp.sqrt(jnp.sum(jnp.max(self._stored.foundation_force**2, axis=0)))
+        """Largest magnitude of the force on the foundation during the run, N, among the stored states.
+
+        In two directions this is the largest length of the vector, not the root of the sum of both squared peaks, which is
+        `foundation_force`.
+        """
+        return jnp.sqrt(jnp.max(jnp.sum(self._stored.foundation_force**2, axis=1)))
 
     @property
     def _stored(self) -> Trajectory:

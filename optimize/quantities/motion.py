@@ -50,9 +50,7 @@ def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
 
 
 def _peak(evaluation: Evaluation, tier: Tier, until: float, spin_up: float | None) -> Array:
-    trajectory = evaluation.start_up(until, spin_up).trajectory
-    assert trajectory is not None
-    return jnp.sqrt(jnp.max(jnp.sum(trajectory.foundation_force**2, axis=1)))
+    return evaluation.start_up(until, spin_up).largest_force
 
 
 @validated
