@@ -270,9 +270,11 @@ def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs:
 def _with_reduced_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
     """Return the run with the sampling rate that its highest frequency needs if it is long, otherwise the same run.
 
-    The natural frequencies are increased by a margin, because they are computed with the first values of the unknowns.
+    The natural frequencies are increased by a margin, because they are computed with the first values of the unknowns. Contacts
+    with a stop change accelerations faster than that.
     """
-    if max(time.size for time in run.times.values()) < MIN_SAMPLES:
+    has_stops = any(isinstance(effect, Stop) for effect in scene.effects)
+    if has_stops or max(time.size for time in run.times.values()) < MIN_SAMPLES:
         return run
     measured = run.rotor_speed()
     if measured is not None:

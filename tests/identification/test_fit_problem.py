@@ -143,6 +143,15 @@ def test_long_records_are_in_stretches():
     assert found.runs[0].readings.shape[1] <= 4096
 
 
+def test_long_records_of_stops_keep_their_rate():
+    t = 0.001 * np.arange(16400)
+    run = run_with({"a": np.sin(20.0 * t)}, {"a": t})
+    scene = scene_of()
+    on_stop = jv.Scene(scene.machine, exciters=scene.exciters, effects=jv.Stop(3e5, gap=1e-3))
+    sizes = [build_problem(each, [run], ["machine.stiffness"], {}).times[0].size for each in (scene, on_stop)]
+    assert sizes[0] < 4100 and sizes[1] == 16400
+
+
 def test_uneven_and_short_runs_are_refused():
     late = T + np.where(np.arange(400) > 200, 0.0003, 0.0)
     run = run_with({"a": np.sin(T), "b": np.sin(T)}, {"a": T, "b": late})
