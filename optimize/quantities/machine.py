@@ -115,7 +115,7 @@ def _product(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
 
 
 def total_mass() -> Quantity:
-    """Return the mass of the platforms and the loads, kg.
+    """Return the mass of the platforms, the loads and the unbalances with an `unbalance_mass`, kg.
 
     **Returns** `Quantity`; typical: 50 to 5000 kg. A machine without platforms raises `InputError` when the quantity is
     computed.
@@ -128,9 +128,8 @@ def total_mass() -> Quantity:
 
 
 def _mass(evaluation: Evaluation, tier: Tier) -> Array:
-    scene = evaluation.scene
-    machine = require_platforms(scene, "the mass")
-    return jnp.sum(machine.mass) + jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,)))
+    require_platforms(evaluation.scene, "the mass")
+    return jnp.trace(evaluation.model.mass)
 
 
 @validated

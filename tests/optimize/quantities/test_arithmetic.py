@@ -226,3 +226,10 @@ def test_ratios_with_a_speed_count_revolutions(text):
 def test_arithmetic_keeps_the_platforms_of_a_phase():
     for made in (phase(mode=3, of=(2, 1)), -phase(mode=3, of=(2, 1)), 2.0 * phase(mode=3, of=(2, 1))):
         assert made.of == (2, 1)
+
+
+def test_total_mass_includes_the_mass_of_unbalances():
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    turning = dict(unbalance=0.5, drive=jv.ConstantSpeed(60.0))
+    heavy = jv.Scene(machine, exciters=[jv.Exciter(unbalance_mass=10.0, **turning), jv.Exciter(**turning)])
+    np.testing.assert_allclose(total_mass()(heavy), 60.0)
