@@ -236,7 +236,8 @@ def test_a_clockwise_rotor_has_a_path_for_each_station(run):
     scene = jv.Scene(rotor, exciters=[jv.Exciter(SCENE.loads, SCENE.drive, direction=-1)])
     moved = np.tile(np.asarray(run.window.state.displacement), (1, 4))
     turned = eqx.tree_at(lambda r: (r.scene, r.window.state.displacement), run, (scene, moved))
-    assert len(turned.plot_path().axes[0].lines) == 2
+    names = [text.get_text() for text in turned.plot_path().axes[0].get_legend().get_texts()]
+    assert [name for name in names if name.startswith("axis at")] == ["axis at -100 mm", "axis at +300 mm"]
 
 
 def test_sketches_of_all_machines_have_one_scale():
