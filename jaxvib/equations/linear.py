@@ -173,6 +173,11 @@ class ExcitedModel(LinearModel):
         """Return `force_direction`."""
         return self.force_direction
 
+    @property
+    def extra_peaks(self) -> int:
+        """Largest number of peaks of the branch in addition to those of the resonances."""
+        return 0
+
     def force(self, omega: Array) -> Array:
         """Return the amplitudes (nd,), N, of the force on the coordinates at the speed `omega` of the masses."""
         return self.unbalance * omega**2 * self.force_direction

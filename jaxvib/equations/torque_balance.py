@@ -184,6 +184,11 @@ class UnbalancedModel(ExcitedModel):
             return None
         return self.shaft.speed * (1.0 - float(jnp.finfo(self.mass.dtype).eps) ** 0.5)
 
+    @property
+    def extra_peaks(self) -> int:
+        """Number of dips of the motors' torques."""
+        return sum(drive.dips for drive in self.balance.averaged.drives if isinstance(drive, Motor))
+
     def motor_torque(self, omega: Array) -> Array:
         """Return the sum of the torques of all motors at the speed `omega`, N m, at least a tiny positive value."""
         total = jnp.sum(self.balance.driving_torque(omega))

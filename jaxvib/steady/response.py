@@ -114,7 +114,8 @@ class OperatingPoints(AbstractResponse):
 class TorqueFolds(Readable):
     """Folds: speeds at which `torque_share` is a maximum (at a resonance) or a minimum (beyond it).
 
-    **Attributes** (2 nd,), ascending in `speed`; entries whose `exists` is False are NaN
+    **Attributes** (2 nd,), for a `TorqueTable` with n points up to n - 2 more (at most 8), ascending in `speed`; entries whose
+    `exists` is False are NaN
 
     - `speed`, rad/s
     - `factor`: `torque_share` at the fold. With a motor of `factor` times the torque, two operating points merge here. At a

@@ -191,6 +191,24 @@ def test_operating_points_and_folds_are_scipys():
         np.testing.assert_allclose(found.folds.lands_at[fold], lands, rtol=1e-7)
 
 
+def test_operating_points_at_a_dip_of_the_torque_are_scipys():
+    """The resonance at 30 rad/s and the dip at 90 rad/s can both catch the motor, which has one coordinate to shake."""
+    dip = jv.TorqueTable([0.0, 80.0, 90.0, 100.0, 150.0, 157.0], [0.8, 0.8, 0.013, 0.8, 0.8, 0.0], inertia=0.1)
+    machine = jv.one_mass(mass=MASS, stiffness=MASS * 30.0**2, damping=DAMPER)
+    found = jv.response(jv.Scene(machine, exciters=[jv.Exciter(drive=dip, unbalance=S)]), SPEEDS)
+
+    def gap(w):
+        size = S * w**2 / np.abs(MASS * (30.0**2 - w**2) + 1j * w * DAMPER)
+        return DAMPER * w * size**2 / 2.0 - np.interp(w, dip.speeds, dip.torques)
+
+    brackets = ((25.0, 30.0), (30.1, 40.0), (80.0, 90.0), (90.0, 95.0), (120.0, 157.0))
+    roots = [scipy.optimize.brentq(gap, *each, xtol=1e-12) for each in brackets]
+    there = np.asarray(found.operating.exists)
+    np.testing.assert_allclose(found.operating.speed[there], roots, rtol=1e-9)
+    assert found.operating.stable[there].tolist() == [True, False, True, False, True]
+    np.testing.assert_allclose(found.folds.lands_at[0], 90.0, atol=0.5)  # from the resonance into the dip
+
+
 def test_operating_points_are_the_regimes_of_one_exciter():
     drive = jv.InductionMotor("1000 rpm", breakdown_torque=1.2, breakdown_slip=0.3, inertia=0.5)
     scene = body([jv.Exciter(drive=drive, unbalance=0.4, at=(0.1, 0.3))])

@@ -15,6 +15,9 @@ from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number, Numbers
 from jaxvib.units.known import require_if_known, when_known
 
+_MAX_DIPS = 4
+"""Largest number of dips of a torque table that a response includes. Each takes as much time as another coordinate."""
+
 
 class TorqueTable(Motor):
     """Motor, switched on at t = 0, with a measured or catalogued torque as a function of its speed.
@@ -60,6 +63,11 @@ class TorqueTable(Motor):
         is_zero = (torque > 0.0) & (after <= 0.0)  # within the segment
         share = torque / jnp.where(is_zero, torque - after, 1.0)
         return jnp.max(jnp.where(is_zero, self.speeds[:-1] + jnp.diff(self.speeds) * share, 0.0))
+
+    @property
+    def dips(self) -> int:
+        """Number of dips: each needs two points between the first and the last."""
+        return min((self.speeds.shape[0] - 2) // 2, _MAX_DIPS)
 
     def torque(self, speed: Array) -> Array:
         """Return the torque by linear interpolation between the points, and extrapolation beyond them."""

@@ -255,6 +255,11 @@ class Motor(Drive):
     def torque(self, speed: Array) -> Array:
         """Return the steady torque T at the rotor's `speed` (rad/s), N m."""
 
+    @property
+    def dips(self) -> int:
+        """Largest number of dips of the torque below the no-load speed that `response` includes."""
+        return 0
+
     def starting_torque(self) -> Array | None:
         """Return the torque at rest when a run begins, N m; None if it changes afterwards, such as that of a converter."""
         zero = jnp.zeros_like(self.speed)
@@ -493,6 +498,11 @@ class MotorWrapper(Motor):
     def inertia(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Inertia of the motor's rotor."""
         return self.motor.inertia
+
+    @property
+    def dips(self) -> int:
+        """Number of dips of the motor's torque."""
+        return self.motor.dips
 
     def state_units(self) -> tuple[Array, ...]:
         """Return the typical magnitudes of the states of the motor."""

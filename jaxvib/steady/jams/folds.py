@@ -199,8 +199,8 @@ def branch_root(
 
 
 class Pieces(NamedTuple):
-    """Monotone pieces of a branch: load speeds and rotor speeds at their ends and mode numbers, (2 nd + 1,) each; resonances
-    and folds."""
+    """Monotone pieces of a branch: load speeds and rotor speeds at their ends and mode numbers, (2 nd + 1,) each, two more for
+    each extra peak; resonances and folds."""
 
     low: Array
     high: Array
@@ -217,10 +217,10 @@ def branch_pieces(model: ExcitedModel) -> Pieces:
     grid, resonances = fold_points(model, _GRID_POINTS)
     highest = frozen.highest_speed
     grid = grid if highest is None else jnp.minimum(grid, highest)
-    nd = resonances.shape[0]
-    grid, slopes = _with_close_folds(partial(scanned_slopes, frozen), grid, 2 * nd)
+    fold_count = 2 * (resonances.shape[0] + model.extra_peaks)
+    grid, slopes = _with_close_folds(partial(scanned_slopes, frozen), grid, fold_count)
     falling = slopes < 0.0
-    change = _first_places(falling[1:] != falling[:-1], 4 * nd, grid.shape[0] - 1)
+    change = _first_places(falling[1:] != falling[:-1], 2 * fold_count, grid.shape[0] - 1)
     exists = change < grid.shape[0] - 1
     change = jnp.minimum(change, grid.shape[0] - 2)
     ends = (grid[change], grid[change + 1], (slopes[change], slopes[change + 1]))
@@ -229,7 +229,7 @@ def branch_pieces(model: ExcitedModel) -> Pieces:
     speed = partial(rotor_speed_at, model) if model.modal is None else partial(scanned_speed, frozen)
     speeds = jax.vmap(speed)(jnp.concatenate([omega, end]))
     speeds, speed_end = speeds[:-1], jax.lax.stop_gradient(speeds[-1:])
-    main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(exists), 2 * nd)
+    main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(exists), fold_count)
     omega, speeds, exists = omega[main], speeds[main], exists[main]
     if model.modal is not None:  # again, with derivatives with respect to parameters
         speeds = jax.vmap(partial(_fold_speed, model))(omega)
