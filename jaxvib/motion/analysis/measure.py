@@ -117,7 +117,8 @@ class AbstractMeasured(Readable):
         exciters = zip(scene.exciters, rotor_speeds, strict=True)
         rotors = [speeds[-1] for exciter, speeds in exciters if exciter.loads is not None]
         rotor = f", {'rotor' if len(rotors) == 1 else 'rotors'} at {speed_text(rotors, 6)}" if rotors else ""
-        each = speed_text(self.load_speed, 6)
+        clockwise = np.any(np.asarray([exciter.direction for exciter in scene.exciters]) < 0)
+        each = speed_text(self.load_speed, 6) + ("; negative: clockwise" if clockwise else "")
         return f"{turning_masses(scene)} turn at {speed_text(self.omega, 6)} (each: {each}){rotor}"
 
 

@@ -347,8 +347,9 @@ def test_summary_of_a_run():
     assert lines[0] == "the averaged run reached its end: 5 s, 31 steps (4 rejected), settled (drift 1.0e-04)"
     assert lines[1] == "  loads turn at 600 rpm (each: 570, 630 rpm), rotor at 572.958 rpm"
     assert lines[2] == "  amplitude, zero to peak: y1 1 mm; foundation force 40 N"
-    assert lines[3].startswith("  y1: stroke 2 mm peak to peak, ") and lines[4].startswith("  support 1: ")
-    assert lines[-1] == "  averaged: relative error of the order of 2.0e-03" and len(lines) == 8
+    assert lines[3].startswith("  y1: stroke 2 mm peak to peak, ") and lines[5].startswith("  support 1: ")
+    assert lines[4].startswith("  static deflection, down: y1 ")
+    assert lines[-1] == "  averaged: relative error of the order of 2.0e-03" and len(lines) == 9
     grown = eqx.tree_at(lambda run: run.amplitude, run_of("not_finite"), jnp.array([jnp.nan]))
     assert len(grown.summary().splitlines()) == 4
     assert "steps (4 rejected), not settled: run longer (drift 2.0e-03)" in run_of(drift=2e-3).summary()

@@ -56,7 +56,7 @@ def test_a_run_of_two_motors_obeys_the_equations_by_hand():
     turned = [np.ptp(angle) / (run.window.time[-1] - run.window.time[0]) for angle in run.window.rotor_angles]
     np.testing.assert_allclose(np.abs(run.load_speed), turned, rtol=0.05)
     speeds = ", ".join(f"{float(speed) * 30.0 / np.pi:.6g}" for speed in run.load_speed)
-    assert f"(each: {speeds} rpm)\n" in run.summary() and "rotor" not in run.summary()
+    assert f"(each: {speeds} rpm; negative: clockwise)\n" in run.summary() and "rotor" not in run.summary()
     assert run.load_speed[0] > 0.0 > run.load_speed[1]
 
 
