@@ -55,12 +55,23 @@ def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     linear = linear_at(weighted._replace(runs=begins), x, project(weighted, x).linear[:2])
     guides = [jnp.asarray(_guide(weighted, r, x, linear)) for r in range(len(problem.runs))]
     runs = tuple(dataclasses.replace(samples, guide=guide) for samples, guide in zip(weighted.runs, guides, strict=True))
-    guided = weighted._replace(runs=runs, linear=linear)
+    guided = weighted._replace(runs=runs, linear=_with_first_states(weighted, x, linear))
     trial, free = minimize(guided, x)[0], minimize(weighted, x)[0]
     trial = minimize(weighted._replace(linear=trial.linear), trial.x)[0]
-    free = project(weighted._replace(linear=free.linear), _with_open_stops(weighted, free.x, free.linear))
+    of_free = weighted._replace(linear=_with_first_states(weighted, free.x, free.linear))
+    free = project(of_free, _with_open_stops(weighted, free.x, free.linear))
     best = free if free.cost < _SAME_COST * trial.cost else trial
     return problem._replace(linear=best.linear), best.x
+
+
+def _with_first_states(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Return the linear unknowns of a linear response with the displacements of the first states in m. Those of the response
+    are multiplied by a frequency."""
+    first = linear.copy()
+    for samples, place in zip(problem.runs, linear_places(problem), strict=True):
+        states = model_states(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear[place]))
+        first[place[: states.shape[1]]] = states[0]
+    return first
 
 
 def _beginning(samples: Samples) -> Samples:

@@ -18,8 +18,10 @@ import jaxvib as jv
 from jaxvib.equations.dynamics import dynamics_of
 from jaxvib.equations.model import assemble
 from jaxvib.equations.state import State
+from jaxvib.identification.fit import project
 from jaxvib.identification.jammed.motion import _recorded, closed_motion, linearized
 from jaxvib.identification.problem import build_problem
+from jaxvib.identification.supports import start
 from jaxvib.identification.supports.contact import HeldStop, held, switched_step
 from jaxvib.identification.supports.start import _guide
 from jaxvib.ode.dopri8_loop import LoopDopri8
@@ -149,6 +151,25 @@ def test_free_mass_between_stops_is_not_guided():
     problem = build_problem(scene, [run], ["machine.mass"], {})
     guide = _guide(problem, 0, np.zeros(problem.unknowns.count), np.array([0.05, 0.0, 0.0, 0.0, 0.0]))
     np.testing.assert_array_equal(guide, np.zeros((2, 1)))
+
+
+def test_guided_motion_begins_with_the_displacement_of_the_record(monkeypatch):
+    """A free vibration; the linear response has multiples of displacements."""
+    t, given = 0.005 * np.arange(600), []
+    readings = 2e-3 * np.exp(-0.6 * t) * np.cos(np.sqrt(800.0 - 0.36) * t)
+    run = jv.MeasuredRun.from_arrays([jv.Channel("d", "displacement", at=1)], t, {"d": readings})
+    machine, drive = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0), jv.RunUp(60.0, acceleration=3.0)
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=0.05)], effects=jv.Stop(3e5, gap=1.0))
+
+    def minimize(problem, x):
+        trial = project(problem._replace(linear=None), x)
+        given.append(problem.linear)
+        return trial if problem.linear is None else trial._replace(linear=problem.linear), None, None, True
+
+    monkeypatch.setattr(start, "minimize", minimize)
+    found, _ = start.with_guided_motion(build_problem(scene, [run], ["machine.stiffness"], {}))
+    for linear in (given[0], found.linear):
+        np.testing.assert_allclose(linear[2:4], [2e-3, -1.2e-3], rtol=0.02)
 
 
 FACTORS = {"stop[0].gap": 1.2, "stop[0].stiffness": 1.3, "machine.stiffness": 1.1, "machine.damping": 0.67}
