@@ -142,7 +142,7 @@ def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:
     """Return a matrix, square if `shape` is None; a number stands for a 1 x 1 matrix."""
     try:
         is_complex = np.iscomplexobj(value)
-        matrix = jnp.asarray(value, dtype=None if is_complex else float)
+        matrix = jnp.array(value, dtype=None if is_complex else float)  # a copy: JAX may share the memory of an array of NumPy
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(name, f"is {quoted(value)}; it must be a square array of numbers, in SI units") from error
     if is_complex:

@@ -168,6 +168,16 @@ def test_a_body_may_move_without_a_spring():
     np.testing.assert_allclose(jv.natural_frequencies(jv.Scene(free, BALLS, DRIVE))[0], 0.0, atol=1e-6)
 
 
+def test_a_machine_does_not_share_memory_with_its_matrix():
+    whole = np.zeros(4 + 8)
+    begin = -whole.ctypes.data // 8 % 8  # JAX shares memory that begins at a multiple of 64 bytes
+    stiffness = whole[begin : begin + 4].reshape(2, 2)
+    stiffness[:] = np.eye(2)
+    machine = jv.from_matrices(np.eye(2), np.zeros((2, 2)), stiffness, places=[[0]])
+    stiffness[0, 0] = 7.0
+    assert machine.stiffness[0, 0] == 1.0
+
+
 def test_a_chain_without_support_is_read_in_single_precision():
     with jax.enable_x64(False):
         for seed in range(5):
