@@ -68,7 +68,13 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
     units = labels.get("unit", ())
     table: dict[str, np.ndarray] = {}
     for name, axes, values, unit in columns(result):
-        if axes[:1] != (axis,) or values.ndim != len(axes):
+        if values.ndim != len(axes):
+            continue
+        while axes[:1] != (axis,) and values.shape[:1] == (
+            1,
+        ):  # one point of the first axis, such as one segment of a spectrum
+            axes, values = axes[1:], values[0]
+        if axes[:1] != (axis,):
             continue
         for place in np.ndindex(values.shape[1:]):
             places = [_label(labels, a, k, n) for a, k, n in zip(axes[1:], place, values.shape[1:], strict=True)]

@@ -30,6 +30,13 @@ class Readings(eqx.Module):
     version: np.ndarray = eqx.field(metadata=in_unit("", "load"))
 
 
+class Spectra(eqx.Module):
+    """Result with arrays over segments, frequencies and directions."""
+
+    frequency: np.ndarray = eqx.field(metadata=in_unit("rad/s", "frequency"))
+    force: np.ndarray = eqx.field(metadata=in_unit("N", "segment", "frequency", "direction"))
+
+
 def table(result, axis, path, **options):
     text = jv.write_csv(result, axis, path, **options).read_bytes().decode("utf-8")
     assert "\r" not in text and text.endswith("\n")
@@ -63,6 +70,15 @@ def test_real_and_imaginary_part_have_one_display_unit(tmp_path):
     assert columns["real amplitude (mm)"].tolist() == ["10", "0.002"]
     assert columns["imaginary amplitude (mm)"].tolist() == ["20", "-0.001"]
     assert columns["mass (g)"].tolist() == ["500", "250"]
+
+
+@pytest.mark.parametrize(("segments", "forces"), [(1, ["force 1 (N)", "force 2 (N)"]), (2, [])])
+def test_table_of_one_segment_has_its_spectrum(segments, forces, tmp_path):
+    spectra = Spectra(np.arange(3.0), np.arange(segments * 6.0).reshape(segments, 3, 2))
+    columns = table(spectra, "frequency", tmp_path / "spectra.csv")
+    assert list(columns) == ["frequency (rad/s)", *forces]
+    if segments == 1:
+        np.testing.assert_array_equal(columns["force 2 (N)"].astype(float), [1.0, 3.0, 5.0])
 
 
 def test_equal_entries_have_separate_rows(tmp_path):
