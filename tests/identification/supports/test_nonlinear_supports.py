@@ -169,7 +169,7 @@ def test_guided_motion_begins_with_the_displacement_of_the_record(monkeypatch):
     monkeypatch.setattr(start, "minimize", minimize)
     found, _ = start.with_guided_motion(build_problem(scene, [run], ["machine.stiffness"], {}))
     for linear in (given[0], found.linear):
-        np.testing.assert_allclose(linear[2:4], [2e-3, -1.2e-3], rtol=0.02)
+        np.testing.assert_allclose(linear[2:4], [2e-3, -1.2e-3], atol=5e-5)  # velocities up to 0.06 m/s
 
 
 FACTORS = {"stop[0].gap": 1.2, "stop[0].stiffness": 1.3, "machine.stiffness": 1.1, "machine.damping": 0.67}
