@@ -194,10 +194,13 @@ def _read_rows(place: Any, name: str, size: int) -> Array:
     """Return the matrix that gives the displacement of a place, from the indices of its coordinates or from a matrix."""
     shape = _shape_of(place)
     if len(shape) == 1 and all(is_real(each) and float(each).is_integer() for each in place):
-        wrong = [int(each) for each in place if not 0 <= each < size]
-        if wrong or not 1 <= len(place) <= 3:
+        chosen = [int(each) for each in place]
+        if not all(0 <= each < size for each in chosen) or not 1 <= len(chosen) <= 3:
             raise InputError(name, f"is {quoted(list(place))}; give 1 to 3 coordinates, 0 to {size - 1}")
-        return jnp.asarray(np.eye(size)[[int(each) for each in place]], dtype=float)
+        if len(set(chosen)) < len(chosen):
+            problem = f"is {quoted(list(place))}, which names a coordinate twice; a row of numbers is written [{list(place)}]"
+            raise InputError(name, problem)
+        return jnp.asarray(np.eye(size)[chosen], dtype=float)
     number = shape[0] if len(shape) == 2 else 0
     if not 1 <= number <= 3:
         raise InputError(name, f"is {quoted(place)}; give 1 to 3 indices of coordinates, or 1 to 3 rows of {size} numbers")

@@ -211,6 +211,10 @@ def test_a_chain_without_support_is_read_in_single_precision():
         (lambda: jv.from_matrices(ONE, ONE, (1 + 0.1j) * ONE, places=[[0]]), "machine.stiffness is complex; a real one"),
         (lambda: jv.from_matrices(ONE, ONE, ONE, ONE, places=[[0]]), "machine.gyroscopic is not skew-symmetric"),
         (
+            lambda: jv.from_matrices(ONE, ONE, ONE, places=[[0, 0]]),
+            r"machine.places\[0\] is \[0, 0\], which names .* \[\[0, 0\]\]",
+        ),
+        (
             lambda: jv.from_matrices(ONE, ONE, ONE, places=[[[1], [0, 1]]]),
             r"machine.places\[0\] is \[\[1\], \[0, 1\]\]; give 1 to 3 indices",
         ),
