@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import is_whole, validated
 from jaxvib.display import speed_text
 from jaxvib.equations.torque_balance import UnbalancedModel, unbalanced_model
 from jaxvib.errors import InputError, quoted
@@ -65,7 +65,9 @@ def _response_quantity(
         speeds = number_in(between[0], "rad/s", "between[0]"), number_in(between[1], "rad/s", "between[1]")
         text = f"largest {text} from {speed_text(list(speeds), between=' to ')}"
     if speeds is not None and not 0.0 < speeds[0] <= speeds[1]:
-        raise InputError("between", f"is {quoted(between or speed)}; speeds must be positive and ascend")
+        if between is None:
+            raise InputError("speed", f"is {quoted(speed)}; it must be positive")
+        raise InputError("between", f"is {quoted(between)}; speeds must be positive and ascend")
     return BuiltinQuantity(
         name, unit, _largest, tiers=("leading",), text=text, settings=(read, speeds, *settings), pieces_function=_pieces
     )
@@ -126,8 +128,8 @@ def _point_settings(at: Any, body: int) -> tuple[object, int]:
         if len(at) != 2:
             raise InputError("at", f"is {quoted(at)}; give a point (x, y) of a body, the number of a platform, or a distance")
         place = tuple(number_in(each, "m", f"at[{k}]") for k, each in enumerate(at))
-    elif at is not None and not isinstance(at, int):
-        place = number_in(at, "m", "at")
+    elif at is not None:
+        place = int(at) if is_whole(at) else number_in(at, "m", "at")
     return place, count(body, "body", low=0)
 
 

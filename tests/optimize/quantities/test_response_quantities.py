@@ -157,6 +157,11 @@ def test_points_of_a_body_and_wrong_scenes():
         jv.InputError, match="scene has an ideal drive; folds of the response exist for one exciter with a motor"
     ):
         fold_distance()(body)
+    with pytest.raises(jv.InputError, match=r"speed is -80\.0; it must be positive"):
+        response_force(speed=-80.0)
+    with pytest.raises(jv.InputError, match="at is True"):
+        response_amplitude(at=True)
+    assert response_amplitude(at=np.int64(1)) == response_amplitude(at=1)
     with pytest.raises(jv.InputError, match="between is given together with speed"):
         response_force(speed=80.0, between=RANGE)
     balls = jv.Scene(
