@@ -132,7 +132,8 @@ class MeasuredRun(Readable):
         **Arguments**
 
         - `channels`: one `Channel` for each recorded quantity
-        - `timeseries`: dictionaries with `data`, `name`, `unit_str`, and `fs` (Hz) or `time` (s)
+        - `timeseries`: dictionaries with `data`, `name`, `unit_str`, and `fs` (Hz) or `time` (s); for kind "pulses" the sampled
+          signal, or the numbers of pulses at their times, as `to_sep005` returns them
         - `change` and `source` as for `from_arrays`
 
         **Returns** `MeasuredRun`. **Raises** `InputError` for a missing entry, and for samples that cannot be used.
@@ -144,6 +145,9 @@ class MeasuredRun(Readable):
         ('m/s^2', 9.807)
         """
         times, values = described_channels(recorded_from_sep005(timeseries, source), channels, source)
+        for channel in channels:  # numbers of pulses ascend, a sampled signal does not
+            if channel.kind == "pulses" and np.all(np.diff(values[channel.name]) > 0.0):
+                del values[channel.name]
         return cls.from_arrays(channels, times, values, change, source)
 
     def to_sep005(self) -> list[dict[str, Any]]:

@@ -133,6 +133,10 @@ def test_runs_go_through_dictionaries_and_back():
     assert late["time"] == pytest.approx(T.tolist()) and late["fs"] == pytest.approx(10.0) and "quantity" not in late
     assert len(tacho["time"]) == len(tacho["data"]) >= 19 and "fs" not in tacho and tacho["unit_str"] == ""
     assert run.span == (0.0, pytest.approx(max(T[-1], run.times["tacho"][-1]))) and run.rate("late") == pytest.approx(10.0)
+    back = MeasuredRun.from_sep005(channels, run.to_sep005())
+    for parts in ("times", "values"):
+        for name in ("frame", "late", "tacho"):
+            np.testing.assert_allclose(getattr(back, parts)[name], getattr(run, parts)[name], rtol=1e-12, atol=1e-12)
     times, speed = run.rotor_speed()  # pulses before speeds
     np.testing.assert_allclose(speed, 2.0 * np.pi / 0.3, rtol=1e-9)
     assert [each.name for each in run.of_kind("pulses", "speed")] == ["late", "tacho"] and len(times) == 19
