@@ -104,8 +104,9 @@ class NamedNumber(NamedTuple):
         leaf, each = self.leaf(scene), self.spec.each
         words = self._numbered(scene, self.spec.words.format(load=load))
         if self.path[0] == "exciters" and len(scene.exciters) > 1:
-            number = 1 + int(self.path[1])
-            return [f"{word} (exciter {number})" for word in self._words_of_entries(scene, words, leaf, load, each)]
+            named = f"exciter {1 + int(self.path[1])}"
+            found = self._words_of_entries(scene, words, leaf, load, each)
+            return [word.replace("the exciter", named) if "the exciter" in word else f"{word} ({named})" for word in found]
         return self._words_of_entries(scene, words, leaf, load, each)
 
     def _words_of_entries(self, scene: Scene, words: str, leaf: Array, load: str, each: str) -> list[str]:
@@ -121,7 +122,7 @@ class NamedNumber(NamedTuple):
         if np.shape(leaf) == (2,) and self.spec.unit == "m":
             return [f"{'xy'[k]} of the {words}" for k in which]
         if several and self._is_of_support:
-            return [f"{words}, direction {k + 1}" for k in which]
+            return [f"{words} {('across', 'along')[k]} its axis" for k in which]
         return [f"{words} {k + 1}" if several else words for k in which]
 
     @property
