@@ -115,13 +115,18 @@ class MachineFit(Result):
 
         **Arguments**: `quantity`: a function of a scene, such as `lambda scene: jv.natural_frequencies(scene)[0]`.
 
-        **Returns** an `Estimate`; its interval is unbounded if the quantity changes along an undetermined direction.
+        **Returns** an `Estimate`; its interval is unbounded if the quantity changes along an undetermined direction. **Raises**
+        `InputError` if the function does not return one number.
         """
         axes = np.array([each.weights for each in self.undetermined]).reshape(-1, len(self.names)).T
         errors = np.array([each.error for each in self.undetermined])
 
         def values(scene: Scene) -> np.ndarray:
-            return np.asarray(quantity(scene), float).reshape(1)
+            found = np.asarray(quantity(scene), float)
+            if found.size != 1:
+                problem = f"returns an array of shape {found.shape}; it must return one number, such as its entry [0]"
+                raise InputError("quantity", problem)
+            return found.reshape(1)
 
         return propagate(self.scene, self.names, self.scale, self.covariance, axes, errors, values)[0]
 

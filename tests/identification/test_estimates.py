@@ -102,6 +102,13 @@ def test_value_0_has_an_absolute_error():
     assert found[1] == (0.0, 0.0, 0.0, 0.0)
 
 
+def test_quantity_of_a_fit_is_one_number():
+    parts = {"names": ("machine.stiffness[0]",), "scale": np.array([4e4]), "covariance": np.eye(1)}
+    fit = SimpleNamespace(undetermined=(), scene=scene_of(), **parts)
+    with pytest.raises(jv.InputError, match=r"quantity returns an array of shape \(2,\); it must return one number"):
+        jv.MachineFit.interval_of(fit, lambda scene: scene.machine.stiffness)
+
+
 def problem_of(gains=(), unbalances=(None,), first=(4e4,)):
     number = find_number(scene_of(2), "machine.stiffness[0]", "unknown")
     unknowns = Unknowns((number,), np.array(first), np.array(first), np.array([True]), gains, 0)
