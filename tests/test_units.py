@@ -122,6 +122,16 @@ def test_grad_is_refused_because_it_is_ambiguous(text):
     assert float(number("30 gon", "rad", "angle")) == pytest.approx(0.15 * np.pi)
 
 
+@pytest.mark.parametrize(
+    ("text", "meanings"),
+    [("2 tons", "1000 kg or 907 kg; write t"), ("1.5ton", "1000 kg or"), ("800 gr", "grams or grains; write g")],
+)
+def test_masses_with_several_meanings_are_refused(text, meanings):
+    with pytest.raises(jv.InputError, match=f"^mass is '{text}', which can mean {meanings}"):
+        number(text, "kg", "mass")
+    assert float(number("1.5 metric_ton", "kg", "mass")) == 1500.0
+
+
 @pytest.mark.parametrize("text", ["25 s^-1", "25 1/s", "25 /s", "25 Bq", "25 count/s"])
 def test_a_speed_must_say_what_it_counts(text):
     """Revolutions and radians per second differ by 2 pi, and 1/s is neither."""

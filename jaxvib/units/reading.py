@@ -77,8 +77,13 @@ gram."""
 
 _JOINED_PATTERN = re.compile(rf"(?<![^\W\d_])({'|'.join(_JOINED)})((?:\^|\*\*)\d|[²³])?(?![^\W\d_])")
 
-_GRAD = re.compile(r"(?<![^\W\d_])grad(?![^\W\d_])", re.IGNORECASE)
-"""Degrees in German, gon in mathematics and on calculators; pint would read "Grad" as `gigaradian`."""
+_AMBIGUOUS = (
+    (re.compile(r"(?<![^\W\d_])grad(?![^\W\d_])", re.IGNORECASE), "degrees or gon; write deg or gon"),
+    (re.compile(r"(?<![^\W\d])tons?(?!\w)"), "1000 kg or 907 kg; write t or short_ton"),
+    (re.compile(r"(?<![^\W\d])gr(?!\w)"), "grams or grains; write g or grain"),
+)
+"""Names with several meanings: Grad are degrees in German, gon in mathematics and on calculators; pint would read `gigaradian`,
+the ton of the United States, and grains."""
 
 _FACTORS = {
     "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3},
@@ -174,8 +179,9 @@ def require_real(value: object, unit: str, field: str) -> None:
 
 def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
     """Return the error for a string that is not in `unit`, or for a string without a readable unit if `unit` is None."""
-    if _GRAD.search(value):
-        return InputError(field, f"is {quoted(value)}, which can mean degrees or gon; write deg or gon")
+    for pattern, meanings in _AMBIGUOUS:
+        if pattern.search(value):
+            return InputError(field, f"is {quoted(value)}, which can mean {meanings}")
     wanted = "not a number with a unit" if unit is None else f"not in {unit}" if unit else "not a plain number"
     return InputError(
         field, f"is {quoted(value)}, which is {wanted}; write for example {_example('m' if unit is None else unit)}"
@@ -186,8 +192,8 @@ def _parsed(unit: str) -> Any:
     """Return pint's unit for a string. **Raises** an error of `_UNREADABLE` or of pint for a string that is not a unit."""
     import pint
 
-    if _GRAD.search(unit):
-        raise ValueError("degrees or gon")
+    if any(pattern.search(unit) for pattern, _ in _AMBIGUOUS):
+        raise ValueError("a name with several meanings")
     name = _SPELLINGS.get(unit, unit)
     return pint.get_application_registry().Unit(
         _JOINED_PATTERN.sub(lambda found: f"({_JOINED[found[1]]}{found[2] or ''})", name) or "dimensionless"
