@@ -15,6 +15,7 @@ from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.readable import Readable
+from jaxvib.units.reading import require_real
 
 
 class Spin(Readable):
@@ -164,6 +165,9 @@ def require_state(scene: Scene, state: State, name: str) -> None:
         raise InputError(f"{name}.exciters", f"are {len(state.exciters)}; this scene needs {len(scene.exciters)}")
     for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
         with within(scene.prefix_of(k)):
+            for field in ("angle", "rate", "rotor"):
+                if not isinstance(value := getattr(own, field), tuple) and not (field == "rotor" and value is None):
+                    raise InputError(f"{name}.{field}", f"is {quoted(value)}; it must be a tuple of arrays, (array,)")
             _require_rotor(exciter, own, f"{name}.rotor")
             if (loads := exciter.loads) is not None:
                 count = 1 if loads.circular else len(jax.eval_shape(loads.rest))
@@ -199,6 +203,8 @@ def _require_rotor(exciter: Exciter, state: ExciterState, field: str) -> None:
 
 def _require_shapes(field: str, values: object, shape: tuple[int, ...], count: int = 1) -> None:
     """**Raises** `InputError` unless there are `count` arrays of this `shape`."""
+    for leaf in jax.tree.leaves(values):
+        require_real(leaf, "SI units", field)
     shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(values)]
     wrong = [each for each in shapes if each != shape]
     if wrong:

@@ -51,6 +51,24 @@ def test_a_state_of_another_machine_is_refused():
         jv.initial_state(eqx.tree_at(lambda s: s.drive, published().scene(), jv.SpinUp(3.0, 1.0)), "jam", mode=3)
 
 
+@pytest.mark.parametrize(
+    ("parts", "says"),
+    [
+        (dict(angle=jnp.zeros(1)), r"^start.angle is Array.*; it must be a tuple of arrays, \(array,\)"),
+        (dict(rate=[jnp.zeros(1)]), r"^start.rate is \[Array.*; it must be a tuple of arrays"),
+        (
+            dict(angle=(jnp.zeros(1) + 0j,)),
+            r"^start.angle is Array\(\[0.\+0.j\].*, which is not a number; write a number in SI",
+        ),
+    ],
+)
+def test_states_of_other_types_are_refused(parts, says):
+    s = scene("one_mass", "rollers")
+    state = jv.State(jnp.zeros(1), jnp.zeros(1), **{"angle": (jnp.zeros(1),), "rate": (jnp.zeros(1),), **parts})
+    with pytest.raises(jv.InputError, match=says):
+        jv.simulate(s, 1.0, start=state)
+
+
 def test_touching_loads_start_a_jam_side_by_side():
     """A start in a jam lays touching loads side by side about the jam's angle."""
     s = jv.Scene(
