@@ -52,6 +52,7 @@ _SPELLINGS = {
     **dict.fromkeys(("RPM", "Rpm", "r/min", "U/min", "rev/min"), "rpm"),
     **dict.fromkeys(("cps", "rps", "r/s", "U/s", "rev/s"), "turn/s"),
     "Kg": "kg",
+    "PS": "metric_horsepower",
     "hz": "Hz",
     "HZ": "Hz",
     "khz": "kHz",
@@ -68,6 +69,7 @@ _JOINED = {
     "Nm": "N m",
     "kNm": "kN m",
     "Nmm": "N mm",
+    "Ncm": "N cm",
     "kgm": "kg m",
     "kgmm": "kg mm",
     "kgcm": "kg cm",
@@ -76,6 +78,9 @@ _JOINED = {
 gram."""
 
 _JOINED_PATTERN = re.compile(rf"(?<![^\W\d_])({'|'.join(_JOINED)})((?:\^|\*\*)\d|[²³])?(?![^\W\d_])")
+
+_PLAIN_POWER = re.compile(r"(?<=[^\W\d_])([23])(?!\w)")
+"""Power of a unit without a sign, as in "kg m2"."""
 
 _AMBIGUOUS = (
     (re.compile(r"(?<![^\W\d_])grad(?![^\W\d_])", re.IGNORECASE), "degrees or gon; write deg or gon"),
@@ -194,7 +199,7 @@ def _parsed(unit: str) -> Any:
 
     if any(pattern.search(unit) for pattern, _ in _AMBIGUOUS):
         raise ValueError("a name with several meanings")
-    name = _SPELLINGS.get(unit, unit)
+    name = _PLAIN_POWER.sub(r"^\1", _SPELLINGS.get(unit, unit))
     return pint.get_application_registry().Unit(
         _JOINED_PATTERN.sub(lambda found: f"({_JOINED[found[1]]}{found[2] or ''})", name) or "dimensionless"
     )

@@ -156,7 +156,7 @@ BAD = {
         lambda: jv.Scene(TWO, LOADS, DRIVE, exciters=[jv.Exciter(LOADS, DRIVE)]),
         "are given together with loads or drive",
     ),
-    "point": (lambda: one_on(SCREEN, at=0.5), r"^at is .*0\.5.*; on a body in a plane give \(x, y\)"),
+    "point": (lambda: one_on(SCREEN, at=0.5), r"^at has 1 number; on a body in a plane give \(x, y\)"),
     "position": (lambda: one_on(ROTOR, at=(0.5, 0.25)), r"^at is .*0\.5 *,? *0\.25.*, a point of a body; on a rotor give"),
     "body": (lambda: jv.Exciter(LOADS, DRIVE, body=0.5), r"body is 0.5; it must be a whole number, at least 0"),
     "none": (lambda: jv.Scene(TWO, exciters=[]), r"exciters is \[\]; it must be a list of exciters"),

@@ -170,7 +170,8 @@ class _Bodies(Machine):
             return self._point_rows(jnp.zeros(2, dtype), body)
         size = len(point) if isinstance(point, (list, tuple)) else getattr(point, "size", 1)
         if size != 2:
-            raise InputError(name, f"is {quoted(point)}; on a body in a plane give (x, y), m from its centre of mass")
+            numbers = f"{size} number{'s' * (size != 1)}"
+            raise InputError(name, f"has {numbers}; on a body in a plane give (x, y), m from its centre of mass")
         return self._point_rows(jnp.asarray(point, dtype), body)
 
     def support_rows(self) -> tuple[Array, Array]:
