@@ -14,7 +14,7 @@ from jaxvib.boundary import validated
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, present_numbers, put_numbers, put_present
 from jaxvib.machine.scene import Scene
-from jaxvib.units import Bounds, number, random_numbers
+from jaxvib.units import Bounds, count, number, random_numbers
 from optimize.quantities.cases import Sampled, require_single_tolerances
 from optimize.quantities.quantity import Demand, Quantity
 
@@ -98,6 +98,7 @@ def tolerance_ranges(
     >>> found.share, found.low < found.design < found.high
     (1.0, True)
     """
+    count(samples, "samples", low=2, each=1e4)  # a scene for each machine
     machines = list(_machines(scene, tolerances, samples, seed))
     ranges = []
     for item in quantities:

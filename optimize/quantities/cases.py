@@ -201,9 +201,8 @@ def _robust(
     for name, value in tolerances.items():
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1.0:
             raise InputError(f"tolerances.{name}", f"is {quoted(value)}; it must be between 0 and 1, such as 0.05 for 5 %")
-    case = Sampled(
-        tuple((k, float(v)) for k, v in tolerances.items()), count(samples, "samples", low=2), count(seed, "seed", low=0)
-    )
+    size = count(samples, "samples", low=2, each=64.0 * len(tolerances))
+    case = Sampled(tuple((k, float(v)) for k, v in tolerances.items()), size, count(seed, "seed", low=0))
     words = statistic if statistic != "quantile" else f"{level:.0%} quantile of"
     return Robust(
         f"{words} {quantity.words}",

@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import call_user, validated
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns
@@ -95,9 +95,14 @@ class Quantity:
     def read(self, evaluation: Evaluation) -> Array:
         """Return the value of the quantity, a scalar in `unit`, from an `evaluation` of a scene."""
         assert self.function is not None
-        if count_required_arguments(self.function) == 1:
-            return jnp.reshape(self.function(evaluation.scene), ())
-        return jnp.reshape(self.function(evaluation.scene, evaluation.modes), ())
+        field, arguments = f"quantity {quoted(self.name)}", (evaluation.scene,)
+        if count_required_arguments(self.function) == 2:
+            arguments = (evaluation.scene, evaluation.modes)
+        value = call_user(self.function, field, *arguments)
+        try:
+            return jnp.reshape(value, ())
+        except TypeError as error:
+            raise InputError(field, f"gives {quoted(value)}; it must give one real number") from error
 
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
         """Return smooth values (p,) in `unit` whose maximum is `sign` (1 or -1) times the quantity, from an `evaluation`.

@@ -55,6 +55,16 @@ def test_wrong_tolerances_are_refused(scene, text):
         tolerance_ranges(scene, [static_deflection()], [text], samples=4)
 
 
+@pytest.mark.parametrize("samples", [0, -3, 10**12])
+def test_numbers_of_machines_are_limited(scene, samples):
+    for compute in (
+        tolerance_ranges,
+        lambda *_, samples: expected(static_deflection(), {"machine.mass": 0.1}, samples=samples),
+    ):
+        with pytest.raises(jv.InputError, match=f"samples is {samples}"):
+            compute(scene, [static_deflection()], ["mass=1%"], samples=samples)
+
+
 def test_range_of_an_array_adds_no_spring():
     machine = jv.two_mass(mass=(50.0, 40.0), stiffness=(4e4, 0.0), damping=(0.0, 0.0), link_stiffness=1e5, link_damping=60.0)
     two = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))

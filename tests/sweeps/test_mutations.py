@@ -69,7 +69,7 @@ TABLES = [
     ("function = 3", "function is"),
     ('function = "os:getcwd"', "getcwd"),
     ('function = "sys:exit"', "function <built-in function exit>"),
-    ('function = "operator:index"', "cannot be computed"),
+    ('function = "operator:index"', "cannot be called"),
     ('function = "no_such_module:f"', "cannot be imported"),
     ('function = "math:sqrt"\nmode = 3', "mode is not a field here"),
 ]

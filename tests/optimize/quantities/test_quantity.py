@@ -63,6 +63,12 @@ def test_functions_of_a_scene_and_of_its_jam_modes():
             Quantity("wrong", "", wrong)
 
 
+@pytest.mark.parametrize("value", [None, "3", [1.0], jnp.ones(2)])
+def test_function_that_gives_no_scalar_is_named(value):
+    with pytest.raises(InputError, match=r"quantity 'weight' gives .*; it must give one real number"):
+        Quantity("weight", "kg", lambda scene: value)(SCENE)
+
+
 def test_units_and_names_of_expressions():
     force, arm, time = constant("force", 3.0, "N"), constant("arm", 2.0, "m"), constant("time", 1.0, "s")
     expressions = {
