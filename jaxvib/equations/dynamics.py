@@ -27,6 +27,7 @@ from jaxvib.equations.exciter import (
 from jaxvib.equations.model import Group, Model, assemble, grouped, stack_members, ungroup
 from jaxvib.equations.sliding import ContactSolution
 from jaxvib.equations.state import State
+from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Mount
 from jaxvib.machine.drives.drive import Directed
 from jaxvib.machine.effects.base import Effect, has_term, terms_of
@@ -89,6 +90,9 @@ class Dynamics(eqx.Module):
         equation per row, for any number of platforms and loads. If there are more rows than coordinates, q'' follows from
         (M + P^T W P) q'' = M q''_free - P^T g instead.
         """
+        count = sum(len(group.members) for group in self.groups)
+        if len(state.exciters) != count:
+            raise InputError("state.exciters", f"are {len(state.exciters)}; this scene needs {count}")
         states = [stack_members(group.members, state.exciters) for group in self.groups]
         speeds = self._each(lambda exciter, of_exciter: exciter.drive.rotor_speed(t, of_exciter.rotor), states)
         unforced = self._unforced(state, speeds)

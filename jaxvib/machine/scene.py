@@ -41,8 +41,9 @@ class Exciter(Part):
       typical: 0.1 to 10 kg m. The function `unbalance` computes it from the force that catalogues state
     - `unbalance_mass` m, kg: mass of the unbalance, added to the machine at the exciter's axis; typical: 5 to 200; default: the
       machine's mass includes it
-    - `at`: place on the machine, a platform number, the distance along a rotor's axis from its centre of mass, m (a float or
-      text), or the point (x, y) of a body in a plane, m; None for the default of the machine
+    - `at`: place on the machine: the number of a platform or of a place of `from_matrices`, the distance along a rotor's axis
+      from its centre of mass, m (a float or text), or the point (x, y) of a body in a plane, m; None for the default of the
+      machine
     - `body`: number of the body from 0, on machines with several; typical: 0 (the default)
     - `direction` of rotation: +1 anticlockwise, -1 clockwise. Angles and speeds of a state are anticlockwise in both cases
     - `effects` of the rotor and its loads such as `StaticImbalance` or `DryFriction`

@@ -68,6 +68,9 @@ def test_states_of_other_scenes_are_refused_in_one_sentence(state, says):
     for ask in asked:
         with pytest.raises(jv.InputError, match=says):
             ask()
+    if "exciters are" in says:
+        with pytest.raises(jv.InputError, match=says):
+            jv.vector_field(BOTH)(0.0, state)
     if "displacement" in says:
         with pytest.raises(jv.InputError, match=says):
             jv.foundation_force(BOTH, state)
