@@ -14,7 +14,7 @@ from jaxvib.boundary import validated
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, present_numbers, put_numbers, put_present
 from jaxvib.machine.scene import Scene
-from jaxvib.units import Bounds, count, number, random_numbers
+from jaxvib.units import Bounds, count, number
 from optimize.quantities.cases import Sampled, require_single_tolerances
 from optimize.quantities.quantity import Demand, Quantity
 
@@ -167,7 +167,7 @@ def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
 def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) -> Iterator[Scene]:
     """Yield scenes with deviations of their numbers."""
     errors, ranges = read_tolerances(scene, tolerances)
-    random = random_numbers(seed)
+    random = np.random.default_rng((count(seed, "seed", low=0), 1))  # independent of the numbers of `Sampled`
     batch = Sampled(errors, samples, seed).scenes(scene) if errors else None
     shares = [random.permutation((np.arange(samples) + 0.5) / samples) for _ in ranges]
     for k in range(samples):

@@ -6,7 +6,7 @@ import pytest
 import jaxvib as jv
 from jaxvib.machine.files import SCREENS, scene_from_toml
 from optimize import expected, jam_frequency, static_deflection, tolerance_ranges, total
-from optimize.tolerance import read_tolerances
+from optimize.tolerance import _machines, read_tolerances
 
 
 @pytest.fixture
@@ -63,6 +63,12 @@ def test_numbers_of_machines_are_limited(scene, samples):
     ):
         with pytest.raises(jv.InputError, match=f"samples is {samples}"):
             compute(scene, [static_deflection()], ["mass=1%"], samples=samples)
+
+
+def test_deviations_of_two_kinds_of_tolerances_are_independent(scene):
+    machines = list(_machines(scene, ["stiffness=5%", "loads.drag=0.5..1.5"], 64, 0))
+    numbers = np.array([[float(each.machine.stiffness[0]), float(each.loads.drag)] for each in machines])
+    assert abs(np.corrcoef(numbers.T)[0, 1]) < 0.3
 
 
 def test_range_of_an_array_adds_no_spring():
