@@ -235,7 +235,7 @@ class Output:
     ) -> None:
         from jaxvib.machine.files import load_scene
         from jaxvib.machine.scene import Scene
-        from jaxvib.report.page import Report, units_of
+        from jaxvib.report.page import Report, units_of_document
 
         scene = getattr(result, "scene", None)
         if not isinstance(scene, Scene):
@@ -247,7 +247,7 @@ class Output:
             author=self.author or "",
             command=shlex.join(["jaxvib", *arguments]),
             document=document,
-            units={} if result is None else units_of(result),
+            units=units_of_document(document, result),
             text=text(),
             scene=scene,
             sketch=None if scene is None or draw_sketch is None else draw_sketch(scene),

@@ -21,6 +21,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.report.tables import Units, accuracy_table, escaped, in_display_units, parameter_tables, result_tables
 from jaxvib.results.fields import Plain
 from jaxvib.results.result import Result
+from jaxvib.steady.measures import VibrationMeasures
 
 _LIBRARIES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy")
 
@@ -110,6 +111,17 @@ def html_report(
     with written(path) as part:
         part.write_text(page.html(), encoding="utf-8", errors="replace")
     return path
+
+
+def units_of_document(document: Mapping[str, Plain], result: eqx.Module | None) -> dict[str, str]:
+    """Return the units of the numbers in the document of a command, by name: those of its `result`, of measures of vibrations,
+    and of speeds that commands add."""
+    units = {"natural_frequencies": "rad/s", "rotor_speed": "rad/s"}
+    rows = [row for value in document.values() if isinstance(value, list) for row in value if isinstance(row, Mapping)]
+    if any("measures" in each for each in (document, *rows)):
+        of_measures = {each.name: each.metadata.get("unit", "") for each in dataclasses.fields(VibrationMeasures)}
+        units |= {name: unit for name, unit in of_measures.items() if unit}
+    return units if result is None else units | units_of(result)
 
 
 def units_of(result: eqx.Module) -> dict[str, str]:

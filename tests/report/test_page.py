@@ -3,6 +3,7 @@
 import base64
 import html.parser
 import math
+import re
 
 import matplotlib
 import pytest
@@ -13,7 +14,7 @@ from small_machine import small_run
 import jaxvib as jv
 from jaxvib.cli.app import run
 from jaxvib.machine.files import TEMPLATES
-from jaxvib.report.page import Report, units_of
+from jaxvib.report.page import Report, units_of, units_of_document
 from jaxvib.study.accuracy.cost import CostRow
 
 RESULT = jv.Cost("amplitude", [1.0], 1e-9, [CostRow("full", "Tsit5", "float64", "1e-3", math.nan, 0.1, 1.0)])
@@ -125,3 +126,10 @@ def test_wrong_input(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert run(["describe", "--report", str(tmp_path / "file" / "r.html")]) == 2
     assert "cannot be created" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("document", [{"measures": {"stroke": [0.002]}}, {"regimes": [{"measures": {"stroke": [0.002]}}]}])
+def test_measures_in_documents_of_commands_have_units(document):
+    page = Report("", {**document, "natural_frequencies": [10.0]}, units_of_document(document, None)).html()
+    assert "rpm" in page and re.search(r"stroke( 2 mm|</th><td>2</td><td class='unit'>mm)", page)
+    assert "stroke" not in units_of_document({"regimes": []}, None)
