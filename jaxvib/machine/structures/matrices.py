@@ -21,6 +21,9 @@ from jaxvib.units.known import when_known
 _MAX_ASYMMETRY = 1e-9
 """Largest asymmetry of a matrix, relative to its largest entry, in double precision."""
 
+_REDUCTION_ERROR = 1e-6
+"""Largest error of the eigenvalues of a reduced matrix, relative to its largest entry: rounding at omitted high frequencies."""
+
 
 class MatrixMachine(Machine):
     """Linear structure from matrices, in modal coordinates if it was reduced; `from_matrices` returns it.
@@ -62,6 +65,26 @@ class MatrixMachine(Machine):
     def rows_at(self, place: Place, name: str = "place") -> Array:
         """Return the matrix that gives the displacement of the place with this number, from 1; None is the first place."""
         return self._all_rows(place, name)[:2]
+
+    def require_valid(self) -> None:
+        """**Raises** `InputError` for replaced arrays whose shapes do not fit, and for an indefinite mass or stiffness matrix.
+
+        The symmetric parts of the matrices are examined, because their entries are replaced one by one.
+        """
+        size, rows = self.places_rows.shape[-1], self.foundation
+        for name in ("mass", "damping", "stiffness", "gyroscopic"):
+            if (matrix := getattr(self, name)) is not None and matrix.shape != (size, size):
+                raise InputError(f"machine.{name}", f"has the shape {matrix.shape}; {size} x {size} is needed")
+        if self.places_rows.ndim != 3 or (rows is not None and (rows.ndim != 3 or rows.shape[-1] != size)):
+            raise InputError("machine", "has places or a foundation of another shape; create it anew by from_matrices")
+
+        def check(mass: np.ndarray | float, stiffness: np.ndarray | float) -> None:
+            for name, matrix in (("mass", np.atleast_2d(mass)), ("stiffness", np.atleast_2d(stiffness))):
+                positive = name == "mass" and matrix.dtype == np.float64  # single precision cannot show it
+                whole = (matrix + matrix.T) / 2.0
+                require_definite(whole, f"machine.{name}", positive=positive, tolerance=_REDUCTION_ERROR)
+
+        when_known(check, self.mass, self.stiffness)
 
     def _all_rows(self, place: Place, name: str) -> Array:
         number, last = 1 if place is None else place, self.places_rows.shape[0]
@@ -157,10 +180,10 @@ def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:
     return matrix
 
 
-def require_definite(matrix: np.ndarray | float, name: str, *, positive: bool) -> None:
+def require_definite(matrix: np.ndarray | float, name: str, *, positive: bool, tolerance: float = _MAX_ASYMMETRY) -> None:
     """**Raises** `InputError` for a matrix that is asymmetric, or has eigenvalues below 0 (if `positive`: at most 0)."""
     full = np.atleast_2d(matrix)
-    allowed_error = _allowed_error(full)
+    allowed_error = _allowed_error(full, tolerance)
     if np.max(np.abs(full - full.T)) > allowed_error:
         raise InputError(name, "is not symmetric; put skew-symmetric parts into gyroscopic, or take (A + A^T)/2")
     least = float(np.min(np.linalg.eigvalsh(full)))
@@ -176,9 +199,9 @@ def _require_skew(matrix: np.ndarray | float) -> None:
         raise InputError("machine.gyroscopic", problem)
 
 
-def _allowed_error(matrix: np.ndarray) -> float:
+def _allowed_error(matrix: np.ndarray, tolerance: float = _MAX_ASYMMETRY) -> float:
     """Return the error of the entries and of the eigenvalues of a matrix that counts as rounding."""
-    return max(_MAX_ASYMMETRY, len(matrix) * float(np.finfo(matrix.dtype).eps)) * float(np.max(np.abs(matrix), initial=1e-300))
+    return max(tolerance, len(matrix) * float(np.finfo(matrix.dtype).eps)) * float(np.max(np.abs(matrix), initial=1e-300))
 
 
 def _read_places(places: Any, size: int) -> Array:

@@ -1,5 +1,6 @@
 """Machines from matrices: equal to the machines that have them, reduced to modes, whirl of a shaft of finite elements."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -166,6 +167,21 @@ ONE = np.eye(2)
 def test_a_body_may_move_without_a_spring():
     free = jv.from_matrices(ONE, 0.0 * ONE, [[1.0, -1.0], [-1.0, 1.0]], places=[[0]])
     np.testing.assert_allclose(jv.natural_frequencies(jv.Scene(free, BALLS, DRIVE))[0], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("stiffness", -np.eye(2), "machine.stiffness has the eigenvalue -1; all must be at least 0"),
+        ("mass", np.diag([1.0, 0.0]), "machine.mass has the eigenvalue 0; all must be greater than 0"),
+        ("damping", np.eye(3), r"machine.damping has the shape \(3, 3\); 2 x 2 is needed"),
+        ("places_rows", np.ones((2, 2)), "machine has places or a foundation of another shape"),
+    ],
+)
+def test_replaced_matrices_are_validated(name, value, says):
+    scene = jv.Scene(jv.from_matrices(np.eye(2), np.eye(2), np.eye(2), places=[[0]]), BALLS, DRIVE)
+    with pytest.raises(jv.InputError, match=says):
+        jv.natural_frequencies(eqx.tree_at(lambda s: getattr(s.machine, name), scene, jnp.asarray(value)))
 
 
 def test_a_machine_does_not_share_memory_with_its_matrix():
