@@ -162,6 +162,11 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """
         return jnp.sqrt(jnp.max(jnp.sum(self._stored.foundation_force**2, axis=1)))
 
+    def _require_end(self) -> None:
+        """**Raises** `InputError` for a run that failed: its window has no values."""
+        if not all(np.all(np.isfinite(np.asarray(values))) for values in (self.window.time, self.window.state.displacement)):
+            raise InputError("run", f"has no values at its end: {self.message}; simulate with throw=True for advice")
+
     @property
     def _stored(self) -> Trajectory:
         """Stored states: the whole run, or the window if only the window was kept."""
@@ -261,9 +266,12 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
         - `unit` of speeds, "rad/s", "rpm" or "Hz"
         - `ax`: axes to draw onto, one for each panel, by rows
+
+        **Raises** `InputError` for a run that failed.
         """
         from jaxvib.draw.motion.histories import time_histories  # slow import
 
+        self._require_end()
         structure = self.scene.machine.structure()
         history, end_history = map(_histories, (self.window if self.trajectory is None else self.trajectory, self.window))
         named = dict(names=structure.coordinates, units=structure.units, directions=structure.foundation_directions)
@@ -279,8 +287,9 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         **Returns** `Spectrum`; for several segments its figure is a waterfall diagram, with resonances marked.
 
         **Raises** `InputError` for more segments than the samples allow, and for several segments if the run kept only its
-        window or fewer than 3 states for each turn of the rotor.
+        window or fewer than 3 states for each turn of the rotor, and for a run that failed.
         """
+        self._require_end()
         return spectrum_of(self.scene, self.window, self.trajectory, parts)
 
     @validated
@@ -338,6 +347,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         from jaxvib.draw.motion.histories import last_periods  # slow import
         from jaxvib.draw.motion.spectra import path_chart
 
+        self._require_end()
         machine = self.scene.machine
         mount, kind = self.scene.mount(), machine.kind
         if mount.axes != (0, 1):

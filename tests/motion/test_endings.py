@@ -21,6 +21,10 @@ def test_a_run_that_does_not_finish_says_so():
     assert error.value.status == "max_steps_reached"
     run = jv.simulate(published().scene(), 20.0, max_steps=16, throw=False)
     assert bool(run.status == jv.RunStatus.max_steps_reached)
+    for ask in (run.plot, run.spectrum, run.plot_path):
+        with pytest.raises(jv.InputError, match=r"^run has no values at its end: the run needs more steps than max_steps .*"):
+            ask()
+    assert "max_steps" in run._repr_html_()  # a notebook shows the text without a figure
 
 
 @pytest.mark.parametrize(

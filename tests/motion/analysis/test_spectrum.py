@@ -50,6 +50,20 @@ def test_rounded_times_do_not_move_a_peak():
     assert abs(found.frequency[np.argmax(found.amplitude[0, :, 0])] - 28.0) <= found.frequency[1] / 2.0
 
 
+def test_an_unknown_force_has_no_figure():
+    time = jnp.linspace(0.0, 1.0, 64)
+    motion = Trajectory(
+        time,
+        jv.State(time[:, None], time[:, None], (time[:, None],), (time[:, None],)),
+        jnp.nan * time[:, None],
+        (time,),
+        (time,),
+    )
+    found = spectrum_of(SCENE, motion, None, 1)
+    with pytest.raises(jv.InputError, match=r"^show is 'force', which is unknown for matrices without a foundation"):
+        found.plot(show="force")
+
+
 def test_spectrum_marks_the_speed_of_each_exciter():
     """Unbalances at 60 and 90 rad/s, clockwise and anticlockwise, on a platform far above its resonance: a peak at each."""
     exciters = [jv.Exciter(drive=jv.ConstantSpeed(w), unbalance=0.1, direction=d, at=1) for w, d in ((60.0, 1), (90.0, -1))]
