@@ -330,6 +330,7 @@ def _values(store: Store, name: str, region: slice | tuple[slice, ...]) -> np.nd
     """Return the values of a measure in a region, NaN for missing values; for a measure with an additional axis, the maximum
     along this axis."""
     values = store.read(name, region).astype(float)
+    values[~np.isin(store.read("status", region), WITH_RESULTS)] = np.nan  # a missing whole number is -1
     return np.max(values, axis=-1) if values.ndim > len(store.shape) else values
 
 

@@ -344,7 +344,8 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
         more: dict[str, Plain] = {"units": measure.unit, "long_name": measure.words}
         if isinstance(measure, RunMeasure) and measure.meanings:
             more |= {"flag_values": list(range(len(measure.meanings))), "flag_meanings": " ".join(measure.meanings)}
-        kind, fill = (form.dtype, np.nan) if real else (np.dtype("i2"), -1)
+        is_integer = np.issubdtype(form.dtype, np.integer) and not isinstance(measure, RunMeasure)
+        kind, fill = (form.dtype, np.nan) if real else (form.dtype if is_integer else np.dtype("i2"), -1)
         add(name, (*grid.dims, *extra), (*grid.shape, *form.shape), (*grid.tile, *form.shape), kind, fill=fill, **more)
         for dim, size in zip(extra, form.shape, strict=True):
             if dim not in group and len(extra_names.get(dim, ())) == size:

@@ -127,6 +127,14 @@ def test_an_absent_quantity_hides_no_other_result(tmp_path):
     assert results_table(found.store)[2][:2] == [["286.48", "not jammed", ""], ["534.76", "jammed, mode 1", "4"]]
 
 
+def test_whole_numbers_are_stored_without_overflow(tmp_path):
+    whole = Quantity("whole", "N/m", lambda scene: (1e3 * scene.drive.speed).astype(int))
+    found = jv.sweep(SCENE, {"drive.speed": [30.0, 56.0, 90.0]}, [whole], tmp_path / "whole.zarr")
+    assert found.data["whole"].values.tolist() == [30_000, 56_000, 90_000]
+    (line,) = found.plot().axes[0].lines
+    np.testing.assert_allclose(line.get_ydata(), [30.0, 56.0, 90.0])  # N/mm
+
+
 def test_a_table_of_many_cases_has_their_range(grid, sampled):
     _, heads, ((name, *weights),) = results_table(grid.store)
     values = grid.data["weighted"].values
