@@ -114,12 +114,15 @@ class Orbit(Result):
     def relative_amplitude(self, i: int, j: int) -> Array:
         """Return the amplitude of coordinate `i` relative to coordinate `j` (counted from 1), (max - min)/2 over the period.
 
-        **Raises** `InputError` for a coordinate that the machine does not have.
+        **Raises** `InputError` for a coordinate that the machine does not have, and for a displacement and a tilt.
         """
         nd = self.displacement_harmonics.shape[-2]
         for name, coordinate in (("i", i), ("j", j)):
             if count(coordinate, name) > nd:
                 raise InputError(name, f"is {coordinate}; the coordinates are numbered 1 to {nd}")
+        if self.units[i - 1] != self.units[j - 1]:
+            one, other = (f"coordinate {k} is in {self.units[k - 1]}" for k in (j, i))
+            raise InputError("j", f"is {j}, but {one}, and {other}; give two displacements or two tilts")
         return _relative_amplitude(self.orders, self.displacement_harmonics, i, j)
 
     @property

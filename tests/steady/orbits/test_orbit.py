@@ -383,9 +383,10 @@ def test_peaks_are_found_from_samples_that_mislead():
 
 
 def test_relative_amplitudes_count_coordinates_from_one():
-    """Amplitudes 2 and 5 in antiphase: 7 apart; 0 is no coordinate, and not the last one."""
-    orbit = SimpleNamespace(orders=(1,), displacement_harmonics=jnp.array([[2.0 + 0.0j], [-5.0 + 0.0j]]))
+    """Amplitudes 2 and 5 in antiphase: 7 apart; 0 is no coordinate, and not the last one; nor is a tilt a length."""
+    harmonics = jnp.array([[2.0 + 0.0j], [-5.0 + 0.0j], [0.1 + 0.0j]])
+    orbit = SimpleNamespace(orders=(1,), displacement_harmonics=harmonics, units=("m", "m", "rad"))
     np.testing.assert_allclose(Orbit.relative_amplitude(orbit, 1, 2), 7.0, rtol=1e-9)
-    for i, j in ((0, 1), (1, 0), (-1, 1), (3, 1), (1, 3), (True, 2)):
-        with pytest.raises(jv.InputError, match=r"whole number|numbered 1 to 2"):
+    for i, j in ((0, 1), (1, 0), (-1, 1), (4, 1), (1, 4), (True, 2), (2, 3), (3, 1)):
+        with pytest.raises(jv.InputError, match=r"whole number|numbered 1 to 3|give two displacements or two tilts"):
             Orbit.relative_amplitude(orbit, i, j)
