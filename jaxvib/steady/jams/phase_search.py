@@ -133,7 +133,8 @@ def phase_jams(
       multiple of their drag, from `starts` random sets of phases and some regular ones. If this multiple passes 1 between two
       load speeds, a jam lies between them, and Newton's method solves for its speed and phases (`phase_jam`)
     - Jams that differ by a common rotation of all loads, or by an exchange of equal loads, count as one
-    - Loads that turn with the rotor and balance it are left out
+    - Loads that turn with the rotor and balance it are left out. So are jams of two equal loads at one point of the machine at
+      the speed at which its response lags by 90 degrees, which `synchronous_regimes` lists
     - Loads count as points: their `ball_radius` is not used, so that loads at one angle have the unbalance N m R. `jam_modes`
       places them side by side
     - An imbalance of the rotor (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force rotates at the rotor
