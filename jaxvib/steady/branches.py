@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit
-from jaxvib.equations.linear import jammed_model
+from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -130,8 +130,8 @@ def branches(
       this is lower
     - `accuracy` of the rotor speeds, relative, with `exact`; typical: 1e-4 to 1e-8 (the default; in single precision 1e-3)
 
-    **Returns** `Branches`, or `ExactBranches` if `exact`. **Raises** `InputError` for fewer than 2 points, a speed that is
-    not positive, and an accuracy that the precision does not allow.
+    **Returns** `Branches`, or `ExactBranches` if `exact`. **Raises** `InputError` for loads without drag, fewer than 2 points,
+    a speed that is not positive, and an accuracy that the precision does not allow.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -153,6 +153,7 @@ def branches(
         raise InputError("least", "is only for exact=True; leave it out, because branches of light loads begin at speed 0")
     if accuracy is not None:
         raise InputError("accuracy", "is only for exact=True; leave it out, because branches of light loads are explicit")
+    require_drag(jammed_loads(scene))
     count(points, "points", low=2, each=1e3)
     top = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
     per_side = max(2, math.ceil(points / (2 * scene.machine.structure().mass.shape[0])))

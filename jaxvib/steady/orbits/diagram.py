@@ -15,7 +15,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit
 from jaxvib.equations.jammed_bodies import jammed_bodies
-from jaxvib.equations.linear import jammed_model
+from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.machine.scene import Scene
@@ -145,6 +145,7 @@ def exact_branches(
     >>> [(p.kind, round(p.omega, 4)) for p in diagram.special]
     [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
     """
+    require_drag(jammed_loads(scene), each=True)
     count(points, "points", low=2, each=1e4)
     dtype = scene.drive.speed.dtype
     if accuracy is None:

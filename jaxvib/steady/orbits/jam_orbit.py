@@ -173,7 +173,7 @@ def plan_orbit(
     # Starts have no derivatives. A scene without traced values is not copied, because a copy would be validated again.
     frozen = scene if all_known else jax.tree.map(lambda x: x if is_known(x) else jax.lax.stop_gradient(x), scene)
     loads = jammed_loads(frozen)
-    require_drag(loads)
+    require_drag(loads, each=True)
     dtype = scene.drive.speed.dtype
     if accuracy is None:
         accuracy = 1e-9 if dtype.itemsize >= 8 else 1e-3

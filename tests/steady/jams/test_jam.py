@@ -185,10 +185,19 @@ def test_loads_of_a_free_undamped_mass_turn_with_the_rotor():
     np.testing.assert_allclose([modes.omega[2], modes.amplitude[2, 0]], [100.0, 0.1 / 51.0], rtol=1e-12)
 
 
-def test_loads_without_drag_are_refused():
-    s = jv.Scene(machines()["two_mass"], jv.balls(count=2, mass=0.1, radius=0.1, drag=0.0), jv.ConstantSpeed(10.0))
-    with pytest.raises(jv.InputError, match=r"loads\.drag is 0"):
-        jv.jam_modes(s)
+@pytest.mark.parametrize(
+    ("drag", "analyses"),
+    [
+        (0.0, [jv.jam_modes, jv.branches]),
+        ([0.0, 1.0], [lambda s: jv.branches(s, exact=True), lambda s: jv.jam_orbit(s, near=5.0)]),
+    ],
+    ids=["all", "one"],
+)
+def test_loads_without_drag_are_refused(drag, analyses):
+    s = jv.Scene(machines()["two_mass"], jv.balls(count=2, mass=0.1, radius=0.1, drag=drag), jv.ConstantSpeed(10.0))
+    for analysis in analyses:
+        with pytest.raises(jv.InputError, match=r"loads\.drag is 0"):
+            analysis(s)
 
 
 def test_select_says_what_is_wrong():
