@@ -398,6 +398,22 @@ def test_units_of_coordinates_and_labels():
     assert RESULTS["JamModes"]().message.count(" of 3)") >= 1
 
 
+def test_batch_of_runs_has_its_own_axis():
+    run = RESULTS["Run"]()
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, 2.0 * leaf]) if leaf.dtype == float else jnp.stack([leaf, leaf]), run)
+    data = batch.to_xarray()
+    assert data.displacement.dims == ("batch", "time", "coordinate") and data.coordinate.values.tolist() == ["y1"]
+    for name in ("largest_displacement", "largest_force"):
+        one = getattr(run, name)
+        np.testing.assert_allclose(getattr(batch, name), jnp.stack([one, 2.0 * one]), rtol=1e-12)
+    one = run.point().largest_displacement
+    moved = jax.tree.map(lambda leaf: jnp.stack([leaf, 2.0 * leaf]), run.point())
+    np.testing.assert_allclose(moved.largest_displacement, [one, 2.0 * one], rtol=1e-12)
+    for ask in (batch.summary, batch.plot, batch.spectrum, batch.ellipse, batch.point, lambda: batch.regime):
+        with pytest.raises(jv.InputError, match=r"^run is a batch of runs of shape \(2,\); take one of them"):
+            ask()
+
+
 def test_plain_data_of_statuses_complex_and_infinite_numbers():
     plain = RESULTS["JamModes"]().as_dict()
     assert set(plain["status"]) <= set(enumeration_names(jv.JamStatus)) and len(plain["status"]) == 3

@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import jax
+import numpy as np
+
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import as_text
 
 
 def _labels(scene: Scene) -> dict[str, Sequence[Any]]:
+    if batch := np.ndim(scene.exciters[0].drive.speed):  # the scenes of a batch have the same names
+        scene = jax.tree.map(lambda leaf: leaf[(0,) * batch], scene)
     structure, counts = scene.machine.structure(), [0 if e.loads is None else e.loads.count for e in scene.exciters]
     loads = range(1, counts[0] + 1)
     if len(counts) > 1:

@@ -56,7 +56,7 @@ class PointMotion(Readable):
     @property
     def largest_displacement(self) -> Array:
         """Largest distance from the place at rest, m, among the stored states."""
-        return jnp.max(magnitude(self.displacement[:, 0] + 1j * self.displacement[:, 1]))
+        return jnp.max(magnitude(self.displacement[..., 0] + 1j * self.displacement[..., 1]), axis=-1)
 
 
 @cached
