@@ -30,7 +30,8 @@ class RunMeasure:
 
     **Arguments**: `name`; `unit`, "" for none; `function` of a `BatchRun` that returns a scalar or an array (n,), or the name
     of an attribute of `BatchRun`; `axis`: name of the dimension of such an array ("coordinate", "load"), "" for a scalar;
-    `meanings`: for a label, the meanings of its values 0, 1, ...; `of_whole_run`: True if the function reads `BatchRun.peaks`.
+    `meanings`: for a label, the meanings of its values 0, 1, ...; `of_whole_run`: True if the function reads `BatchRun.peaks`;
+    `text`: description, default: the name.
     """
 
     name: str
@@ -39,11 +40,12 @@ class RunMeasure:
     axis: str = ""
     meanings: tuple[str, ...] = ()
     of_whole_run: bool = False
+    text: str = ""
 
     @property
     def words(self) -> str:
         """Description of the measure."""
-        return self.name.replace("_", " ").removeprefix("run.")
+        return self.text or self.name.replace("_", " ").removeprefix("run.")
 
     def read(self, run: BatchRun) -> Array:
         """Return the value of a run."""
@@ -99,7 +101,7 @@ _MEANS = ("torque", "power", "static_load")
 """Fields of `VibrationMeasures` that are mean values, and exist for motions without a vibration."""
 
 
-def _vibration_measure(name: str, unit: str, field: str, axis: str = "") -> RunMeasure:
+def _vibration_measure(name: str, unit: str, field: str, axis: str = "", text: str = "") -> RunMeasure:
     """Return a measure with the name of a `field` of `VibrationMeasures`."""
 
     def read(run: BatchRun) -> Array:
@@ -112,7 +114,7 @@ def _vibration_measure(name: str, unit: str, field: str, axis: str = "") -> RunM
         share = vibration_share(run.scene.machine, run.window.time, run.measured, motion.displacement)
         return jnp.where(has_vibration(share), value, jnp.nan)
 
-    return RunMeasure(name, unit, read, axis)
+    return RunMeasure(name, unit, read, axis, text=text)
 
 
 def _support_load(run: BatchRun) -> Array:
@@ -139,7 +141,7 @@ RUN_MEASURES = {
         RunMeasure("run.peak_force", "N", "peaks.force", of_whole_run=True),
         RunMeasure("run.settling_time", "s", _settling_time),
         _vibration_measure("run.stroke", "m", "stroke", "translation"),
-        _vibration_measure("run.acceleration", "", "acceleration", "translation"),
+        _vibration_measure("run.acceleration", "", "acceleration", "translation", "acceleration in g"),
         _vibration_measure("run.velocity", "m/s", "velocity", "translation"),
         _vibration_measure("run.transmissibility", "", "transmissibility"),
         _vibration_measure("run.shaft_torque", "N m", "torque", "exciter"),

@@ -64,6 +64,10 @@ def test_measures_of_data_sheets_follow_from_a_run():
     np.testing.assert_allclose(load, [50.0 * 9.80665 + measured.foundation_force], rtol=2e-2)
 
 
+def test_the_unit_of_an_acceleration_is_named():
+    assert RUN_MEASURES["run.acceleration"].words == "acceleration in g" and RUN_MEASURES["run.velocity"].words == "velocity"
+
+
 def test_runs_of_several_exciters_are_measured(tmp_path):
     """Motors of opposite directions on soft supports; a no-load speed of 130 rad/s is beyond their synchronisation."""
     springs = [jv.support(at=(x, 0.0), stiffness=(1e4, 1e4), damping=(500.0, 500.0)) for x in (-1.0, 1.0)]
