@@ -126,6 +126,8 @@ def work_precision(
         raise InputError("solvers", f"are {quoted(list(solvers))}; name some of {', '.join(SOLVERS)}")
     if not tolerances:
         raise InputError("tolerances", f"are {quoted(tuple(tolerances))}; name one at least, such as 1e-6")
+    for k, tolerance in enumerate(tolerances):
+        number(tolerance, "", f"tolerances[{k}]", low=0.0, open_low=True)
     count(repeats, "repeats")
     scene = require_double(scene, "a comparison of errors")
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
