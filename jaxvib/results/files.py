@@ -168,7 +168,14 @@ def _encoded_field(field: dataclasses.Field, owner: object, arrays: dict[str, np
     if "write" not in field.metadata:
         return _encoded(value, arrays)
     double = any(getattr(leaf, "dtype", None) == np.float64 for leaf in jax.tree.leaves(value))
-    return {"text": field.metadata["write"](value), "double": double}
+    text = field.metadata["write"](value)
+    try:
+        with jax.enable_x64(double):
+            field.metadata["read"](text)
+    except InputError as error:
+        problem = f"contains a {field.name} that load could not read; for a batch of results, save each of them"
+        raise InputError("result", f"{problem}, jax.tree.map(lambda x: x[0], result)") from error
+    return {"text": text, "double": double}
 
 
 def _stored(array: np.ndarray, arrays: dict[str, np.ndarray]) -> str:
