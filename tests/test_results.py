@@ -411,7 +411,9 @@ def test_batch_of_runs_has_its_own_axis():
     np.testing.assert_allclose(moved.largest_displacement, [one, 2.0 * one], rtol=1e-12)
     with pytest.raises(jv.InputError, match=r"^result contains a scene that load could not read; for a batch of results, save"):
         batch.save("runs")
-    for ask in (batch.summary, batch.plot, batch.spectrum, batch.ellipse, batch.point, lambda: batch.regime):
+    averaged = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), RESULTS["Envelope"]())
+    full = (batch.summary, batch.plot, batch.spectrum, batch.ellipse, batch.point, lambda: batch.regime)
+    for ask in (*full, averaged.summary, averaged.plot, averaged.ellipse):
         with pytest.raises(jv.InputError, match=r"^run is a batch of runs of shape \(2,\); take one of them"):
             ask()
 

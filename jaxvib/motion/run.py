@@ -162,16 +162,9 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """
         return jnp.sqrt(jnp.max(jnp.sum(self._stored.foundation_force**2, axis=-1), axis=-1))
 
-    def _require_single(self) -> None:
-        """**Raises** `InputError` for a batch of runs."""
-        if jnp.ndim(self.omega):
-            shape = jnp.shape(self.omega)
-            advice = "take one of them, jax.tree.map(lambda x: x[0], runs), or call this inside of jax.vmap"
-            raise InputError("run", f"is a batch of runs of shape {shape}; {advice}")
-
     def _require_end(self) -> None:
         """**Raises** `InputError` for a batch of runs, and for a run that failed: its window has no values."""
-        self._require_single()
+        self.require_single()
         if not all(np.all(np.isfinite(np.asarray(values))) for values in (self.window.time, self.window.state.displacement)):
             raise InputError("run", f"has no values at its end: {self.message}; simulate with throw=True for advice")
 
@@ -185,7 +178,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
         **Arguments**: `measures` of the vibration that are shown; default: those of the centre of mass on a level deck.
         """
-        self._require_single()
+        self.require_single()
         error = f"estimated error of the states in the window, phase included, {float(self.error):.1e}"
         error = "error not estimated" if np.isnan(self.error) else error
         rotors = [w[-1] for w in self.window.rotor_speeds]
@@ -248,7 +241,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
     @property
     def regime(self) -> Regime:
         """Kind of motion at the end of the run, see `Regime`."""
-        self._require_single()
+        self.require_single()
         return regime(self.scene, self.window)
 
     @property
@@ -258,7 +251,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         It is NaN for a load that never lost contact, and for loads that their track holds from both sides. The equations keep
         the load on its track; after this time the computed motion is therefore not that of a real load.
         """
-        self._require_single()
+        self.require_single()
         loads = [exciter.loads for exciter in self.scene.exciters if exciter.loads is not None]
         is_pushed = np.repeat([one_kind.one_sided for one_kind in loads], [one_kind.count for one_kind in loads])
         if not np.any(is_pushed):
@@ -314,7 +307,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         **Returns** `PointMotion`. **Raises** `InputError` for a place that the machine does not have, and for "all" if the run
         kept only its window.
         """
-        self._require_single()
+        self.require_single()
         trajectory = self.window if part == "window" else self.trajectory
         if trajectory is None:
             raise InputError("part", "is 'all', but the run kept only its window; simulate with save='all'")
@@ -327,7 +320,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
         **Raises** `InputError` if the exciters make fewer than 3 turns in the window, and for a batch of runs.
         """
-        self._require_single()
+        self.require_single()
         when_known(require_turns, self.window.time, self.omega)
         amplitude, rest = fit_harmonic(self.window.time, self.window.state.displacement, self.omega)
         return Harmonic(self.scene.machine, self.omega, amplitude, rest)
@@ -339,7 +332,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         The exciters must make 3 turns in the window, and at least half of the amplitude must be at their speed. Otherwise
         `vibration` raises an error, and the summary contains this reason in place of the measures.
         """
-        self._require_single()
+        self.require_single()
         return absent_vibration(self.scene.machine, self.window.time, self, self.harmonic)
 
     def vibration(self) -> Vibration:

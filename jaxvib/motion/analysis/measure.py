@@ -101,6 +101,13 @@ class AbstractMeasured(Readable):
         """True if the relative changes of amplitudes, force and speeds are below 1e-3."""
         return self.drift < 1e-3
 
+    def require_single(self) -> None:
+        """**Raises** `InputError` for a batch of runs."""
+        if jnp.ndim(self.omega):
+            shape = jnp.shape(self.omega)
+            advice = "take one of them, jax.tree.map(lambda x: x[0], runs), or call this inside of jax.vmap"
+            raise InputError("run", f"is a batch of runs of shape {shape}; {advice}")
+
     def amplitude_text(self, scene: Scene) -> str:
         """Return the amplitudes and the foundation force of a `scene` as a line of text."""
         structure = scene.machine.structure()

@@ -116,7 +116,11 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         return (self.drift < SETTLED_DRIFT) & is_stable
 
     def harmonic(self) -> Harmonic:
-        """Return the mean vibration of the coordinates over the window, at the mean speed of the loads."""
+        """Return the mean vibration of the coordinates over the window, at the mean speed of the loads.
+
+        **Raises** `InputError` for a batch of runs.
+        """
+        self.require_single()
         mean = jnp.mean(self.window.displacement, axis=0)
         away = self.window.displacement - mean[None]
         rest = 0.5 * (away.T @ jnp.conj(away)).real / away.shape[0]
@@ -125,6 +129,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
     @property
     def no_vibration(self) -> str:
         """Reason for which the window has no vibration that can be measured, see `Run.no_vibration`."""
+        self.require_single()
         return absent_vibration(self.scene.machine, self.window.time, self, self.harmonic)
 
     def vibration(self) -> Vibration:
@@ -160,6 +165,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
 
         **Arguments**: `measures` of the vibration that are shown; default: those of the centre of mass on a level deck.
         """
+        self.require_single()
         moves = bool(np.all(np.isfinite(self.amplitude)))
         measured = measures_text(self.scene, self.no_vibration, self.vibration, measures) if moves else []
         named, first = status_name(self.status), []
@@ -185,6 +191,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
 
         **Arguments**: `unit` and `ax`, as in `Run.plot`.
         """
+        self.require_single()
         return plot_histories(self, unit=unit, ax=ax)
 
 
