@@ -74,7 +74,7 @@ class Ensemble(Result):
     **Attributes** (B runs)
 
     - `state`: final `State` of each run, with arrays that have a leading axis over the runs; in single precision angles are
-      within one turn
+      within one turn, unless the steps are implicit
     - `load_speed` (B, count), rad/s: the mean speed of each load, or of the rotor of an exciter without loads, over the last
       quarter of the run
     - `relative_rotation` (B,), rad: largest difference between the angles through which two masses turn, each in its
@@ -168,7 +168,7 @@ def ensemble(
       depend on an automatic choice of steps
     - Compiled programs are used again for other values and other numbers of runs above `batch`, if `make` is the same function
       object and the same parameters are shared by all runs. A lambda in the call is a new function in each call
-    - In single precision the integration keeps angles within one turn; therefore long runs keep their phase
+    - In single precision explicit steps keep angles within one turn; therefore long runs keep their phase
 
     **Arguments**
 

@@ -101,9 +101,9 @@ def simulate(
     **Returns** `Run`, with its estimated `error` and its cost.
 
     - Forward and reverse derivatives, `jit` and `vmap` are supported
-    - In single precision, angles are kept within one turn during the integration, and angles of the window are relative to the
-      number of turns at its beginning. Runs of more than 20,000 turns at constant speed that keep only a window are divided
-      into stretches. Long runs therefore keep their phase
+    - In single precision, the default methods of order 8 keep angles within one turn during the integration, and angles of the
+      window are relative to the number of turns at its beginning. Runs of one exciter of more than 20,000 turns at constant
+      speed that keep only a window are divided into stretches. Long runs therefore keep their phase
 
     **Raises** `InputError` for values that are not allowed, `ComputationError` for a run that does not finish.
 
