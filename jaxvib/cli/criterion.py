@@ -145,11 +145,12 @@ def _balance_text(states: jv.BalancedStates, stabilities: list[BalancedStability
     lines = [f"balanced motion at {speed_text(states.scene.drive.speed)}: {answer}", textwrap.fill(states.message, 80)]
     if not len(states.angles):
         lines += states.summary().splitlines()[1:]
-    for k, share in enumerate(states.share):
-        plane = f" in plane {k + 1}" if len(states.share) > 1 else ""
+    for k, (share, loads) in enumerate(zip(states.share, states.planes, strict=True)):
+        several = f"load{'s' if loads.size > 1 else ''} {', '.join(str(j + 1) for j in loads)}"
+        plane = f" in plane {k + 1} ({several})" if len(states.share) > 1 else ""
         lines.append(f"imbalance{plane}: {100.0 * share:.4g} % of the unbalance of all loads{' there' if plane else ''}")
     rows = [
-        [str(k + 1), name, f"{stability.growth:.4g}", " ".join(f"{degrees(float(a)):.4g}" for a in angles)]
+        [str(k + 1), name, f"{stability.growth:.4g}", " ".join(f"{degrees(float(a)) % 360.0:.4g}" for a in angles)]
         for k, (name, stability, angles) in enumerate(zip(names, stabilities, states.angles, strict=True))
     ]
     if rows:

@@ -78,16 +78,18 @@ class CharacteristicSpeeds(Result):
         return [pair for pair in pairs if pair[1] == pair[1]]
 
     def summary(self) -> str:
-        """Return a table in text: each speed without and with damping, and the mode shape of each resonance."""
-        damped, (unit, scale) = dict(self.labelled(damped=True)), speed_unit()
-        lines = [f"{'':14s}{'undamped':>12s}{'damped':>12s}  {unit}; mode shape ({', '.join(self.coordinates)})"]
+        """Return the speeds without damping, the mode shapes of the resonances and the sign changes with damping as text."""
+        unit, scale = speed_unit()
+        lines = [f"{'no damping':14s}{unit:>12s}  mode shape ({', '.join(self.coordinates)})"]
         for label, speed in self.labelled():
-            line = f"{label:14s}{scale * speed:12.6g}{f'{scale * damped[label]:.6g}' if label in damped else 'none':>12s}"
+            line = f"{label:14s}{scale * speed:12.6g}"
             if label.startswith("resonance"):
                 shape = self.shapes[:, int(label.split()[1]) - 1]
-                largest = shape[jnp.argmax(jnp.abs(shape))]
-                line += "  " + ", ".join(f"{x:.3g}" for x in (shape / largest).tolist())
+                relative = shape / shape[jnp.argmax(jnp.abs(shape))]
+                line += "  " + ", ".join(_entry_text(complex(x)) for x in relative)
             lines.append(line)
+        damped = ", ".join(f"{label} {scale * speed:.6g}" for label, speed in self.labelled(damped=True))
+        lines.append(f"sign changes with this damping: {damped} {unit}")
         return "\n".join(lines)
 
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
@@ -97,6 +99,14 @@ class CharacteristicSpeeds(Result):
         rows = [("resonances", self.resonances), ("additional", self.additional)]
         rows += [("damped resonances", self.damped_resonances), ("damped additional", self.damped_additional)]
         return speeds_chart([(label, np.asarray(speeds)) for label, speeds in rows], unit=unit, ax=ax)
+
+
+def _entry_text(entry: complex) -> str:
+    """Return an entry of a mode shape as text, without parts that are rounding errors of 0."""
+    real, imaginary = (round(part, 9) + 0.0 for part in (entry.real, entry.imag))
+    if imaginary == 0.0:
+        return f"{real:.3g}"
+    return f"{imaginary:.3g}j" if real == 0.0 else f"{real:.3g}{imaginary:+.3g}j"
 
 
 def port_receptance(scene: Scene, omega: Array) -> Array:

@@ -37,13 +37,14 @@ from jaxvib.steady.balance.monodromy import (
     monodromies,
     validate_steps,
 )
+from jaxvib.steady.jams.phases import degrees
 from jaxvib.units import Number, Numbers, count, number, numbers
 
 
 class BalanceStatus(eqx.Enumeration):
     """Outcomes of the balance of loads. The value of each member is the message shown to the user."""
 
-    unique = "the loads cancel in one arrangement and its mirror image"
+    unique = "the loads of each plane cancel in one arrangement and its mirror image"
     family = "the loads cancel in a family of arrangements: angles that change along the neutral directions keep the balance"
     alone = "a single load has no other load to cancel it"
     outweighed = (
@@ -118,9 +119,14 @@ class BalancedStates(Result):
         return balanced_intervals(self.scene, low, high, self._angles_of(arrangement), points=points, steps=steps)
 
     @property
+    def planes(self) -> list[np.ndarray]:
+        """Loads of each plane, counted from 0. Planes ascend along the axis."""
+        return [plane.loads for plane in _planes(self.scene)]
+
+    @property
     def share(self) -> np.ndarray:
         """Imbalance of the rotor in each plane of the loads, divided by the sum of m_j R_j there, (planes,): 0 for a balanced
-        rotor, above 1 if the loads cannot cancel it. Planes ascend along the axis."""
+        rotor, above 1 if the loads cannot cancel it, see `planes`."""
         sides = _sides(turning_loads(self.scene))
         return np.array([abs(plane.imbalance) / np.sum(sides[plane.loads]) for plane in _planes(self.scene)])
 
@@ -142,7 +148,7 @@ class BalancedStates(Result):
 
     def summary(self) -> str:
         """Return the arrangements and their neutral directions as text."""
-        rows = ["  " + ", ".join(f"{np.degrees(a):.4g}" for a in row) + " deg" for row in self.angles]
+        rows = ["  " + ", ".join(f"{degrees(a) % 360.0:.4g}" for a in row) + " deg" for row in self.angles]
         if not rows:
             pairs = [(abs(plane.imbalance), most) for plane, most in zip(_planes(self.scene), self.capacity, strict=True)]
             amounts = [
@@ -201,14 +207,14 @@ def balanced_states(scene: Scene) -> BalancedStates:
     >>> loads = jv.balls(count=3, mass=[0.3, 0.4, 0.5], radius=0.1, drag=1.0)
     >>> states = jv.balanced_states(jv.Scene(machine, loads, jv.ConstantSpeed(100.0)))
     >>> print(states.summary())
-    the loads cancel in one arrangement and its mirror image
+    the loads of each plane cancel in one arrangement and its mirror image
       0, 90, 233.1 deg
       0, 270, 126.9 deg
     neutral directions: turn of all loads
     >>> loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
     >>> imbalance = jv.StaticImbalance("50 g m", angle="90 deg")    # as much as each of the balls
     >>> print(jv.balanced_states(jv.Scene(machine, loads, jv.ConstantSpeed(100.0), (imbalance,))).summary())
-    the loads cancel in one arrangement and its mirror image
+    the loads of each plane cancel in one arrangement and its mirror image
       210, 330 deg
       330, 210 deg
     neutral directions: none

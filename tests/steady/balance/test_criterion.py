@@ -194,6 +194,10 @@ def test_port_of_two_directions_without_damping(s):
             d = np.asarray(bare.carrier().stiffness) - w**2 * np.asarray(mass)
             size = np.abs(b.conj() @ np.linalg.solve(d + 1e-2 * np.asarray(carrier.stiffness), b))
             assert abs(b.conj() @ np.linalg.solve(d, b)) < 1e-9 * size
+    # Rounding errors of mode shapes are not shown, and speeds with damping are not assigned to those without.
+    *rows, damped = speeds.summary().splitlines()
+    assert "e-" not in "".join(rows[1:]) and "+0j" not in "".join(rows)
+    assert damped.startswith("sign changes with this damping: resonance 1 ")
 
 
 def test_twenty_platforms():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.cli.criterion import _balance_text
 
 MASS, ACROSS, ALONG, K1, K2, B1, B2, L1, L2 = 20.0, 0.6, 0.15, 6e5, 5e5, 700.0, 600.0, 0.25, -0.2
 LOAD, R, DRAG, STATIONS = 0.05, 0.08, 1.0, (0.2, 0.2, -0.15, -0.15)
@@ -33,6 +34,16 @@ def test_forces_and_moments_cancel_in_all_arrangements():
     assert states.angles.shape == (4, 4) and states.dimension == 0 and states.names == ()
     pairs = {tuple(np.round(np.sort(row[:2]), 9)) + tuple(np.round(np.sort(row[2:]), 9)) for row in states.angles}
     assert len(pairs) == 1  # equal loads: the arrangements differ by exchanges
+
+
+def test_summary_lists_angles_within_a_turn():
+    balls = jv.balls(count=4, mass=LOAD, radius=R, drag=DRAG, ball_radius=0.01)
+    effects = (*EFFECTS, jv.LoadContact(1e5, restitution=0.6))
+    states = jv.balanced_states(jv.Scene(rotor(), balls, jv.ConstantSpeed(450.0), effects))
+    assert np.max(states.angles) > 2.0 * np.pi  # loads that cannot pass each other: angles ascend within a plane
+    head, *rows, _ = states.summary().splitlines()
+    assert head == "the loads of each plane cancel in one arrangement and its mirror image" and len(rows) == 4
+    assert all(0.0 <= float(angle) < 360.0 for row in rows for angle in row.removesuffix(" deg").split(","))
 
 
 def test_stations_that_differ_by_rounding_are_in_one_plane():
@@ -113,3 +124,7 @@ def test_a_plane_without_enough_loads_is_named():
     heavy = (jv.StaticImbalance("20 g m"),)
     states = jv.balanced_states(scene(effects=heavy))
     assert states.status_name == "outweighed" and states.angles.shape == (0, 4)
+    # Loads 1 and 2 are at the station 0.2 m, which is the second plane along the axis.
+    lines = _balance_text(states, [], []).splitlines()
+    heads = ("imbalance in plane 1 (loads 3, 4): ", "imbalance in plane 2 (loads 1, 2): ")
+    assert all(any(line.startswith(head) for line in lines) for head in heads)
