@@ -1,4 +1,4 @@
-"""Field of a result that contains the scene: its TOML text for files, and the names of coordinates and loads."""
+"""Field of a result that contains the scene: its TOML text for files, and the names of coordinates, directions and loads."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ def _labels(scene: Scene) -> dict[str, Sequence[Any]]:
     loads = range(1, counts[0] + 1)
     if len(counts) > 1:
         loads = [name for k, n in enumerate(counts, 1) for name in ([f"{k}.{j + 1}" for j in range(n)] or [f"{k}"])]
-    return {"coordinate": structure.coordinates, "unit": structure.units, "load": loads}
+    # A single direction needs no name.
+    directions = structure.foundation_directions if len(structure.foundation_directions) > 1 else ()
+    return {"coordinate": structure.coordinates, "unit": structure.units, "load": loads, "direction": directions}
 
 
 SCENE = as_text(scene_to_toml, scene_from_toml, _labels)

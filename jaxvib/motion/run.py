@@ -229,7 +229,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         structure = self.scene.machine.structure()
         largest = zip(structure.coordinates, np.asarray(self.largest_displacement), structure.units, strict=True)
         named = ", ".join(f"{name} {quantity_text(x, unit, 4)}" for name, x, unit in largest)
-        return f"largest on the way, zero to peak: {named}; foundation force {quantity_text(self.largest_force, 'N', 4)}"
+        force = quantity_text(self.largest_force, "N", 4)
+        return f"largest on the way, zero to peak: {named}; magnitude of the foundation force {force}"
 
     def _detachment(self) -> list[str]:
         times = np.asarray(self.detached)

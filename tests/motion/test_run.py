@@ -76,6 +76,17 @@ def test_largest_force_is_a_magnitude():
     force = np.asarray(run.trajectory.foundation_force)
     np.testing.assert_allclose(run.largest_force, np.max(np.hypot(*force.T)), rtol=1e-12)
     assert float(run.largest_force) < 0.9 * np.hypot(*np.max(np.abs(force), axis=0))
+    assert f"magnitude of the foundation force {float(run.largest_force):.4g} N" in run.summary()
+
+
+def test_forces_of_a_rotor_are_labelled_by_direction():
+    """The scene of the test above."""
+    machine = jv.planar_rotor(mass=10.0, stiffness=1e5, damping=50.0)
+    s = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(60.0), unbalance=0.02)])
+    run = jv.simulate(s, 1.0, estimate=False)
+    force = run.to_xarray()["foundation_force"]
+    np.testing.assert_array_equal(force.sel(direction="up"), run.trajectory.foundation_force[:, 1])
+    assert {"foundation_force across (N)", "foundation_force up (N)"} <= set(run.to_pandas())
 
 
 def test_loads_run_together_that_have_one_angle_all_the_time():

@@ -37,6 +37,10 @@ _MIN_SHARE = 0.5
 """Smallest amplitude of the harmonic at the speed of the exciters, relative to the measured amplitude, of a motion with
 vibration measures. It is about 1 in a steady motion, and small if a rotor slows down or a free vibration decays."""
 
+_PURE_SHARE = 0.95
+"""The same share, below which a summary states that its measures do not describe the whole motion. Typical: 0.9 for loads that
+are jammed on a rotor with an imbalance, which vibrates at the rotor speed too."""
+
 _HARMONICS = 3
 """Number of fitted harmonics. The second and the third are included because they would otherwise influence the first."""
 
@@ -133,11 +137,15 @@ def vibration_share(machine: Machine, time: Array, measured: AbstractMeasured, h
 
     **Arguments**: `time` (nt,) of the window, its `measured` quantities, and the `harmonic` (nd,) of this speed.
     """
+    share = _harmonic_share(machine, harmonic, measured.amplitude)
+    return jnp.where(_turns(time, measured.omega) >= _MIN_TURNS, share, 0.0)
+
+
+def _harmonic_share(machine: Machine, harmonic: Array, amplitude: Array) -> Array:
     is_length = np.asarray(machine.carrier().units) == "m"
     moves = is_length if np.any(is_length) else np.ones_like(is_length)
-    part, whole = (jnp.linalg.norm(magnitude(each)[moves]) for each in (harmonic, measured.amplitude))
-    share = jnp.where(whole > 0.0, part / jnp.where(whole > 0.0, whole, 1.0), 1.0)
-    return jnp.where(_turns(time, measured.omega) >= _MIN_TURNS, share, 0.0)
+    part, whole = (jnp.linalg.norm(magnitude(each)[moves]) for each in (harmonic, amplitude))
+    return jnp.where(whole > 0.0, part / jnp.where(whole > 0.0, whole, 1.0), 1.0)
 
 
 def has_vibration(share: Array) -> Array:
@@ -172,7 +180,16 @@ def measures_text(
     the `reason` for which there is none."""
     if reason:
         return [f"no vibration to measure: {reason}"]
-    return (measures or vibration_measures(scene, vibration())).summary().splitlines()
+    shaking = vibration()
+    lines = (measures or vibration_measures(scene, shaking)).summary().splitlines()
+    share = float(_harmonic_share(scene.machine, shaking.displacement, shaking.amplitude))
+    if share >= _PURE_SHARE:
+        return lines
+    note = (
+        f"only {100.0 * share:.3g} % of the amplitude is at the mean speed of the exciters, {speed_text(shaking.speed, 4)}; "
+        "g and mm/s are computed at this speed, forces are those of this part"
+    )
+    return [note, *lines]
 
 
 def _turns(time: Array | np.ndarray, speed: Array | float) -> Array:

@@ -100,7 +100,8 @@ class MotorRunUp(Result):
         named = zip(structure.coordinates, self.peak_amplitude, structure.units, strict=True)
         peaks = ", ".join(f"{name} {quantity_text(a, unit, 4)}" for name, a, unit in named)
         of = " (largest of several initial angles; the figure shows one run)" if _turned_motors(self.scene) else ""
-        lines += [f"  peaks on the way{of}:", f"    {peaks}; foundation force {quantity_text(self.peak_force, 'N', 4)}"]
+        force = quantity_text(self.peak_force, "N", 4)
+        lines += [f"  peaks on the way{of}:", f"    {peaks}; magnitude of the foundation force {force}"]
         if np.isfinite(self.least_torque):
             lines.append(f"  all pass with torques of at least {float(self.least_torque):.3g} times those of the motors")
             lifting = _lifting_factor(self.scene)

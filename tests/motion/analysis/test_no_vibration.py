@@ -8,6 +8,7 @@ import pytest
 import jaxvib as jv
 from jaxvib.cli.app import run as run_command
 from jaxvib.machine.files import SCREENS
+from jaxvib.motion.analysis.points import measures_text
 
 AT = (1.5, 0.1)
 
@@ -47,6 +48,10 @@ def test_a_free_vibration_has_no_measures():
     forced = 0.2 * 300.0**2 / abs(8e5 - 200.0 * 300.0**2 + 60.0 * 300.0j)  # closed form
     assert forced < 0.5 * float(early.amplitude[0])
     np.testing.assert_allclose(abs(late.harmonic().amplitude), forced, rtol=1e-3)
+    vibration = late.vibration()
+    mixed = vibration._replace(amplitude=abs(vibration.displacement) / 0.8)
+    assert "only" not in late.summary()
+    assert measures_text(scene, "", lambda: mixed, None)[0].startswith("only 80 % of the amplitude is at the mean speed")
 
 
 def test_sweeps_have_no_stroke_of_a_free_vibration(tmp_path):
