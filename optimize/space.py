@@ -109,7 +109,8 @@ class DesignSpace(Readable):
     - `hold`: quantities that keep their value, each in `optimize.hold(...)`, for example a sum (`total`) or a product
       (`product`) of parameters
     - `ties`: a mapping from the name of a parameter to its source: the name of another parameter (equal values), (name,
-      factor), or (name, "keep") to keep the present ratio of both; entries of an array that are 0 stay 0, as in `free`
+      factor), or (name, "keep") to keep the present ratio of both; the factor -1 mirrors a position; entries of an array that
+      are 0 stay 0, as in `free`
     - `choices`: a mapping from the name of a parameter to its allowed values, such as the springs of a catalogue, or from
       "loads.count" to allowed numbers of loads; typical: 2 to 20 values. Rows of a catalogue, such as motors, are a mapping
       from any name to the columns: {"motor": {"drive.speed": ["1450 rpm", "970 rpm"], "drive.inertia": [0.01, 0.02]}}; the
@@ -393,10 +394,14 @@ def _read_ties(scene: Scene, ties: Mapping[str, Source], used: set) -> tuple[Tie
         if factor == "keep":
             with np.errstate(divide="ignore", invalid="ignore"):  # refused below
                 ratio = np.asarray(target.read(scene)) / np.asarray(source.read(scene))
-        elif isinstance(factor, (int, float)) and not isinstance(factor, bool) and factor > 0.0:
-            ratio = np.full(target.size, float(factor))
         else:
-            raise InputError(f"ties.{name}", f"has the factor {quoted(factor)}; give a number greater than 0, or 'keep'")
+            lowest = target.spec.bounds.low  # positions and angles may be mirrored
+            is_number = isinstance(factor, (int, float)) and not isinstance(factor, bool)
+            value = float(factor) if is_number else 0.0
+            if not np.isfinite(value) or value == 0.0 or (value < 0.0 and lowest >= 0.0):
+                allowed = "greater than 0" if lowest >= 0.0 else "other than 0"
+                raise InputError(f"ties.{name}", f"has the factor {quoted(factor)}; give a number {allowed}, or 'keep'")
+            ratio = np.full(target.size, value)
         if target.keeps_zeros(scene):  # a spring or damper that does not exist is not created
             ratio = np.where(np.asarray(target.read(scene)) == 0.0, 0.0, ratio)
         if not np.all(np.isfinite(ratio)):

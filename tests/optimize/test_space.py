@@ -7,6 +7,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
+from jaxvib.machine.files import SCREENS, scene_from_toml
 from optimize import DesignSpace, hold, jam_frequency, total
 
 SCENE, THREE = scene("two_mass"), scene("three_mass")
@@ -131,6 +132,16 @@ def test_tie_to_a_parameter_of_zero_is_refused():
     ties = {"machine.stiffness": ("machine.damping", "keep")}
     with pytest.raises(jv.InputError, match=r"machine\.damping, which is 0 in the scene"):
         DesignSpace(half, {"loads.drag": (1.0, 2.0)}, ties=ties)
+
+
+def test_positions_can_be_mirrored_by_a_tie():
+    screen = scene_from_toml(SCREENS["linear_screen"])
+    name = "exciters[0].position[0]"
+    space = DesignSpace(screen, {name: (0.0, 1.0, "even")}, ties={"exciters[1].position[0]": (name, -1.0)})
+    np.testing.assert_allclose(space.at(jnp.array([0.25])).exciters[1].position[0], -0.25)
+    for factor in (0.0, float("inf")):
+        with pytest.raises(jv.InputError, match="give a number other than 0"):
+            DesignSpace(screen, {name: (0.0, 1.0)}, ties={"exciters[1].position[0]": (name, factor)})
 
 
 def test_absent_springs_stay_absent():
