@@ -41,8 +41,8 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
     >>> scene = jv.Scene(jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),
     ...                  jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5), jv.ConstantSpeed(60.0))
     >>> path = write_csv(jv.whirl(scene, [10.0, 20.0]), "rotor_speed", pathlib.Path(tempfile.mkdtemp()) / "campbell.csv")
-    >>> path.read_text().splitlines()[0]
-    'rotor_speed (rad/s),speed 1 (rad/s),speed 2 (rad/s),decay 1 (1/s),decay 2 (1/s),forward 1,forward 2,straight 1,straight 2'
+    >>> path.read_text().splitlines()[0].split(",")[:4]
+    ['rotor_speed (rad/s)', 'speed 1 (rad/s)', 'speed 2 (rad/s)', 'decay 1 (1/s)']
     """
     table = table_along(result, axis, display=display)
     path = Path(path)
