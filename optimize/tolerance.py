@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.errors import ComputationError, InputError, quoted
+from jaxvib.machine.files import suggest_name
 from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, present_numbers, put_numbers, put_present
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Bounds, count, number
@@ -147,6 +148,9 @@ def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals:
             raise InputError("tolerances", f"is {quoted(text)}; write NAME=SHARE or NAME=LOW..HIGH, such as stiffness=5%")
+        if "." not in name and name not in _SHORT_NAMES and not _MATERIAL.fullmatch(name):
+            known = suggest_name(name, [*_SHORT_NAMES, "material"])
+            raise InputError(f"tolerances.{name}", f"is no short name; {known}, and parameters such as machine.mass")
         if share := _SHARE_PATTERN.fullmatch(value):
             size = float(share[1]) / 100.0
             if not 0.0 < size < 1.0:

@@ -10,7 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.output import fields_of, note
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 
 SEPARATION = click.option(
     "--separation",
@@ -32,6 +32,9 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
         if isinstance(value, tuple):
             from jaxvib.units import numbers  # slow import, which --help does not need
 
+            for point in value:
+                if point.count(",") != 1:
+                    raise InputError("--deck", f"is {quoted(point)}; give X,Y from the centre of mass, m, such as 1.5,0.1")
             value = [numbers([part.strip() for part in point.split(",")], "m", "--deck", 2).tolist() for point in value]
         elif value is not None:
             from jaxvib.units import number  # slow import, which --help does not need

@@ -356,6 +356,9 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     assert "natural frequencies: 42.706, 42.706, 51.247 rpm" in out and "stable, above all natural frequencies:" in out
     code, _, err = typed("regimes", "screen.toml", "--slope", "10")
     assert code == 2 and "--slope is 10 rad (573 degrees), no slope of a deck; write degrees as '10 deg'" in err
+    assert (
+        "--deck is '0.4'; give X,Y from the centre of mass, m, such as" in typed("regimes", "screen.toml", "--deck", "0.4")[2]
+    )
     shown = float(out.split("throw number ")[1].split(",")[0])
     scene = jv.load_scene(tmp_path / "screen.toml")
     np.testing.assert_allclose(shown, jv.working_regime(scene).ellipse((0.4, 0.1), slope="-5 deg").throw_number, rtol=5e-3)

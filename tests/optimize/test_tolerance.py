@@ -71,6 +71,12 @@ def test_deviations_of_two_kinds_of_tolerances_are_independent(scene):
     assert abs(np.corrcoef(numbers.T)[0, 1]) < 0.3
 
 
+def test_unknown_short_names_are_answered_by_the_known_ones(scene):
+    for text, says in (("stiffnes=5%", "did you mean 'stiffness'"), ("load=0..20kg", "unbalance, material, and parameters")):
+        with pytest.raises(jv.InputError, match=says):
+            read_tolerances(scene, [text])
+
+
 def test_range_of_an_array_adds_no_spring():
     machine = jv.two_mass(mass=(50.0, 40.0), stiffness=(4e4, 0.0), damping=(0.0, 0.0), link_stiffness=1e5, link_damping=60.0)
     two = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
