@@ -551,7 +551,10 @@ class SwitchedOff(MotorWrapper):
 
     def __init__(self, motor: Motor, at: Number = 0.0, bearing: Number = 0.0):
         if not isinstance(motor, Motor) or isinstance(motor, SwitchedOff):
-            raise InputError("drive.motor", f"is {quoted(motor)}; it must be a motor, for example InductionMotor(...)")
+            raise InputError(
+                "drive.motor",
+                f"is {quoted(motor)}; it must be a motor that is not switched off already, for example InductionMotor(...)",
+            )
         self.motor, self.kind = motor, "switched_off"
         self.at, self.bearing = read_numbers(SwitchedOff, "drive", at=at, bearing=bearing).values()
 

@@ -118,7 +118,10 @@ def exciter(**more):
             r"exciters\[0\]\.unbalance\.force is '10 kg', which is not in N",
         ),
         (lambda: jv.unbalance(force="10 kN", at=1450), "at is 1450, and a plain number is in rad/s; write '1450 rpm' or"),
-        (lambda: jv.SwitchedOff(jv.ConstantSpeed(9.0)), "drive.motor is .*; it must be a motor, for example InductionMotor"),
+        (
+            lambda: jv.SwitchedOff(jv.ConstantSpeed(9.0)),
+            "drive.motor is .*; it must be a motor that is not switched off already",
+        ),
         (lambda: jv.SwitchedOff(MOTOR, bearing=-1.0), "drive.bearing is -1 N m s; it must be at least 0"),
         (
             lambda: jv.simulate(
