@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
+import diffrax
 import numpy as np
 from jax import Array
 
@@ -19,7 +20,7 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.regime import Regime, RegimeName
 from jaxvib.motion.analysis.separation import prepare_separation, would_separate
 from jaxvib.motion.integrate import WINDOW_SAMPLES, frequency_bounds, whole_turns
-from jaxvib.motion.plan import RunPlan, StepChoice, Tolerance, plan_stretch, with_settled_drives
+from jaxvib.motion.plan import EqualSteps, RunPlan, StepChoice, Tolerance, plan_stretch, require, with_settled_drives
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.simulate import last_state, prepare_run, run_planned
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state, start_state
@@ -163,6 +164,7 @@ def _plan_settle(
     scene = validate_scene(scene)
     scene = with_settled_drives(scene, start, "a motion settles at a constant rotor speed; use ConstantSpeed")
     count(periods, "periods")
+    require(steps, Tolerance, EqualSteps, diffrax.AbstractStepSizeController)
     double = scene.top_speed.dtype.itemsize >= 8
     default_drift = 1e-6 if double else 1e-3
     # Each stretch is a whole number of turns, so that an imbalance continues at its angle.

@@ -115,10 +115,12 @@ def test_what_is_steady_in_the_mean():
         assert not steady(1e-3 * share**k, 5.0 + 0.01 * share**k * np.sin(2.3 * k))
 
 
-def test_settle_refuses_a_spin_up():
+def test_settle_refuses_a_spin_up_and_an_accuracy():
     """Each stretch begins with the rotor at its full speed, so that this start would be that at rest."""
     with pytest.raises(jv.InputError, match=r"start is 'spin_up'; a motion settles at a constant rotor speed; use .*'rest'"):
         jv.settle(scene(), start="spin_up")
+    with pytest.raises(jv.InputError, match=r"^stepsize_controller is Accuracy\(error=0.1\); it must be one of: Tolerance"):
+        jv.settle(scene(), stepsize_controller=jv.Accuracy(0.1))
 
 
 def test_settle_stops_where_a_stretch_fails():
