@@ -172,17 +172,14 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     fixed = [(number, each) for number, each in known_numbers.values() if each.error == 0.0]
     if fixed:
         scene = put_numbers(scene, [number for number, _ in fixed], np.array([each.value for _, each in fixed]))
-    exact = {number.name for number, _ in fixed}
-    free = {number.name: number for number in numbers if number.name not in exact}
+    free = {number.name: number for number in numbers if number.name not in {each.name for each, _ in fixed}}
     free |= {name: number for name, (number, each) in known_numbers.items() if each.error > 0.0}
     _require_torque_balance(scene, free, runs)
     nonlinear = [number for number in free.values() if number.path[-1] != "unbalance"]
     unbalances = tuple(_known_unbalance(scene, k, free, known_numbers) for k in range(len(scene.exciters)))
 
     if not nonlinear and all(known is not None and known.is_exact for known in unbalances):
-        raise InputError(
-            "unknown", f"is {quoted(unknown)}, and all of these numbers are exactly known; nothing is left to find"
-        )
+        raise InputError("unknown", f"is {quoted(unknown)}; these numbers are exactly known, and nothing is left to find")
 
     values = np.array([float(number.read(scene)[0]) for number in nonlinear])
     positive = (values > 0.0) & np.array([number.spec.bounds.low == 0.0 for number in nonlinear], bool)
@@ -198,9 +195,8 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     gains = {c.name: c.gain_error for run in runs for c in run.of_kind(*MOTIONS) if c.gain_error > 0.0}
     # With several exciters, each drive's schedule fixes its angle in every run.
     turns = [k for k, is_marked in enumerate(marked) if k and not (is_marked and marked[0]) and len(scene.exciters) == 1]
-    unknowns = Unknowns(
-        tuple(nonlinear), jnp.asarray(values), jnp.asarray(scale), jnp.asarray(positive), tuple(gains), len(turns)
-    )
+    arrays = jnp.asarray(values), jnp.asarray(scale), jnp.asarray(positive)
+    unknowns = Unknowns(tuple(nonlinear), *arrays, tuple(gains), len(turns))
     cases = enumerate(zip(runs, angles, strict=True))
     prepared = [_samples(scene, run, angle, turns.index(k) if k in turns else None) for k, (run, angle) in cases]
     samples, masks, raw, bounds, times, turned = zip(*prepared, strict=True)

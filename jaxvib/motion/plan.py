@@ -129,9 +129,12 @@ def require(chosen: object, *kinds: type) -> None:
 
 def require_error_estimate(solver: diffrax.AbstractSolver | None, control: object) -> None:
     """**Raises** `InputError` for a `solver` without an error estimate if the `control` of its steps needs one."""
-    is_given = isinstance(control, diffrax.AbstractStepSizeController)
-    is_given = is_given and not isinstance(control, diffrax.AbstractAdaptiveStepSizeController)
-    if solver is not None and not is_given and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+    if isinstance(control, StepControl):
+        is_fixed = control.tolerance is None
+    else:
+        is_fixed = isinstance(control, diffrax.AbstractStepSizeController)
+        is_fixed = is_fixed and not isinstance(control, diffrax.AbstractAdaptiveStepSizeController)
+    if solver is not None and not is_fixed and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
         problem = f"is {type(solver).__name__}, which does not estimate the error of a step"
         raise InputError("solver", f"{problem}; give another solver such as diffrax.Dopri5(), or equal steps")
 
@@ -195,8 +198,7 @@ def plan_run(
     fastest, slowest = map(numpy_of_known, frequency_bounds(scene))
     stiff = stiff_solver(scene, state, fastest) if solver is None and known else None
     control = _step_control(end, steps, estimate)
-    if not (isinstance(control, StepControl) and control.tolerance is None):
-        require_error_estimate(solver, control)
+    require_error_estimate(solver, control)
     if samples is None:
         samples = _enough_samples(speed, end)
     else:

@@ -112,7 +112,7 @@ def test_inputs_turn_the_rotors():
     assert rates.rotor_angles == (-110.0, None, 3.4) and outputs.rotors == (None,) * 3
 
 
-def test_parameters_of_matrices_are_in_the_order_of_their_entries():
+def test_parameters_of_matrices_have_the_order_of_their_entries():
     machine = jv.from_matrices(np.diag([2.0, 3.0]), 0.1 * np.eye(2), [[3e3, -1e3], [-1e3, 2e3]], places=[[0], [1]])
     scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(50.0), unbalance=0.1, at=2)])
     values = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(scene)])

@@ -204,7 +204,7 @@ def test_unknowns_with_their_known_values():
     np.testing.assert_allclose(found.runs[1].scene(found.scene).machine.link_stiffness, [9e4])
 
 
-def test_channels_that_measure_nothing_and_long_delays_are_refused():
+def test_silent_channels_and_long_delays_are_refused():
     run = run_with({"a": np.sin(T)}, channels=[channel("a", direction="across")])
     with pytest.raises(jv.InputError, match=r"channel 'a': direction is \(1.0, 0.0\), but the machine moves vertically only"):
         build_problem(scene_of(), [run], ["machine.stiffness"], {})
@@ -213,7 +213,7 @@ def test_channels_that_measure_nothing_and_long_delays_are_refused():
 
 
 def test_without_a_number_to_find_a_fit_is_refused():
-    with pytest.raises(jv.InputError, match=r"unknown is \['machine.mass'\], and all of these numbers are exactly known"):
+    with pytest.raises(jv.InputError, match=r"unknown is \['machine.mass'\]; these numbers are exactly known"):
         build_problem(scene_of(), [run_with({"a": np.sin(T)})], ["machine.mass"], {"machine.mass": "80 kg"})
     only = build_problem(scene_of(), [run_with({"a": np.sin(T)})], ["exciters[0].unbalance"], {})
     assert only.unknowns.count == 0 and only.unbalances == (None,)

@@ -153,7 +153,7 @@ def test_free_mass_between_stops_is_not_guided():
     np.testing.assert_array_equal(guide, np.zeros((2, 1)))
 
 
-def test_guided_motion_begins_with_the_displacement_of_the_record(monkeypatch):
+def test_guided_motion_begins_at_the_recorded_displacement(monkeypatch):
     """A free vibration; the linear response has multiples of displacements."""
     t, given = 0.005 * np.arange(600), []
     readings = 2e-3 * np.exp(-0.6 * t) * np.cos(np.sqrt(800.0 - 0.36) * t)
