@@ -264,13 +264,25 @@ def _solve_one_by_one(size: int, is_mapped: list[bool], a: Array, b: Array) -> t
     return jax.lax.platform_dependent(a, right, cpu=solve_each, default=jax.vmap(jnp.linalg.solve)), True
 
 
+def eigenvalues(matrix: Array) -> Array:
+    """Return the complex eigenvalues (..., n) of matrices (..., n, n), which have derivatives of any order.
+
+    For `jnp.linalg.eigvals` JAX refuses second derivatives, because those of eigenvectors depend on their normalization. The
+    derivatives of the eigenvalues do not.
+    """
+    pair = jax.lax.linalg.eig(
+        matrix, compute_left_eigenvectors=False, compute_right_eigenvectors=False, enable_eigvec_derivs=True
+    )
+    return pair[0]
+
+
 @custom_vmap
 def eigenvalues_in_turn(matrix: Array) -> Array:
     """Return the complex eigenvalues (n,) of a matrix (n, n), without eigenvectors.
 
     The library is called for one matrix of a batch after the other, see `solve_in_turn`.
     """
-    return jnp.linalg.eigvals(matrix)
+    return eigenvalues(matrix)
 
 
 @eigenvalues_in_turn.def_vmap

@@ -17,7 +17,7 @@ from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import Mount
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
-from jaxvib.numerics.linalg import MAX_EIGENVALUE_ERROR, hermitian_error, hermitian_modes, relative_to
+from jaxvib.numerics.linalg import MAX_EIGENVALUE_ERROR, eigenvalues, hermitian_error, hermitian_modes, relative_to
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
@@ -209,7 +209,7 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
 
     def at(n: Array) -> tuple[Array, ...]:
         resisting = carrier.damping + n * gyroscopic
-        values = jnp.linalg.eigvals(first_order(resisting))
+        values = eigenvalues(first_order(resisting))
         # The coupling is too small to change the speeds. It separates two whirls of equal speed.
         coupled = jax.lax.stop_gradient(resisting + coupling)
         separated, vectors = jnp.linalg.eig(jax.lax.stop_gradient(first_order(coupled)))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxvib.numerics.linalg import (
+    eigenvalues,
     eigenvalues_in_turn,
     hermitian_error,
     hermitian_modes,
@@ -126,3 +127,13 @@ def test_a_metric_is_divided_out_in_its_own_precision(n, precision):
     np.testing.assert_allclose(inverse @ metric @ inverse.T, np.eye(n), atol=digits)
     np.testing.assert_allclose(np.triu(inverse, 1), 0.0, atol=0.0)
     np.testing.assert_allclose(square, inverse @ matrix @ inverse.T, atol=digits * float(jnp.max(jnp.abs(square))))
+
+
+def test_eigenvalues_have_second_derivatives():
+    def largest(x):
+        return jnp.max(eigenvalues(jnp.array([[1.0, x], [2.0, 3.0]])).real)
+
+    # The eigenvalues are 2 +- sqrt(1 + 2 x).
+    np.testing.assert_allclose(largest(1.5), 4.0, rtol=1e-14)
+    np.testing.assert_allclose(jax.grad(largest)(1.5), 0.5, rtol=1e-14)
+    np.testing.assert_allclose(jax.hessian(largest)(1.5), -0.125, rtol=1e-13)

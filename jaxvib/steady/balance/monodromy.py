@@ -17,6 +17,7 @@ from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics import radau
+from jaxvib.numerics.linalg import eigenvalues
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.runtime.programs import cached
 from jaxvib.units import count
@@ -131,4 +132,4 @@ def _slowest_decay(scene: Scene) -> tuple[Array, Array]:
         model.mass, jnp.concatenate([-model.carrier.stiffness, -model.damping(scene.drive.speed)], axis=1)
     )
     first = jnp.concatenate([jnp.zeros((nd, nd)), jnp.eye(nd)], axis=1)
-    return -jnp.max(jnp.linalg.eigvals(jnp.concatenate([first, solved])).real), _steps_for(scene)
+    return -jnp.max(eigenvalues(jnp.concatenate([first, solved])).real), _steps_for(scene)

@@ -16,7 +16,7 @@ from jax import Array
 from jaxvib.equations.jammed_bodies import JammedBodies
 from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import Grid
-from jaxvib.numerics.linalg import relative_to, small_solve
+from jaxvib.numerics.linalg import eigenvalues, relative_to, small_solve
 from jaxvib.numerics.loops import repeat
 from jaxvib.ode.dopri8 import NODES, ROWS
 from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution
@@ -424,7 +424,7 @@ def _small_solve(weight: Array, right: Array) -> Array:
 def _eigenvalues(matrices: Array) -> Array:
     """Return eigenvalues (P, n) of matrices (P, n, n), one matrix after the other, because batched library calls may deadlock
     if several programs run in parallel (jaxlib 0.10)."""
-    return jnp.linalg.eigvals(matrices) if matrices.shape[0] == 1 else jax.lax.map(jnp.linalg.eigvals, matrices)
+    return eigenvalues(matrices) if matrices.shape[0] == 1 else jax.lax.map(eigenvalues, matrices)
 
 
 def deflate(matrix: Array, known: Array) -> tuple[Array, Array]:

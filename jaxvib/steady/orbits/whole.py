@@ -21,7 +21,7 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of, resampling
-from jaxvib.numerics.linalg import small_solve, solve_in_turn
+from jaxvib.numerics.linalg import eigenvalues, small_solve, solve_in_turn
 from jaxvib.steady.orbits.solve import Linearized, newton
 from jaxvib.steady.orbits.stability import deflate
 
@@ -330,11 +330,11 @@ def multipliers_of(
     steps = steps if max_steps is None else jnp.clip(steps, 1, max_steps)
     whole = radau.flow(slopes, n, 2.0 * np.pi, steps, x.dtype, max_steps)
     if forced:
-        return jnp.linalg.eigvals(whole), jnp.full_like(omega, jnp.nan)
+        return eigenvalues(whole), jnp.full_like(omega, jnp.nan)
     rate, second = _rates(grid, x)
     along = jnp.concatenate([rate[:, 0].at[scene.coordinates :].add(1.0), second[:, 0]])
     trivial, rest = deflate(whole, along)
-    return jnp.linalg.eigvals(rest), trivial
+    return eigenvalues(rest), trivial
 
 
 def _steps_for(scene: PeriodicScene, omega: Array) -> Array:

@@ -242,6 +242,12 @@ def test_gradients_forward_reverse_and_by_differences():
     np.testing.assert_allclose(jnp.vdot(reverse, along_x), jnp.vdot(weights, forward), rtol=1e-9)
 
 
+def test_second_derivatives_of_a_jam_can_be_traced():
+    flat, restore = ravel_pytree(published(eps=0.05).scene())
+    curvature = jax.hessian(lambda x: jv.jam_orbit(restore(x), near=0.97, points=16).multiplier)
+    assert jax.eval_shape(curvature, flat).shape == (flat.size, flat.size)
+
+
 def test_beyond_a_fold_the_status_says_so():
     scene = published(eps=0.05, speed=5.3).scene()
     with pytest.raises(jv.ComputationError, match="not_converged"):
