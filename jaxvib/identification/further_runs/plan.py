@@ -79,7 +79,7 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
     - F is the Fisher information about the unknown numbers and the gains of the sensors
     - Each candidate has further unknowns: its state at the first sample and the offsets of its channels. The zero of the
       rotor's angle is also unknown, unless the candidate has a channel of kind "pulses" or "angle"; the mark of such a channel
-      is assumed to be the mark of the runs so far
+      is assumed to be the mark of the runs so far. A wheel with several pulses per turn has a mark if it has a gap
     - The model of the fit gives the expected readings. `change` of a candidate describes an added mass; its `channels` describe
       new sensors and sensors at other places
     - A run with loads on the rotor begins with the state at the first sample of the first run of the fit, and the loads must
