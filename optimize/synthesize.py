@@ -133,6 +133,7 @@ def synthesize(
     report = partial(_report, progress, _SEARCH_SHARE if verify else 0.9)
     if begin is not None:
         options = dataclasses.replace(options, begin=_designs_to_continue(space, begin), starts=len(begin.designs))
+    given = space
     space, problem, result = _search(space, objective, demands, options, report)
     neighbour_scenes = scenes_of(problem, neighbours(problem, result))
     scene = validate_scene(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], neighbour_scenes)))
@@ -140,8 +141,7 @@ def synthesize(
     motion = _motion_of(space, objective, demands)
     named = _named_quantities(space, scene, objective, demands, motion)
     demand_sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
-    batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, neighbour_scenes)
-    reports = evaluate_quantities((*(q for _, q in named), objective, *demand_sides), batch, problem)
+    reports = _values_of_all((*(q for _, q in named), objective, *demand_sides), given.scene, neighbour_scenes, problem)
     limits = limits_of(problem, demands, result, reports[1, len(named) + 1 :].reshape(-1, 2))
     if throw and status is SynthesisStatus.contradictory:
         raise _unmet(limits)
@@ -150,9 +150,9 @@ def synthesize(
     run, unverified = (None, unfinished) if unfinished else _run(scene, motion, verify)
     report("computing the exact motion", 0.99)
     other_tiers = _other_tiers(scene, [q for _, q in named], verify, run, motion)
-    rows = _table(space, scene, named, reports[:2, : len(named)], other_tiers)
+    rows = _table(given, scene, named, reports[:2, : len(named)], other_tiers)
     n = len(_standard_rows(scene, motion, objective.of))
-    before, after = (_outcome(space, s, reports[k, :n]) for k, s in enumerate((space.scene, scene)))
+    before, after = (_outcome(space, s, reports[k, :n]) for k, s in enumerate((given.scene, scene)))
     verified = None if run is None else _by_run(space, run, motion, objective.of)
     report("done", 1.0)
     return Synthesis(
@@ -404,6 +404,14 @@ def _named_quantities(
     named = [sought, *(h.quantity for h in space.held), *(d.quantity for d in demands)]
     standard_quantities = {q for _, q in standard}
     return standard + [(q.words, q) for q in dict.fromkeys(named) if q not in standard_quantities]
+
+
+def _values_of_all(quantities: tuple[Quantity, ...], initial: Scene, others: Scene, problem: Problem) -> np.ndarray:
+    """Return the values (1 + s, q) of quantities of the initial scene and of s other scenes (arrays with a leading axis)."""
+    first = jax.tree.map(lambda leaf: np.asarray(leaf)[None], initial)
+    if jax.tree.structure(first) == jax.tree.structure(others):
+        return evaluate_quantities(quantities, jax.tree.map(lambda a, b: np.concatenate([a, b]), first, others), problem)
+    return np.concatenate([evaluate_quantities(quantities, first), evaluate_quantities(quantities, others, problem)])
 
 
 def _table(

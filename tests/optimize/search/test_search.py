@@ -153,7 +153,11 @@ def test_catalogues_give_the_best_of_all_choices():
     np.testing.assert_allclose(continued.stiffness, least, rtol=1e-9)
     several = DesignSpace(SCENE, FREE, choices={"loads.count": [2, 3, 5]})
     mass = Quantity("mass", "kg", lambda s: NEAREST(s) / 1e8 + (s.loads.mass * s.loads.count - 3.8) ** 2)
-    assert found(several, mass).scene.loads.count == 5
+    most = found(several, mass)
+    assert most.scene.loads.count == 5
+    rows = {row.what: (row.before, row.after) for row in most.table}
+    assert rows["number of loads"] == (3.0, 5.0)  # the scene has 3 loads
+    np.testing.assert_allclose(rows["mass"], [float(mass(scene)) for scene in (SCENE, most.scene)], rtol=1e-9)
 
 
 def test_interrupted_search_continues_from_the_best(tmp_path):
