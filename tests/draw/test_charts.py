@@ -15,7 +15,8 @@ from jaxvib.draw.machine.parts import ground
 from jaxvib.draw.motion.histories import amplitude_histories, time_histories
 from jaxvib.draw.motion.response import response_chart
 from jaxvib.draw.motion.spectra import path_chart
-from jaxvib.draw.results import growth_chart, phase_circles, shapes_chart, speeds_chart
+from jaxvib.draw.results import draw_circle, growth_chart, phase_circles, shapes_chart, speeds_chart
+from jaxvib.draw.style import panels
 from jaxvib.draw.sweeps import label_map
 
 
@@ -242,10 +243,17 @@ def test_a_response_ends_at_half_the_least_and_twice_the_most():
 
 
 def test_the_resultant_of_phases_is_weighted():
-    titles = [
-        phase_circles([("", np.array([0.0, np.pi]))], weights=w).axes[0].get_title() for w in (None, np.array([3.0, 1.0]))
-    ]
-    assert titles == ["\nresultant 0", "\nresultant 0.5"]
+    _, axes = panels(1, 2)
+    for axis, w in zip(axes, (None, np.array([0.75, 0.25])), strict=True):
+        draw_circle(axis, "", np.array([0.0, np.pi]), weights=w)
+    assert [axis.get_title() for axis in axes] == ["\nresultant 0", "\nresultant 0.5"]
+
+
+def test_equal_arrows_have_equal_lengths_in_the_title():
+    (axis,) = panels(1)[1]
+    angle = np.arccos(-0.0625)
+    draw_circle(axis, "", np.array([angle, -angle]), imbalance=0.0625)  # the mean is -0.06250000000000003
+    assert axis.get_title() == "\nloads 0.062, rotor 0.062 (orange), sum 0"
 
 
 def test_labels_of_speeds_that_would_overlap_are_left_out():
