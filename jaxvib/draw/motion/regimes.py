@@ -72,6 +72,8 @@ def regimes_chart(
     circles = axes[curves is not None :]
     for axis in circles:
         axis.set_axis_off()
+    if not regimes:
+        axes[0].text(0.5, 0.5, "no synchronous regime", ha="center", va="center", transform=axes[0].transAxes)
     for axis, regime in zip(circles, regimes, strict=False):
         lines = [f"{scale * regime.speed:.6g} {unit}, {'stable' if regime.stable else 'unstable'}"]
         if regime.phases.size <= _MAX_TITLE_MASSES:
@@ -103,7 +105,7 @@ def _draw_torques(
         for group in groups:
             look = {"color": COLORS[group[0] % len(COLORS)], "ls": stroke, "lw": 1.2}
             axis.plot(scale * curves.speed, values[:, group[0]], label=words.format(_group_name(names, group)), **look)
-    for regime in regimes:
+    for regime in sorted(regimes, key=lambda each: each.stable):  # stable ones on top
         for k, torque in enumerate(regime.torque):
             color = COLORS[k % len(COLORS)]
             look = {"mec": color, "mfc": color if regime.stable else "white", "ms": 5.0, "zorder": 4}

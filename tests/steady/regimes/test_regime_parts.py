@@ -471,6 +471,7 @@ def test_summary_and_plot_of_regimes(two):
     assert [float(several.select(k).speed) for k in range(3)] == [float(regime.speed) - k for k in range(3)]
     assert len(several.summary().splitlines()) == 3 and several.summary().startswith(regime.summary())
     assert as_list(regime, 0).summary() == STATUSES[STATUSES.none]
+    assert [text.get_text() for text in as_list(regime, 0).plot().axes[0].texts] == ["no synchronous regime"]
     for index in (3, -1):
         with pytest.raises(jv.InputError, match=rf"^index is {index}; there are 3 regimes, counted from 0"):
             several.select(index)
