@@ -165,7 +165,10 @@ def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[
     machine = _platforms(scene, 1)
     space = DesignSpace(scene, _springs(machine, 3.0, ("stiffness", "link_stiffness")))
     amplitude_of_mode = amplitude(mode=mode, of=of)
-    return Design(space, -fold_margin(mode=mode), subject_to=(amplitude_of_mode > share * float(amplitude_of_mode(scene)),))
+    present = float(amplitude_of_mode(scene))
+    if not present > 0.0:
+        raise InputError("mode", f"is {mode}; this jam mode does not exist at the rotor speed of the scene")
+    return Design(space, -fold_margin(mode=mode), subject_to=(amplitude_of_mode > share * present,))
 
 
 def linear_screen(

@@ -198,6 +198,7 @@ def test_the_widest_range_is_that_of_the_whole_branch():
         (lambda: widest_range(SCENE, mode=3, keep=2.0), "at most 1"),
         (lambda: lightest_exciter(scene("one_mass", "pendulums"), 0.01, mode=1), "differs from load to load"),
         (lambda: widest_range(SCENE, mode=3, keep="much"), "keep is 'much'"),
+        (lambda: widest_range(scene("two_mass", speed=1e-3), mode=5), "mode is 5; this jam mode does not exist"),
         (lambda: antiphase(SCENE, range_=0.0), "range_ is 0.0; it must be greater than 1"),
         (lambda: antiphase(SCENE, range_="wide"), "range_ is 'wide'"),
         (lambda: feeder(SCREEN, points=[(0.0, 0.0), (1.0, 0.0)], range_=0), "range_ is 0; it must be greater than 1"),
