@@ -101,6 +101,9 @@ def validated(function: F) -> F:
         except _NEEDS_VALUE:
             _require_known(bound.arguments)
             raise
+        except jax.dtypes.TypePromotionError as error:
+            problem = "is 'strict'; it must be 'standard', for example in `with jax.numpy_dtype_promotion('standard'):`"
+            raise InputError("jax_numpy_dtype_promotion", problem) from error
 
     return typing.cast(F, checked)
 

@@ -21,6 +21,18 @@ from jaxvib.units import Number
 
 
 @validated
+def mixed_sum(count: int) -> Array:
+    return jnp.zeros(1, complex) + jnp.ones(1) * count
+
+
+def test_strict_promotion_of_types_is_refused_in_a_sentence():
+    assert mixed_sum(2)[0] == 2.0
+    message = r"^jax_numpy_dtype_promotion is 'strict'; it must be 'standard'"
+    with jax.numpy_dtype_promotion("strict"), pytest.raises(jv.InputError, match=message):
+        mixed_sum(2)
+
+
+@validated
 def question(
     *,
     word: str = "",
