@@ -82,8 +82,8 @@ class Dynamics(eqx.Module):
         """The exciters of the scene, in order."""
         return ungroup(self.groups, (group.part for group in self.groups))
 
-    def __call__(self, t: Array, state: State) -> State:
-        """Return the time derivative of `state` at time `t`.
+    def __call__(self, t: Array, state: State, args: object = None) -> State:  # diffrax passes `args`
+        """Return the time derivative of `state` at time `t`; `args` is not used.
 
         Each exciter is eliminated first, see `RotorDynamics.eliminate`. With the added mass W and the reaction g of all
         exciters, the accelerations a of P's rows then follow from (1 + accelerance W) a = a_free - accelerance g. This is one
@@ -248,7 +248,8 @@ def vector_field(scene: Scene) -> Dynamics:
     **Arguments**: `scene`, on any machine, with any drive and effects.
 
     **Returns** `Dynamics`, a pure function of time (s) and `State` that gives the state's time derivative. `jit`, `vmap` and
-    `grad` apply to it and to the scene. The cost of an evaluation is proportional to the number of loads.
+    `grad` apply to it and to the scene. The cost of an evaluation is proportional to the number of loads. For other solvers and
+    for events, `diffrax.ODETerm(vector_field(scene))` is a term of diffrax, with `initial_state(scene)` as `y0`.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)

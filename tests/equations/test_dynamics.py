@@ -2,6 +2,7 @@
 
 import functools
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -132,6 +133,12 @@ def test_three_mass_is_the_papers_equation_mended():
     residual = [own[0] + link[0] + link[1], own[1] - link[0] + link[2] + s_y2, own[2] - link[1] - link[2]]
     residual += list(ddphi + eps * beta * (dphi - speed) + eps * a[1] * np.cos(phi))
     np.testing.assert_allclose(residual, 0.0, atol=1e-12)
+
+
+def test_vector_field_is_a_term_of_diffrax():
+    s = scene(effects=())
+    field, state = jv.vector_field(s), random_state(s)
+    assert eqx.tree_equal(diffrax.ODETerm(field).vf(0.0, state, None), field(0.0, state))
 
 
 def test_absent_effect_is_not_in_the_program():
