@@ -160,7 +160,8 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: LoadMasses
 
     - `scene` with a machine that moves in two directions
     - `rotor_speed`, rad/s, one or a list (default: the drive's); typical: 50 values from 0 to 500 for a Campbell diagram
-    - `loads`: "fixed": the masses of the loads are fixed to the rotor at their track (the default); "none": without the loads
+    - `loads`: "fixed": the masses of the loads are fixed to the axis of the rotor at their station (the default); "none":
+      without the loads
 
     **Returns** `Whirl`. Speeds and decays have derivatives if no two of them are equal.
 
