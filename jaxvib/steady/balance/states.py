@@ -558,7 +558,8 @@ class BalancedStability(Result):
         largest = ", ".join(f"{abs(m):.6g}" for m in self.multipliers[:3])
         return (
             f"at the rotor speed {speed_text(self.rotor_speed)}: {self.message} {rate}; "
-            f"largest multipliers {largest}, {self.neutral} of them neutral, with an error of {self.error:.1e}"
+            f"largest Floquet multipliers, in absolute value: {largest} "
+            f"(neutral: {self.neutral}; estimated error {self.error:.1e})"
         )
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
