@@ -102,6 +102,8 @@ def validated(function: F) -> F:
             _require_known(bound.arguments)
             raise
         except jax.dtypes.TypePromotionError as error:
+            if getattr(jax.config, "jax_numpy_dtype_promotion", "strict") != "strict":
+                raise
             problem = "is 'strict'; it must be 'standard', for example in `with jax.numpy_dtype_promotion('standard'):`"
             raise InputError("jax_numpy_dtype_promotion", problem) from error
 

@@ -33,6 +33,16 @@ def test_strict_promotion_of_types_is_refused_in_a_sentence():
 
 
 @validated
+def unpromotable_sum(count: int) -> Array:
+    return jnp.zeros(1, jnp.float8_e4m3fn) + count * jnp.ones(1, jnp.bfloat16)
+
+
+def test_other_errors_of_types_pass_unchanged():
+    with pytest.raises(jax.dtypes.TypePromotionError):
+        unpromotable_sum(2)
+
+
+@validated
 def question(
     *,
     word: str = "",
