@@ -173,8 +173,14 @@ def project(problem: Problem, x: np.ndarray) -> _Trial:
 
 def _nonlinear_trial(problem: Problem, x: np.ndarray, linear: np.ndarray) -> _Trial:
     """Return the unknowns of a nonlinear motion, and their cost."""
-    cost = known_cost(problem, x, linear) + float(np.sum(nonlinear_differences(problem, x, linear) ** 2))
-    return _Trial(x, linear, cost if np.isfinite(cost) else np.inf)
+    return _Trial(x, linear, nonlinear_cost(problem, x, linear, nonlinear_differences(problem, x, linear)))
+
+
+def nonlinear_cost(problem: Problem, x: np.ndarray, linear: np.ndarray, left: np.ndarray) -> float:
+    """Return the cost of the differences `left` and of the known values; infinite for a motion that diverges."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        cost = known_cost(problem, x, linear) + float(np.sum(left**2))
+    return cost if np.isfinite(cost) else np.inf
 
 
 def nonlinear_differences(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:

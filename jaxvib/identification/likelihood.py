@@ -17,9 +17,9 @@ import numpy as np
 from jaxvib.identification.directions import Information, eliminate, elimination, free_unbalances, in_polar_unbalances
 from jaxvib.identification.fit import (
     Fitted,
-    known_cost,
     minimize,
     nonlinear_columns,
+    nonlinear_cost,
     nonlinear_differences,
     prior_equations,
     project,
@@ -97,7 +97,7 @@ class _Profile:
         slopes, p, best, last = self.columns[:, :-1], x.size, (x, linear), math.inf
         for _ in range(_VALLEY_STEPS):
             left = nonlinear_differences(problem, x, linear)
-            cost = float(left @ left) + known_cost(problem, x, linear)
+            cost = nonlinear_cost(problem, x, linear, left)
             if not cost < last - _SMALL_REDUCTION:
                 break
             best, last = (x, linear), cost
