@@ -196,7 +196,7 @@ def test_ellipse_of_a_run_is_differentiable():
     ("ask", "says"),
     [
         (lambda r: r.ellipse((0.0, 0.0), body=1), "body is 1; the machine has one body, number 0"),
-        (lambda r: r.ellipse(2), "at is 2; on a body"),
+        (lambda r: r.ellipse(2), "at has 1 number; on a body"),
         (lambda r: r.ellipse((0.0, 1.0, 2.0)), "at has 3 values; 2 are needed"),
         (lambda r: r.deck([]), "points is .*; it must be a list of points"),
         (lambda r: r.deck([(0.0, "1 kg")]), r"points\[0\].*not in m"),

@@ -18,8 +18,11 @@ def evaluation(size, force=None):
     """Evaluation of a run-up with this amplitude of platform 2; platform 1 rests."""
     y, v = size * jnp.sin(SPEED * TIME), size * SPEED * jnp.cos(SPEED * TIME)
     state = SimpleNamespace(displacement=jnp.stack([0.0 * y, y], axis=1), velocity=jnp.stack([0.0 * v, v], axis=1))
-    run = SimpleNamespace(trajectory=SimpleNamespace(state=state, time=TIME, foundation_force=force), omega=jnp.asarray(SPEED))
-    return SimpleNamespace(start_up=lambda until, spin_up: run if (until, spin_up) == (10.0, 2.0) else None)
+    run = SimpleNamespace(trajectory=SimpleNamespace(state=state, time=TIME), omega=jnp.asarray(SPEED), largest_force=force)
+    return SimpleNamespace(
+        start_up=lambda until, spin_up: run if (until, spin_up) == (10.0, 2.0) else None,
+        scene=SimpleNamespace(machine=SimpleNamespace(has_foundation=True)),
+    )
 
 
 @pytest.mark.parametrize("within", [0.05, 0.2])
@@ -52,10 +55,8 @@ def test_settling_time_of_unsettled_motion_is_the_end():
             peak_force(until=10.0, spin_up=wrong)
 
 
-def test_the_peak_of_a_force_is_its_largest_modulus():
-    force = jnp.stack([3.0 * jnp.sin(TIME), 4.0 * jnp.sin(TIME)], axis=1) * jnp.exp(-TIME)[:, None]
-    top = float(jnp.sin(jnp.pi / 4.0) * jnp.exp(-jnp.pi / 4.0))
-    np.testing.assert_allclose(peak_force(until=10.0, spin_up=2.0).read(evaluation(TIME, force)), 5.0 * top, rtol=1e-5)
+def test_the_peak_of_a_force_is_the_largest_of_the_run():
+    assert float(peak_force(until=10.0, spin_up=2.0).read(evaluation(TIME, jnp.asarray(7.5)))) == 7.5
 
 
 def test_platforms_are_counted_from_one():

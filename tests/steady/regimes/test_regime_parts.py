@@ -508,7 +508,7 @@ def test_motions_in_groups_are_listed_and_selected(monkeypatch):
     found, asked = motions(), []
     assert found.summary().splitlines() == [
         "1, 2: 90 rpm; 3: 60 rpm; stable (-2 1/s), interaction 0.12",
-        "0, 2: 90 rpm; 1: 30 rpm; unstable (0.5 1/s), interaction 0.034",
+        "1, 3: 90 rpm; 2: 30 rpm; unstable (0.5 1/s), interaction 0.034",
     ]
     monkeypatch.setattr(partitions, "synchronous_regimes", lambda *args, **given: asked.append((*args, given)) or len(asked))
     assert found.select(1) == [1, 2] and all(scene is THREE for scene, _ in asked)
