@@ -45,6 +45,9 @@ from jaxvib.units import Number
 _REFITS_NEAR_FIRST_VALUES = 2
 """Number of fits in which undetermined combinations of numbers are moved back towards their first values."""
 
+_SAME_NOISE = 1.01
+"""Noise of a channel in such a fit, relative to the fit before, above which the fit has ended at another, worse minimum."""
+
 _STEP = 1e-4
 """Relative change of a number in a difference quotient."""
 
@@ -272,7 +275,8 @@ def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted
         start = fitted.x[: problem.unknowns.count].copy()
         start[:number_count] -= (axes @ (axes.T @ away))[:number_count]
         back = fit_with_torques(problem, [start])
-        if not back.converged:
+        noise_ratio = max(float(np.max(new / old)) for new, old in zip(back.noise, fitted.noise, strict=True))
+        if not back.converged or noise_ratio > _SAME_NOISE:
             break
         fitted = back
     return fitted

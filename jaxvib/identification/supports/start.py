@@ -58,8 +58,8 @@ def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     guided = weighted._replace(runs=runs, linear=_with_first_states(weighted, x, linear))
     trial, free = minimize(guided, x)[0], minimize(weighted, x)[0]
     trial = minimize(weighted._replace(linear=trial.linear), trial.x)[0]
-    # The first displacements of the response, multiplied by a frequency, are large: a start with the stops far open.
-    free = project(weighted._replace(linear=free.linear), _with_open_stops(weighted, free.x, free.linear))
+    of_free = weighted._replace(linear=_with_first_states(weighted, free.x, free.linear))
+    free = project(of_free, _with_open_stops(weighted, free.x, free.linear))
     best = free if free.cost < _SAME_COST * trial.cost else trial
     return problem._replace(linear=best.linear), best.x
 
