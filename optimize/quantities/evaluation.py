@@ -226,6 +226,13 @@ class Evaluation:
         return case.scenes(self.scene), (*self.path, case)
 
 
+def require_foundation(scene: Scene) -> None:
+    """**Raises** `InputError` for a machine from matrices whose force on the foundation is unknown."""
+    if not scene.machine.has_foundation:
+        problem = "is not given, so that the force on the foundation is unknown; give from_matrices(foundation=(T_K, T_C))"
+        raise InputError("machine.foundation", problem)
+
+
 def guesses(modes: JamModes, target: Target) -> Array:
     """Return the load speed, rad/s, of a target from the jam modes of a scene.
 

@@ -22,7 +22,7 @@ from jaxvib.numerics.linalg import magnitude
 from jaxvib.steady.measures import conveying_speed_at
 from jaxvib.steady.points import Ellipse, at_positive_speed
 from jaxvib.units import Number, count
-from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.evaluation import Evaluation, require_foundation
 from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier, walk
 from optimize.quantities.user_inputs import Point, number_in, read_point
 
@@ -206,7 +206,7 @@ def force_per_throw(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: T
 
 
 def _force_per_throw(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:
-    return evaluation.working(tier).foundation_force / _ellipse(evaluation, tier, at, body).semi_major
+    return working_force(evaluation, tier) / _ellipse(evaluation, tier, at, body).semi_major
 
 
 @validated
@@ -409,6 +409,7 @@ def _working_amplitude(evaluation: Evaluation, tier: Tier, k: int) -> Array:
 
 def working_force(evaluation: Evaluation, tier: Tier) -> Array:
     """Return the foundation force of the working regime, N."""
+    require_foundation(evaluation.scene)
     return evaluation.working(tier).foundation_force
 
 

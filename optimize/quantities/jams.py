@@ -17,7 +17,7 @@ from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.steady.measures import shaft_torque
 from jaxvib.units import count
-from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.evaluation import Evaluation, require_foundation
 from optimize.quantities.exciters import RegimeQuantity, working_force, working_power
 from optimize.quantities.quantity import TIERS, BuiltinQuantity, Pair, Quantity, Tier
 
@@ -204,6 +204,8 @@ def foundation_force(*, mode: int | None = None, harmonic: int | None = None, ti
 
 
 def jam_force(evaluation: Evaluation, tier: Tier, mode: int, harmonic: int | None) -> Array:
+    """Return the foundation force in a jam mode, or a harmonic of it, N zero to peak."""
+    require_foundation(evaluation.scene)
     if tier == "leading":
         return evaluation.jam(mode).foundation_force
     if tier == "time":

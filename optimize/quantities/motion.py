@@ -11,7 +11,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.units import Number, count
-from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.evaluation import Evaluation, require_foundation
 from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier
 from optimize.quantities.user_inputs import Point, number_in, read_point
 
@@ -50,6 +50,7 @@ def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
 
 
 def _peak(evaluation: Evaluation, tier: Tier, until: float, spin_up: float | None) -> Array:
+    require_foundation(evaluation.scene)
     return evaluation.start_up(until, spin_up).largest_force
 
 

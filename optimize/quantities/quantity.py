@@ -204,9 +204,6 @@ class BuiltinQuantity(Quantity):
 
     def read(self, evaluation: Evaluation) -> Array:
         assert self.function is not None
-        if (self.unit in ("N", "N/m") or "transmissibility" in self.name) and not evaluation.scene.machine.has_foundation:
-            problem = "is not given, so that the force on the foundation is unknown; give from_matrices(foundation=(T_K, T_C))"
-            raise InputError("machine.foundation", problem)
         return jnp.reshape(self.function(evaluation, self.tier, *self.settings), ())
 
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:

@@ -22,7 +22,7 @@ from jaxvib.machine.carrier import Place, on_body
 from jaxvib.steady.points import ellipse_at, rows_in_plane
 from jaxvib.steady.response import motion_at, operation_of, require_unbalances
 from jaxvib.units import Number, count
-from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.evaluation import Evaluation, require_foundation
 from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier
 from optimize.quantities.user_inputs import number_in
 
@@ -249,6 +249,8 @@ def _field(name: str) -> Read:
 
 
 def _read_field(name: str, model: UnbalancedModel, w: Array) -> Array:
+    if name in ("foundation_force", "transmissibility"):
+        require_foundation(model.scene)
     return jnp.sum(motion_at(model, w)[1][name])
 
 

@@ -9,7 +9,7 @@ from jaxvib.errors import InputError
 from jaxvib.steady import measures
 from jaxvib.steady.measures import acceleration_of, exciter_force, rms_velocity_of, support_loads, weight_deflection
 from jaxvib.units import count
-from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.evaluation import Evaluation, require_foundation
 from optimize.quantities.jams import jam_amplitude, jam_force, jam_quantity, jam_speed, pair_of, pair_text
 from optimize.quantities.quantity import Pair, Quantity, Tier
 
@@ -166,6 +166,7 @@ def support_load(*, mode: int, of: int) -> Quantity:
 
 
 def _support_load(evaluation: Evaluation, tier: Tier, mode: int, of: int) -> Array:
+    require_foundation(evaluation.scene)
     jam = evaluation.jam(mode)
     static, dynamic, _ = support_loads(evaluation.jammed, jam.omega, jam.displacement, weight_deflection(evaluation.jammed))
     if of > static.shape[0]:
