@@ -35,6 +35,12 @@ from jaxvib.steady.regimes.synchronous import require_one_speed
 from jaxvib.units import Number, Numbers, count, number, numbers
 from jaxvib.units.known import when_known
 
+_LENGTHS = ("displacement", "amplitude")
+"""Fields of a response that are 0 at speed 0, except for those of a machine without supports."""
+
+_RATES_AND_FORCES = ("acceleration", "velocity", "exciter_force", "foundation_force", "torque", "power")
+"""Further fields of a response that are 0 at speed 0."""
+
 _POINTS_PER_SIDE = 64
 """Number of speeds on each side of a resonance in the default range."""
 
@@ -324,18 +330,10 @@ def _response(scene: Scene, speeds: Array, phases: Array) -> Response:
     resonances = jax.lax.stop_gradient(model).modes()[0]
     status, curve = jax.vmap(partial(motion_at, model))(jnp.where(speeds > 0.0, speeds, _slow_speed(resonances)))
     rests, moves = speeds == 0.0, resonances[0] == 0.0
-    for name in (
-        "displacement",
-        "amplitude",
-        "acceleration",
-        "velocity",
-        "exciter_force",
-        "foundation_force",
-        "torque",
-        "power",
-    ):
-        is_zero = rests & ~moves if name in ("displacement", "amplitude") else rests
-        curve[name] = jnp.where(is_zero.reshape((-1,) + (1,) * (curve[name].ndim - 1)), 0.0, curve[name])
+    for name in (*_LENGTHS, *_RATES_AND_FORCES):
+        is_zero = rests & ~moves if name in _LENGTHS else rests
+        is_zero = is_zero.reshape((-1,) + (1,) * (curve[name].ndim - 1))
+        curve[name] = jnp.where(is_zero, 0.0 * curve[name], curve[name])  # an unknown force stays NaN
     operating, folds = operation_of(model)
     fields = curve | {"speed": speeds}
     return Response(**fields, status=status, operating=operating, folds=folds, resonances=resonances, scene=scene)
