@@ -301,6 +301,10 @@ class Machine(Part):
         """Return the coordinates (nd,) of a translation of the whole machine upward by 1 m; None if they are unknown."""
         return None
 
+    def require_valid(self) -> None:
+        """**Raises** `InputError` for arrays that were replaced and do not fit together. By default no array is examined: the
+        constructor is called again with the new values."""
+
     @property
     def has_foundation(self) -> bool:
         """True if the force on the foundation is known, see `Carrier`; otherwise results state NaN."""

@@ -22,7 +22,6 @@ from jaxvib.machine.drives.drive import Motor
 from jaxvib.machine.effects.base import static_imbalances, total_gravity
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import MAX_USUAL_SPEED, Exciter, Scene, read_unbalance, require_comparable
-from jaxvib.machine.structures.matrices import MatrixMachine
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.units import conditions_of_traced_values
@@ -245,8 +244,7 @@ _CARRIED = ("loads", "unbalance")
 def _rebuild(scene: Scene) -> None:
     """Construct each part of a scene again. **Raises** `InputError` for a known value or a shape that is not allowed."""
     _rebuild_part(scene.machine, "machine")
-    if isinstance(scene.machine, MatrixMachine):
-        scene.machine.require_valid()
+    scene.machine.require_valid()
     for k, exciter in enumerate(scene.exciters):
         with within(scene.prefix_of(k)):
             if exciter.loads is not None:
