@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
 from typing import TypeAlias, TypeGuard, cast
 
 import equinox as eqx
@@ -176,14 +175,12 @@ def _row_table(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
     heads = "".join(f"<th{_column_class(rows, name)}>{escaped(_words(name))}{_unit_of(name, units)}</th>" for name in names)
     body = ""
     for row in rows[:_MAX_ROWS]:
-        body += (
-            "<tr>" + "".join(f"<td{_column_class(rows, name)}>{_cell(row.get(name), units)}</td>" for name in names) + "</tr>"
-        )
+        cells = (f"<td{_column_class(rows, name)}>{_cell(row.get(name), units)}</td>" for name in names)
+        body += f"<tr>{''.join(cells)}</tr>"
         for name in long_names:
             if row.get(name):
-                body += (
-                    f"<tr><td class='below' colspan='{len(names)}'>{escaped(_words(name))}: {_cell(row[name], units)}</td></tr>"
-                )
+                text = f"{escaped(_words(name))}: {_cell(row[name], units)}"
+                body += f"<tr><td class='below' colspan='{len(names)}'>{text}</td></tr>"
     return f"<div class='wide'><table><tr>{heads}</tr>{body}</table></div>{_more_rows_note(len(rows))}"
 
 
@@ -198,21 +195,22 @@ def _grid_table(values: Sequence[Plain]) -> str:
     """Return a list of lists as a table; for other lists a sentence with the number of entries and their range."""
     rows = [x for x in values if isinstance(x, list) and _fits_in_cell(x)]
     if len(rows) == len(values):
-        body = "".join("<tr>" + "".join(f"<td class='n'>{_cell(x)}</td>" for x in row) + "</tr>" for row in rows[:_MAX_ROWS])
+        body = "".join(
+            "<tr>" + "".join(f"<td class='n'>{_cell(x, {})}</td>" for x in row) + "</tr>" for row in rows[:_MAX_ROWS]
+        )
         return f"<div class='wide'><table>{body}</table></div>{_more_rows_note(len(values))}"
     numbers = [x for x in values if isinstance(x, (int, float)) and not isinstance(x, bool)]
     if not numbers:
         return f"<p>{len(values)} values; see the output of --json or --out</p>"
-    return (
-        f"<p>{len(values)} numbers from {_cell(min(numbers))} to {_cell(max(numbers))}; see the output of --json or --out</p>"
-    )
+    least, largest = (_cell(each, {}) for each in (min(numbers), max(numbers)))
+    return f"<p>{len(values)} numbers from {least} to {largest}; see the output of --json or --out</p>"
 
 
 def _more_rows_note(count: int) -> str:
     return f"<p>{count - _MAX_ROWS} more rows; see the output of --json or --out</p>" if count > _MAX_ROWS else ""
 
 
-def _cell(value: Plain, units: Units = MappingProxyType({})) -> str:
+def _cell(value: Plain, units: Units) -> str:
     """Return a value as HTML; `units`: those of numbers in tables within it."""
     if value is None:
         return "none"

@@ -70,9 +70,8 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
     for name, axes, values, unit in columns(result):
         if values.ndim != len(axes):
             continue
-        while axes[:1] != (axis,) and values.shape[:1] == (
-            1,
-        ):  # one point of the first axis, such as one segment of a spectrum
+        # A first axis of one point, such as the only segment of a spectrum, is left out.
+        while axes[:1] != (axis,) and values.shape[:1] == (1,):
             axes, values = axes[1:], values[0]
         if axes[:1] != (axis,):
             continue

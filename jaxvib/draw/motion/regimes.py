@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
+from jaxvib.display import Drawn, Onto, speed_unit
 from jaxvib.draw.results import draw_circle
 from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, legend_above, panels
 
@@ -44,15 +44,14 @@ def regimes_chart(
     *,
     names: Sequence[str],
     resultant: bool = False,
-    unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
     """Draw the torques over the speed in the first panel (if there are `curves`), and the phases of each regime on a circle.
 
     Points are filled for stable regimes, hollow for unstable ones.
 
-    **Arguments**: `resonances`, rad/s; `names` (count,) of the masses; `resultant`, see `phase_circles`; `unit` of the speeds;
-    `ax`: as many axes as there are panels.
+    **Arguments**: `resonances`, rad/s; `names` (count,) of the masses; `resultant`, see `phase_circles`; `ax`: as many axes
+    as there are panels.
 
     >>> import numpy as np
     >>> one = DrawnRegime(100.0, np.zeros(2), np.ones(2), True)
@@ -61,7 +60,7 @@ def regimes_chart(
     >>> [axis.get_title().splitlines() for axis in figure.axes]
     [[], ['954.93 rpm, stable', 'phases 0, 0 deg', 'torques 1, 1 N m']]
     """
-    unit, scale = speed_unit(unit)
+    unit, scale = speed_unit()
     count = len(regimes) + (curves is not None)
     columns = max(count, 1) if ax is not None else min(max(count, 1), 4)
     rows = 1 if ax is not None else -(-max(count, 1) // columns)
