@@ -150,8 +150,8 @@ def test_undetermined_combinations_return_to_the_first_values(monkeypatch):
         starts.append(given[0])
         return fitted_at(given[0][0], 0.5 if len(starts) < 2 else 0.0)
 
-    def fitted_at(x, unbalance, converged=True):
-        return Fitted(np.array([x]), np.array([unbalance]), problem, None, None, (), (), (), converged)
+    def fitted_at(x, unbalance, converged=True, noise=1e-3):
+        return Fitted(np.array([x]), np.array([unbalance]), problem, None, None, (), (np.array([noise]),), (), converged)
 
     def information_of(fitted):
         values = np.array([0.0, 0.05 * np.exp(fitted.linear[0])])
@@ -168,6 +168,9 @@ def test_undetermined_combinations_return_to_the_first_values(monkeypatch):
     assert _near_first_values(scene_of(2), problem, lost) is lost and starts == []
     monkeypatch.setattr(sys.modules[propagate.__module__], "fit_with_torques", lambda *_: lost)
     good = fitted_at(0.3, 0.5)
+    assert _near_first_values(scene_of(2), problem, good) is good
+    worse = fitted_at(-0.1, 0.0, noise=1.02e-3)
+    monkeypatch.setattr(sys.modules[propagate.__module__], "fit_with_torques", lambda *_: worse)
     assert _near_first_values(scene_of(2), problem, good) is good
     axes = np.zeros((2, 0))
     assert _near_first_values(scene_of(2), problem, good) is good

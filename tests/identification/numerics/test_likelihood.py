@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize
 
-from jaxvib.identification import likelihood
+from jaxvib.identification import fit, likelihood
 from jaxvib.identification.likelihood import QUANTILE, _Profile, profile_intervals
 from jaxvib.identification.problem import Known, Problem
 
@@ -176,7 +176,7 @@ def test_steps_lead_into_a_curved_valley(monkeypatch):
     slopes = np.array([[20.0, 0.0, -20.0, 0.0], [0.0, -20.0, 0.0, -20.0], [-1.0, 0, 0, 0], [0, -1.0, 0, 0], [0, 0, 0, 0]])
     monkeypatch.setattr(likelihood, "nonlinear_differences", differences)
     prior = np.diag([1e6, 0.0, 0.0, 0.0])
-    monkeypatch.setattr(likelihood, "known_cost", lambda problem, x, linear: 1e6 * (x[0] - 0.5) ** 2)
+    monkeypatch.setattr(fit, "known_cost", lambda problem, x, linear: 1e6 * (x[0] - 0.5) ** 2)
     monkeypatch.setattr(
         likelihood, "prior_equations", lambda problem, x, linear: (prior, -1e6 * np.array([x[0] - 0.5, 0.0, 0.0, 0.0]))
     )
