@@ -35,7 +35,7 @@ from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import lifting_torques
-from jaxvib.numerics.linalg import small_solve, times
+from jaxvib.numerics.linalg import magnitude, small_solve, times
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.runtime.programs import cached
 
@@ -331,20 +331,22 @@ def resultant_of(model: LinearModel, phasors: Array) -> Array:
     """Return the resultant of the centrifugal forces per w^2, (np,) kg m complex: sum_j S_j exp(i alpha_j) e_j.
 
     `phasors` (count,): exp(i alpha) of each load, or of the unbalance of an exciter without loads, which includes the static
-    imbalance of its rotor. The result is NaN for loads that do not move on a circle.
+    imbalance of its rotor. The result is NaN for loads that do not move on a circle, and 0 if the forces cancel up to the
+    errors of the phases.
     """
-    total, first = jnp.zeros((), phasors.dtype), 0
+    total, largest, first = jnp.zeros((), phasors.dtype), 0.0, 0
     for exciter, mount in zip(model.scene.exciters, model.mounts, strict=True):
         loads = exciter.loads
         if loads is None:
             unbalance = 0.0 if exciter.unbalance is None else exciter.unbalance
-            each = phasors[first] * sum((amount for amount in _imbalances(exciter, about_tilts=False)), unbalance)
+            size = sum((amount for amount in _imbalances(exciter, about_tilts=False)), unbalance)
         else:
             size = loads.mass * loads.radius if isinstance(loads, CircularLoads) else jnp.nan
-            each = jnp.sum(size * phasors[first : first + loads.count])
-        total = total + each * rotating_direction(mount, exciter.direction)
-        first += 1 if loads is None else loads.count
-    return total
+        each = size * phasors[first : first + (1 if loads is None else loads.count)]
+        total = total + jnp.sum(each) * rotating_direction(mount, exciter.direction)
+        largest = largest + jnp.sum(magnitude(each))
+        first += each.shape[0]
+    return jnp.where(magnitude(total) <= jnp.finfo(phasors.dtype).eps ** 0.5 * largest, 0.0, total)
 
 
 @cached

@@ -247,6 +247,8 @@ class VibrationMeasures(Readable):
         if ratio < _LARGEST_TRANSMISSIBILITY:
             passed = f"of the exciter's {quantity_text(self.exciter_force, 'N', 4)}, {100.0 * ratio:.3g} % reach the foundation"
             lines.append(passed + (f" (isolation {100.0 * (1.0 - ratio):.3g} %)" if ratio < 1.0 else ""))
+        elif float(self.exciter_force) == 0.0:
+            lines.append("the forces of the exciters cancel: there is no transmissibility")
         shafts = [
             f"mean torque {float(t):.4g} N m, mean power {float(p):.4g} W" for t, p in zip(self.torque, self.power, strict=True)
         ]

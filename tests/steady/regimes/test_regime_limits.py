@@ -48,10 +48,15 @@ def test_exciters_on_one_axis_have_two_isolated_regimes(second):
 
 
 def test_cancelling_forces_leave_the_machine_at_rest():
-    regime = jv.working_regime(scene_of([(0.1, 0.2)] * 3, (1, 1, 1)))
+    scene = scene_of([(0.1, 0.2)] * 3, (1, 1, 1))
+    regime = jv.working_regime(scene)
     assert regime.status_name == "no_vibration" and "no vibration" in regime.summary()
     np.testing.assert_allclose(regime.speed, 100.0, rtol=1e-12)
     np.testing.assert_allclose(regime.amplitude, 0.0, atol=1e-12)
+    measures = jv.vibration_measures(scene, regime.vibration())
+    assert float(measures.exciter_force) == 0.0 and np.isinf(float(measures.transmissibility))
+    text = measures.summary()
+    assert "the forces of the exciters cancel: there is no transmissibility" in text and "reach the foundation" not in text
 
 
 def test_no_damping_is_not_called_stable():
