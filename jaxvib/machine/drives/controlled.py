@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import cast
 
 import equinox as eqx
@@ -101,6 +102,10 @@ def _require_ascending(values: np.ndarray, name: str) -> None:
         raise InputError(f"drive.{name}[{k}]", f"is {values[k]:g} after {values[k - 1]:g}; list the {name} in ascending order")
 
 
+_at_each_time = partial(jnp.vectorize, excluded=(0,))
+"""Decorator of methods of a single time, which then accept arrays of times."""
+
+
 class SpeedProfile(IdealDrive):
     """Drive that prescribes the rotor speed at several times, with constant accelerations between them.
 
@@ -142,11 +147,13 @@ class SpeedProfile(IdealDrive):
         lengths = jnp.diff(self.times)
         return jnp.clip(t - self.times[:-1], 0.0, lengths), jnp.diff(self.speeds) / lengths
 
+    @_at_each_time
     def speed_at(self, t: Array) -> Array:
         """Return the speed by linear interpolation between the points."""
         elapsed, acceleration = self._elapsed(t)
         return self.speeds[0] + jnp.sum(acceleration * elapsed)
 
+    @_at_each_time
     def angle_at(self, t: Array) -> Array:
         """Return the angle: the sum of v T + a T^2 / 2 over the segments, plus the angles before and after them."""
         elapsed, acceleration = self._elapsed(t)
@@ -154,6 +161,7 @@ class SpeedProfile(IdealDrive):
         before, after = jnp.minimum(t, self.times[0]), jnp.maximum(t - self.times[-1], 0.0)
         return within + self.speeds[0] * before + self.speeds[-1] * after
 
+    @_at_each_time
     def acceleration_at(self, t: Array) -> Array:
         """Return the acceleration of the segment, 0 before the first and after the last time."""
         _, acceleration = self._elapsed(t)

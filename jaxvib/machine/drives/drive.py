@@ -291,7 +291,7 @@ class ConstantSpeed(IdealDrive):
 
     def speed_at(self, t: Array) -> Array:
         """Return n."""
-        return self.speed
+        return jnp.broadcast_to(self.speed, jnp.shape(t))
 
     def angle_at(self, t: Array) -> Array:
         """Return n t."""
@@ -299,7 +299,7 @@ class ConstantSpeed(IdealDrive):
 
     def acceleration_at(self, t: Array) -> Array:
         """Return 0."""
-        return jnp.zeros_like(self.speed)
+        return jnp.zeros_like(self.speed, shape=jnp.shape(t))
 
 
 class SpinUp(IdealDrive):

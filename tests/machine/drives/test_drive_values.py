@@ -257,6 +257,22 @@ def test_ideal_drives_settle_at_their_working_speed():
     assert constant.jump_ts() == () == jv.SpinUp(60.0, duration=4.0).jump_ts()
 
 
+@pytest.mark.parametrize(
+    "drive",
+    [
+        jv.ConstantSpeed(60.0),
+        jv.SpinUp(60.0, duration=4.0),
+        jv.RunUp(60.0, acceleration=20.0),
+        jv.SpeedProfile([0.0, 2.0, 6.0, 8.0], [0.0, 60.0, 60.0, 30.0]),
+    ],
+    ids=lambda drive: drive.kind,
+)
+def test_ideal_drives_accept_arrays_of_times(drive):
+    for function in (drive.speed_at, drive.angle_at, drive.acceleration_at):
+        for times in (np.array([1.0, 3.0, 7.0]), np.ones((2, 3))):  # as many times as segments
+            np.testing.assert_allclose(function(times), np.vectorize(lambda t: float(function(t)))(times), rtol=1e-14)  # noqa: B023
+
+
 def test_run_up_changes_at_its_end():
     drive = jv.RunUp(60.0, acceleration=20.0)
     assert [float(drive.acceleration_at(t)) for t in (0.0, 2.9, 3.0, 4.0)] == [20.0, 20.0, 0.0, 0.0]
