@@ -273,8 +273,9 @@ def _problem(value: Any, kind: Any) -> str | InputError | None:
     if kind is bool:
         return None if isinstance(value, (bool, np.bool_)) else "True or False"
     if kind is int:
-        whole = is_whole(value) and abs(value) <= _MAX_WHOLE
-        return None if whole or _is_traced(value) else "a whole number"
+        if _is_traced(value):
+            return "a whole number that is known outside of jit, grad and vmap"
+        return None if is_whole(value) and abs(value) <= _MAX_WHOLE else "a whole number"
     if kind is float:
         return _problem_of_float(value)
     if kind is complex and (isinstance(value, complex) or getattr(getattr(value, "dtype", None), "kind", "") == "c"):

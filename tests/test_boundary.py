@@ -118,6 +118,12 @@ def test_an_argument_of_another_type_ends_in_a_sentence(arguments, sentence):
     assert str(caught.value).startswith(sentence)
 
 
+def test_a_traced_whole_number_is_refused():
+    sentence = r"^count is .*Tracer.*; it must be a whole number that is known outside of jit, grad and vmap"
+    with pytest.raises(jv.InputError, match=sentence):
+        jax.eval_shape(lambda count: len(question(count=count)), 3)
+
+
 def test_arguments_of_the_right_types_pass():
     kept = dict(word="a", flag=np.True_, count=np.int64(3), size=np.float32(2.0), side="right", path=pathlib.Path("x"))
     more = dict(make=len, sizes=(1.0, np.float64(2.0)), pair=(1, 2), shares={"a": 1}, array=jnp.ones(2), speed="3 rpm")

@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from jaxvib.boundary import is_whole
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers import Part
 from jaxvib.results.readable import Readable
@@ -51,6 +52,15 @@ def read_place(at: int | Number | Sequence[Number] | None, name: str) -> int | A
     if isinstance(at, (list, tuple)) or getattr(at, "ndim", 0) > 0:
         return numbers(at, "m", name, 2)
     return number(cast(Number, at), "m", name)
+
+
+def read_number_of_place(place: object, allowed: str, last: int, name: str) -> int:
+    """Return the number of a place, 1 to `last`; None is 1. **Raises** `InputError` with the text `allowed` otherwise."""
+    if place is None:
+        return 1
+    if not is_whole(place) or not 1 <= cast(int, place) <= last:
+        raise InputError(name, f"is {quoted(place)}; {allowed}")
+    return int(cast(int, place))
 
 
 def on_body(at: int | Array | None, body: int) -> Place:

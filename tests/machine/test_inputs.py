@@ -185,7 +185,7 @@ WRONG_ROTORS = {
     ),
     "position of platforms": (
         lambda: rotor_scene(two(), None, (jv.Stop(1e6, gap=0.0, position=0.1),)),
-        r"name a platform instead",
+        r"is .*0\.1.*; the machine has platforms 1",
     ),
     "platform of a rotor": (lambda: rotor_scene(effects=(jv.CubicSupport(1.0, platform=1),)), r"on a rotor give a position"),
     "both places": (lambda: jv.CubicSupport(1.0, platform=1, position=0.1), r"has both a platform and a position"),

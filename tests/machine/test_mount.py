@@ -93,11 +93,16 @@ def test_loads_on_two_discs_are_euler_lagrange():
     ("body", "place", "message"),
     [
         (machines()["two_mass"], 3, "place is 3; the machine has platforms 1 to 2"),
-        (machines()["two_mass"], 0.1, "is a distance along a rotor's axis; name a platform instead, 1 to 2"),
+        (machines()["two_mass"], 0.1, "place is 0.1; the machine has platforms 1 to 2"),
+        (machines()["two_mass"], {}, "place is {}; the machine has platforms 1 to 2"),
+        (machines()["two_mass"], True, "place is True; the machine has platforms 1 to 2"),
+        (machine(), {}, "place is {}, which is not a number; write a number in m"),
+        (machine(), float("nan"), "place is nan m; a finite number is needed"),
+        (machine(), np.int64(1), "place is 1, which numbers a platform; on a rotor give a position"),
         (machine(), 1, "place is 1, which numbers a platform; on a rotor give a position"),
         (jv.planar_rotor(mass=37.0, stiffness=1e6, damping=8.0), 0.1, "names a place .*, whose points all move together"),
     ],
-    ids=["no platform", "distance", "platform", "planar"],
+    ids=["no platform", "distance", "object", "Boolean", "rotor", "nan", "NumPy", "platform", "planar"],
 )
 def test_a_place_that_a_machine_lacks_is_refused(body, place, message):
     with pytest.raises(jv.InputError, match=message):

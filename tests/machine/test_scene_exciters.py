@@ -145,7 +145,7 @@ BAD = {
     "jam": (lambda: jv.initial_state(two(), "jam", mode=1), "start is 'jam', but scene has 2 exciters; start at 'rest'"),
     "zero": (lambda: one_on(ROTOR, at=0), r"^at is 0; .* a distance of 0 m is written 0.0"),
     "truth value": (lambda: two(at=True), r"at is True; it must be a whole number"),
-    "distance": (lambda: two(at="2 mm"), r"at is a distance along a rotor's axis; name a platform instead"),
+    "distance": (lambda: two(at="2 mm"), r"at is .*0\.002.*; the machine has platforms 1 to 2"),
     "friction without loads": (lambda: two(effects=jv.DryFriction(0.01, 0.02)), r"acts on loads, but this exciter has none"),
     "shared effect": (lambda: jv.Exciter(LOADS, DRIVE, effects=jv.Gravity()), "effects.gravity acts on the whole machine"),
     "own effect": (

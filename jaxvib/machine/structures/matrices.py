@@ -6,17 +6,18 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxvib.boundary import is_real
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.carrier import Carrier, Machine, Mount, Place
+from jaxvib.machine.carrier import Carrier, Machine, Mount, Place, read_number_of_place
 from jaxvib.machine.numbers import unit
 from jaxvib.numerics.linalg import hermitian_modes, relative_to
 from jaxvib.units import count
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_known, when_known
 
 _MAX_ASYMMETRY = 1e-9
 """Largest asymmetry of a matrix, relative to its largest entry, in double precision."""
@@ -87,10 +88,8 @@ class MatrixMachine(Machine):
         when_known(check, self.mass, self.stiffness)
 
     def _all_rows(self, place: Place, name: str) -> Array:
-        number, last = 1 if place is None else place, self.places_rows.shape[0]
-        if not isinstance(number, int) or not 1 <= number <= last:
-            raise InputError(name, f"is {quoted(number)}; give the number of a place, 1 to {last}")
-        return self.places_rows[number - 1]
+        last = self.places_rows.shape[0]
+        return self.places_rows[read_number_of_place(place, f"give the number of a place, 1 to {last}", last, name) - 1]
 
 
 def from_matrices(
@@ -164,7 +163,7 @@ def _lowest_modes(mass: Array, stiffness: Array, number: int) -> Array:
 def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:
     """Return a matrix, square if `shape` is None; a number stands for a 1 x 1 matrix."""
     try:
-        is_complex = np.iscomplexobj(value)
+        is_complex = any(map(np.iscomplexobj, jax.tree.leaves(value)))
         matrix = jnp.array(value, dtype=None if is_complex else float)  # a copy: JAX may share the memory of an array of NumPy
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(name, f"is {quoted(value)}; it must be a square array of numbers, in SI units") from error
@@ -216,6 +215,8 @@ def _read_places(places: Any, size: int) -> Array:
 def _read_rows(place: Any, name: str, size: int) -> Array:
     """Return the matrix that gives the displacement of a place, from the indices of its coordinates or from a matrix."""
     shape = _shape_of(place)
+    if len(shape) == 1:
+        require_known(list(place), name, "from_matrices", "give the indices of coordinates as whole numbers of Python")
     if len(shape) == 1 and all(is_real(each) and float(each).is_integer() for each in place):
         chosen = [int(each) for each in place]
         if not all(0 <= each < size for each in chosen) or not 1 <= len(chosen) <= 3:
@@ -241,5 +242,7 @@ def _shape_of(value: Any) -> tuple[int, ...]:
     """Return the shape of an array or of nested lists; () if the lists have different lengths."""
     try:
         return np.shape(value)
+    except jax.errors.TracerArrayConversionError:
+        return jnp.asarray(value).shape
     except ValueError:
         return ()

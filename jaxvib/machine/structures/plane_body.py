@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import BodyPoint, Carrier, Machine, Mount, Place
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.machine.structures.damping import damping_constants
-from jaxvib.units import Number, count
+from jaxvib.units import Number, Numbers, count, numbers
 
 
 class PlaneSupport(Part):
@@ -144,14 +144,14 @@ class _Bodies(Machine):
                 if each.to is None:
                     force[name] = force[name] + at_point
                 matrix[name] = matrix[name] + rows.T @ at_point
-        numbers = [""] if len(inertias) == 1 else map(str, range(len(inertias)))
+        bodies = [""] if len(inertias) == 1 else map(str, range(len(inertias)))
         return Carrier(
             mass=jnp.diag(jnp.stack([value for mass, inertia in inertias for value in (mass, mass, inertia)])),
             damping=matrix["damping"],
             stiffness=matrix["stiffness"],
             foundation_stiffness=force["stiffness"],
             foundation_damping=force["damping"],
-            coordinates=tuple(f"{name}{number}" for number in numbers for name in ("x", "y", "psi")),
+            coordinates=tuple(f"{name}{body}" for body in bodies for name in ("x", "y", "psi")),
             coordinate_units=("m", "m", "rad") * len(inertias),
         )
 
@@ -170,9 +170,9 @@ class _Bodies(Machine):
             return self._point_rows(jnp.zeros(2, dtype), body)
         size = len(point) if isinstance(point, (list, tuple)) else getattr(point, "size", 1)
         if size != 2:
-            numbers = f"{size} number{'s' * (size != 1)}"
-            raise InputError(name, f"has {numbers}; on a body in a plane give (x, y), m from its centre of mass")
-        return self._point_rows(jnp.asarray(point, dtype), body)
+            many = f"{size} number{'s' * (size != 1)}"
+            raise InputError(name, f"has {many}; on a body in a plane give (x, y), m from its centre of mass")
+        return self._point_rows(numbers(cast(Numbers, point), "m", name, 2).astype(dtype), body)
 
     def support_rows(self) -> tuple[Array, Array]:
         """Return the rows of the forces of all supports, also of those between two bodies, see `Machine.support_rows`."""

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.carrier import Carrier, Machine, Mount, Place
+from jaxvib.machine.carrier import Carrier, Machine, Mount, Place, read_number_of_place
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.machine.structures.damping import damping_constants
 from jaxvib.units import Number, Numbers, count
@@ -79,11 +79,8 @@ class Platforms(Machine):
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
         """Return the row of a platform's coordinate; None is the first platform."""
-        n, which = self.mass.shape[0], 1 if place is None else place
-        if not isinstance(which, int):
-            raise InputError(name, f"is a distance along a rotor's axis; name a platform instead, 1 to {n}")
-        if not 1 <= which <= n:
-            raise InputError(name, f"is {which}; the machine has platforms 1 to {n}")
+        n = self.mass.shape[0]
+        which = read_number_of_place(place, f"the machine has platforms 1 to {n}", n, name)
         return jnp.asarray(np.eye(n)[which - 1 : which], dtype=self.mass.dtype)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import partial
+from typing import cast
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -16,7 +16,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine, Mount, Place
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.machine.structures.damping import damping_constants
-from jaxvib.units import Number, Numbers
+from jaxvib.units import Number, Numbers, number
 from jaxvib.units.known import require_if_known, when_known
 
 _MASS = unit("kg", low=0.0, open_low=True, words="mass of the rotor")
@@ -120,17 +120,17 @@ class Rotor(Machine):
 
         None is the common station of the loads, or the centre of mass if each load has a separate station.
         """
-        if isinstance(place, int):
+        if isinstance(place, (int, np.integer)):
             raise InputError(
                 name, f"is {place}, which numbers a platform; on a rotor give a position, m from the centre of mass"
             )
-        if isinstance(place, Sequence) or (isinstance(place, jax.Array) and place.ndim > 0):
+        if isinstance(place, (list, tuple)) or getattr(place, "ndim", 0) > 0:
             raise InputError(
                 name, f"is {quoted(place)}, a point of a body; on a rotor give a position, m from the centre of mass"
             )
         translation, tilt = self._directions()
         shared = self.stations if self.stations.ndim == 0 else None
-        distance = shared if place is None else jnp.asarray(place)
+        distance = shared if place is None else number(cast(Number, place), "m", name)
         return translation if distance is None else translation + distance * tilt
 
     def _directions(self) -> tuple[Array, Array]:

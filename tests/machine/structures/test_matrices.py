@@ -291,3 +291,13 @@ def test_forces_on_an_unknown_foundation_are_nan():
     found = jv.response(turning, [0.0, 20.0])
     assert np.all(np.isnan(found.foundation_force)) and np.all(np.isnan(found.transmissibility))
     assert found.exciter_force.tolist() == [0.0, 40.0]
+
+
+def test_traced_entries_are_read_and_traced_indices_refused():
+    def rows(entry, place):
+        return jv.from_matrices([[entry, 0.0], [0.0, 2.0]], ONE, ONE, places=[place(entry)]).places_rows
+
+    traced = jax.jit(lambda entry: rows(entry, lambda entry: [[entry, 3.0]]))(2.0)
+    np.testing.assert_array_equal(traced, [[[2.0, 3.0]]])
+    with pytest.raises(jv.InputError, match=r"^machine.places\[0\] contains values .* give the indices of coordinates"):
+        jax.eval_shape(lambda entry: rows(1.0 * entry, lambda entry: [entry]), 1)
