@@ -19,10 +19,12 @@ _MAX_TITLE_MASSES = 3
 class DrawnRegime(NamedTuple):
     """Synchronous regime of a chart.
 
-    **Attributes** (count masses): `speed`, rad/s; `phases` (count,), rad; `torque` (count,), N m; `stable`.
+    **Attributes** (count masses): `speed`, rad/s; `masses` (count,): their numbers, from 0; `phases` (count,), rad;
+    `torque` (count,), N m; `stable`.
     """
 
     speed: float
+    masses: np.ndarray
     phases: np.ndarray
     torque: np.ndarray
     stable: bool
@@ -54,7 +56,7 @@ def regimes_chart(
     as there are panels.
 
     >>> import numpy as np
-    >>> one = DrawnRegime(100.0, np.zeros(2), np.ones(2), True)
+    >>> one = DrawnRegime(100.0, np.arange(2), np.zeros(2), np.ones(2), True)
     >>> curves = TorqueCurves(np.arange(3.0), np.ones((3, 2)), np.ones((3, 2)))
     >>> figure = regimes_chart([one], curves, np.ones(1), names=["motor 1", "motor 2"])
     >>> [axis.get_title().splitlines() for axis in figure.axes]
@@ -78,7 +80,7 @@ def regimes_chart(
         if regime.phases.size <= _MAX_TITLE_MASSES:
             lines.append(f"phases {', '.join(f'{a + 0.0:g}' for a in np.round(np.rad2deg(regime.phases), 1))} deg")
             lines.append(f"torques {', '.join(f'{t:.3g}' for t in regime.torque)} N m")
-        draw_circle(axis, "\n".join(lines), regime.phases, resultant=resultant)
+        draw_circle(axis, "\n".join(lines), regime.phases, resultant=resultant, numbers=regime.masses)
     return figure if ax is None else ax
 
 

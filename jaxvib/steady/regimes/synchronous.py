@@ -108,6 +108,7 @@ class AbstractSynchronousRegime(Result):
     **Attributes**
 
     - `status`: a `RegimeStatus`
+    - `masses` (mass,): their numbers in the scene, from 0
     - `speed` Omega, rad/s
     - `phases` (mass,), rad, in the direction of rotation. If unbalances have ideal drives, their phases are 0; otherwise that
       of the first mass is 0
@@ -128,6 +129,7 @@ class AbstractSynchronousRegime(Result):
     """
 
     status: RegimeStatus
+    masses: Array = eqx.field(metadata=in_unit("", "*", "mass"))
     speed: Array = eqx.field(metadata=in_unit("rad/s", "*"))
     phases: Array = eqx.field(metadata=in_unit("rad", "*", "mass"))
     growth: Array = eqx.field(metadata=in_unit("1/s", "*"))
@@ -178,7 +180,7 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
         from jaxvib.draw.results import phase_circles  # slow import
 
         one = [(speed_text(self.speed, 6), np.asarray(self.phases))]
-        return phase_circles(one, resultant=_has_resultant(self.scene), ax=ax)
+        return phase_circles(one, resultant=_has_resultant(self), numbers=np.asarray(self.masses), ax=ax)
 
 
 @cached
@@ -240,7 +242,13 @@ class SynchronousRegimes(AbstractSynchronousRegime):
 
         order = np.argsort(~np.asarray(self.stable), kind="stable")[: None if ax is not None else _MAX_CIRCLES]
         regimes = [
-            DrawnRegime(float(self.speed[k]), np.asarray(self.phases[k]), np.asarray(self.torque[k]), bool(self.stable[k]))
+            DrawnRegime(
+                float(self.speed[k]),
+                np.asarray(self.masses[k]),
+                np.asarray(self.phases[k]),
+                np.asarray(self.torque[k]),
+                bool(self.stable[k]),
+            )
             for k in order
         ]
         owners, curves = mass_owners(self.scene), None
@@ -249,7 +257,7 @@ class SynchronousRegimes(AbstractSynchronousRegime):
             curves = None if np.all(np.isnan(curves.driving)) else curves
         names = [f"{'motor' if self.scene.exciters[owner].loads is None else 'load'} {k + 1}" for k, owner in enumerate(owners)]
         resonances = np.asarray(natural_frequencies(self.scene))
-        return regimes_chart(regimes, curves, resonances, names=names, resultant=_has_resultant(self.scene), ax=ax)
+        return regimes_chart(regimes, curves, resonances, names=names, resultant=_has_resultant(self), ax=ax)
 
 
 @cached
@@ -268,9 +276,10 @@ def _torque_curves(scene: Scene, phases: Array) -> tuple[Array, Array, Array]:
     return (speeds, *jax.vmap(torques)(speeds))
 
 
-def _has_resultant(scene: Scene) -> bool:
-    """Return True if all masses turn in one direction; otherwise the mean of their phases has no meaning."""
-    return len({exciter.direction for exciter in scene.exciters}) == 1
+def _has_resultant(found: AbstractSynchronousRegime) -> bool:
+    """Return True if all masses of regimes turn in one direction; otherwise the mean of their phases has no meaning."""
+    owners = mass_owners(found.scene)[np.ravel(found.masses)]
+    return len({found.scene.exciters[owner].direction for owner in owners}) < 2
 
 
 @validated
@@ -390,7 +399,8 @@ def _fields_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ..
     balance = assemble_torque_balance(scene)
     if group is not None:
         fields = _fields_of(balance_of_group(balance, group), omega, phases)
-        return {**fields, "can_start": fields["can_start"][np.unique(mass_owners(scene)[list(group)])]}
+        can_start = fields["can_start"][np.unique(mass_owners(scene)[list(group)])]
+        return {**fields, "masses": jnp.asarray(group), "can_start": can_start}
     return _fields_of(balance, omega, phases)
 
 
@@ -452,7 +462,8 @@ def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: A
     }
     with_nan = {name: jnp.where(there, value, jnp.nan) for name, value in numbers.items()}
     stable = there & decays(growth, w)
-    return {"status": status, "stable": stable, "can_start": can_start(balance.model.scene), **with_nan}
+    masses, starts = jnp.arange(angles.size), can_start(balance.model.scene)
+    return {"status": status, "masses": masses, "stable": stable, "can_start": starts, **with_nan}
 
 
 def _power(balance: TorqueBalance, omega: Array, driving: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -113,6 +114,9 @@ def test_group_of_one_mass_is_a_scene_of_its_own():
     np.testing.assert_allclose(alone.speed, single.speed, rtol=1e-12)
     np.testing.assert_allclose(alone.growth, single.growth, rtol=1e-6)
     np.testing.assert_allclose(alone.power, single.power, rtol=1e-9)
+    assert alone.masses.tolist() == [1] and "2" in {text.get_text() for text in alone.plot().axes[0].texts}
+    assert alone.plot().axes[0].get_title().endswith("resultant 1")
+    plt.close("all")
     with pytest.raises(jv.InputError, match=f"masses has 1 of the scene's {len(scene.exciters)} rotating masses"):
         alone.vibration()
 

@@ -418,6 +418,7 @@ def test_ideal_drives_of_two_speeds_cannot_share():
 
 
 UNITS = {
+    "masses": ("", ("mass",)),
     "speed": ("rad/s", ()),
     "phases": ("rad", ("mass",)),
     "growth": ("1/s", ()),
