@@ -12,9 +12,9 @@ A mutant is the package with one change in one line:
 Mutants are drawn from every folder of `jaxvib` and `optimize`, or from each `--folder`: `--count` in each, of all kinds alike,
 in an order that follows from the seed and the change itself: a change of one file leaves the mutants of others as they were.
 
-A mutant is given to the `--tests` tests that are most likely to see it, and to the examples of its own file. Those whose text
-names the changed function or class come first, then those of the test file of its name and those that name a public part of
-its module; the shorter of two equal tests comes first. The first test that fails ends it: the shares are lower bounds of those
+A mutant is given to the `--tests` tests that are most likely to see it, and to the examples of its own file. Those of the test
+file of its name come first, then those whose text names the changed function or class and those that name a public part of its
+module; the shorter of two equal tests comes first. The first test that fails ends it: the shares are lower bounds of those
 of the whole suite.
 
 A mutant is killed when a test fails or when the process dies. Survivors, those whose tests did not end in `--seconds` of
@@ -104,7 +104,7 @@ def likely_tests(mutant: Mutant, count: int) -> list[str]:
     for file, tests in _test_files():
         own = _home(pathlib.Path(file).relative_to("tests"))
         common = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(place, own, strict=False)))
-        near = 2 * (own[-1] == place[-1] and common > 0) + common / len(place)
+        near = 5 * (own[-1] == place[-1] and common > 0) + common / len(place)
         for name, test in tests:
             score = near + 4 * bool(enclosing.search(f"{name} {test}")) + 2 * bool(public.search(test))
             ranked.append((-score, len(test), f"{file}::{name}"))
