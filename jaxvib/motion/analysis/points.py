@@ -97,8 +97,8 @@ def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -
     """Return the harmonic at the mean speed of the loads, fitted to the displacements of a window, with the measured amplitudes
     and the mean torques and powers of the drives.
 
-    The exciter force is NaN for a rotor with an imbalance, because the rotor can turn faster than the loads. Torques and powers
-    are NaN for loads that spin or slide.
+    The exciter force is NaN for a rotor with an imbalance, or with loads and an unbalance, because the rotor can turn faster
+    than the loads. Torques and powers are NaN for loads that spin or slide.
     """
     time, states, model = window.time, window.state, assemble(scene)
     harmonic, _ = fit_harmonic(time, states.displacement, measured.omega)
@@ -107,6 +107,7 @@ def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -
     weight = jnp.asarray(hann / np.sum(hann), time.dtype)
     torque, power = (weight @ torque_or_power for torque_or_power in torques)
     has_spin = np.array([own.spin is not None for own in states.exciters])
+    is_unknown = has_term(scene.all_effects, RotorImbalance) or any(len(own.carries) > 1 for own in scene.exciters)
     angles, _ = turning_angles(scene, lambda: time, states)
     phases = turning_directions(scene)[None] * angles - (measured.omega * (time - 0.5 * (time[0] + time[-1])))[:, None]
     force = peak_force(measured.omega**2 * resultant_of(linear_model(scene), weight @ jnp.exp(1j * phases)))
@@ -115,7 +116,7 @@ def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -
         displacement=harmonic,
         amplitude=measured.amplitude,
         foundation_force=measured.foundation_force,
-        exciter_force=jnp.where(has_term(scene.all_effects, RotorImbalance), jnp.nan, force),
+        exciter_force=jnp.where(is_unknown, jnp.nan, force),
         torque=jnp.where(has_spin, jnp.nan, torque),
         power=jnp.where(has_spin, jnp.nan, power),
     )

@@ -2,13 +2,15 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
 
 import jaxvib as jv
 from jaxvib.cli.app import run as run_command
 from jaxvib.machine.files import SCREENS
-from jaxvib.motion.analysis.points import measures_text
+from jaxvib.motion.analysis.measure import Measured, Trajectory
+from jaxvib.motion.analysis.points import measures_text, vibration_of
 
 AT = (1.5, 0.1)
 
@@ -52,6 +54,19 @@ def test_a_free_vibration_has_no_measures():
     mixed = vibration._replace(amplitude=abs(vibration.displacement) / 0.8)
     assert "only" not in late.summary()
     assert measures_text(scene, "", lambda: mixed, None)[0].startswith("only 80 % of the amplitude is at the mean speed")
+
+
+def test_the_force_of_loads_on_an_unbalanced_rotor_is_unknown():
+    exciter = jv.Exciter(jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0), unbalance=0.2)
+    scene, time = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0), exciters=[exciter]), np.linspace(0.0, 1.0, 64)
+    angle = 100.0 * time[:, None]
+    state = jv.State(1e-3 * np.cos(angle), -0.1 * np.sin(angle), (angle,), (0.0 * angle + 100.0,))
+    window = Trajectory(time, state, 40.0 * np.cos(angle), (angle[:, 0],), (angle[:, 0] * 0.0 + 100.0,))
+    speed, amplitude, zero = np.asarray(100.0), np.asarray([1e-3]), np.asarray(0.0)
+    with jax.disable_jit():
+        found = vibration_of(scene, window, Measured(speed, speed[None], amplitude, zero, zero))
+    np.testing.assert_allclose(abs(found.displacement), amplitude, rtol=1e-6)
+    assert np.isnan(found.exciter_force)  # that of the loads alone is 10 times smaller
 
 
 def test_sweeps_have_no_stroke_of_a_free_vibration(tmp_path):
