@@ -33,8 +33,8 @@ class Spin(Readable):
     (2,)
     """
 
-    drilling: Array | None = None
-    slip: tuple[Array, ...] | None = None
+    drilling: Array | None = eqx.field(metadata=in_unit("rad/s", "load"), default=None)
+    slip: tuple[Array, ...] | None = eqx.field(metadata=in_unit("m/s", "load"), default=None)
 
 
 class ExciterState(Readable):
@@ -47,7 +47,7 @@ class ExciterState(Readable):
     - `angle` and `rate`: a tuple of (count,) arrays, one for each coordinate of a load: for loads on a circle ((phi_1, ...),)
       in rad and rad/s; () without loads
     - `rotor`: the rotor's angle and speed, rad and rad/s, if a motor drives it, followed by the states of the motor, such as
-      currents; None under an ideal drive
+      currents, which tables and datasets of a run contain as `motor_state`; None under an ideal drive
     - `spin` of the loads if effects permit it, see `Spin` and `with_spin`; otherwise None
 
     >>> import jax.numpy as jnp, jaxvib as jv
@@ -58,8 +58,8 @@ class ExciterState(Readable):
 
     angle: tuple[Array, ...] = eqx.field(metadata=in_unit("rad", "load"), default=())
     rate: tuple[Array, ...] = eqx.field(metadata=in_unit("rad/s", "load"), default=())
-    rotor: tuple[Array, ...] | None = None
-    spin: Spin | None = None
+    rotor: tuple[Array, ...] | None = eqx.field(metadata=in_unit("SI", name="motor_state", first=2), default=None)
+    spin: Spin | None = eqx.field(metadata=part(), default=None)
 
 
 class _Omitted:

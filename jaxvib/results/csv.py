@@ -57,9 +57,16 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
 
 
 def main_axis(result: eqx.Module) -> str:
-    """Return the most frequent first axis of the arrays of a result; "" if none has an axis."""
-    counts = collections.Counter(axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes))
-    return max(counts, key=lambda axis: counts[axis], default="")
+    """Return the most frequent first axis of the arrays of a result; "" if none has an axis.
+
+    If it has one point only, such as the segments of one spectrum, return the longest axis with coordinates, such as
+    frequencies, if there is one.
+    """
+    arrays = [(name, axes, values) for name, axes, values, _ in columns(result) if axes and values.ndim == len(axes)]
+    counts = collections.Counter(axes[0] for _, axes, _ in arrays)
+    main = max(counts, key=lambda axis: counts[axis], default="")
+    sizes = {axes[0]: values.shape[0] for name, axes, values in arrays if axes in ((name,), (main,))}
+    return max(sizes, key=lambda axis: sizes[axis], default="") if sizes.get(main) == 1 else main
 
 
 def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict[str, np.ndarray]:

@@ -39,6 +39,7 @@ class InUnit(TypedDict):
     unit: str
     axes: tuple[str, ...]
     name: str
+    first: int
 
 
 class Part(TypedDict):
@@ -56,7 +57,7 @@ class AsText(TypedDict):
     labels: Callable[[Any], Labels]
 
 
-def in_unit(unit: str, *axes: str, name: str = "") -> InUnit:
+def in_unit(unit: str, *axes: str, name: str = "", first: int = 0) -> InUnit:
     """Return the metadata of a field of numbers: their unit ("" for none) and the names of their axes in order.
 
     **Arguments**
@@ -64,11 +65,12 @@ def in_unit(unit: str, *axes: str, name: str = "") -> InUnit:
     - `unit`: one unit, or two if it depends on the coordinate, such as "m or rad" for lengths and angles
     - `axes`: names of the axes; "*" is a placeholder for the `outer_axes` of the class
     - `name`: name in labelled data; default: the name of the field
+    - `first`: number of first entries of a tuple that labelled data omit
 
     >>> in_unit("rad/s", "load")
-    {'unit': 'rad/s', 'axes': ('load',), 'name': ''}
+    {'unit': 'rad/s', 'axes': ('load',), 'name': '', 'first': 0}
     """
-    return {"unit": unit, "axes": axes, "name": name}
+    return {"unit": unit, "axes": axes, "name": name, "first": first}
 
 
 def part(*axes: str, prefix: str = "") -> Part:
@@ -210,7 +212,8 @@ def _columns(tree: eqx.Module, prefix: str, outer: tuple[str, ...], renamed: Map
                 yield from _columns(each, before, axes(metadata["part"]), inner)
         elif "unit" in metadata:
             name = prefix + (metadata["name"] or field.name)
-            yield from _column(name, axes(metadata["axes"]), value, metadata["unit"])
+            shown = value[first:] if (first := metadata["first"]) else value
+            yield from _column(name, axes(metadata["axes"]), shown, metadata["unit"])
         elif is_status(value):
             yield from _column(prefix + field.name, axes((EACH,)), value, "")
 

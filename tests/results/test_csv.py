@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.motion.analysis.measure import Trajectory
+from jaxvib.motion.analysis.spectrum import Spectrum
+from jaxvib.results.csv import main_axis, table_along
 from jaxvib.results.fields import in_unit
 from jaxvib.results.status import status_names
 
@@ -99,3 +102,28 @@ def test_another_axis_is_refused(axis, tmp_path):
     with pytest.raises(jv.InputError, match=r"^axis is .*; the axes of \w+ are: .*rotor_speed"):
         jv.write_csv(found, axis, tmp_path / "whirl.csv")
     assert not list(tmp_path.iterdir())
+
+
+def test_tables_of_runs_have_states_of_motors_and_rolling_loads():
+    rows = np.arange(6.0).reshape(3, 2)
+    spin = jv.Spin(drilling=rows, slip=(rows + 6.0,))
+    exciter = jv.ExciterState((rows,), (rows,), rotor=tuple(np.arange(4 * 3.0).reshape(4, 3)), spin=spin)
+    angles = (np.zeros(3),) * 2
+    for number, exciters in (("", (exciter,)), ("exciters_2_", (jv.ExciterState(), exciter))):
+        state = jv.State(rows[:, :1], rows[:, :1], exciters=exciters)
+        columns = table_along(Trajectory(np.arange(3.0), state, rows[:, :1], angles, angles), "time")
+        for k in (1, 2):
+            np.testing.assert_array_equal(columns[f"{number}motor_state_{k} (SI)"], exciter.rotor[k + 1])
+            np.testing.assert_array_equal(columns[f"{number}drilling {k} (rad/s)"], rows[:, k - 1])
+            np.testing.assert_array_equal(columns[f"{number}slip {k} (m/s)"], rows[:, k - 1] + 6.0)
+        assert sum("motor_state" in head for head in columns) == 2
+
+
+@pytest.mark.parametrize(("segments", "axis"), [(1, "frequency"), (2, "segment")])
+def test_main_axis_of_one_spectrum_is_its_frequency(segments, axis):
+    means = np.zeros((segments, 1))
+    spectrum = Spectrum(
+        np.zeros(segments), np.zeros(5), np.zeros((segments, 5, 2)), np.zeros((segments, 5, 1)), means, means, np.zeros(2),
+        coordinates=("y1", "y2"), units=("m", "m"),
+    )  # fmt: skip
+    assert main_axis(spectrum) == axis and len(table_along(spectrum, axis)) > 3
