@@ -1,4 +1,4 @@
-"""Run-ups of a screen with two motors whose no-load speeds differ at random: share that synchronises, and time.
+"""Run-ups of a screen with two motors whose no-load speeds differ at random: share that synchronizes, and time.
 
     python benchmarks/exciters/run_ups.py --runs 4096
 

@@ -244,7 +244,7 @@ def orbits(quick: bool = False) -> None:
 
 
 def by_differentiation(scene: jv.Scene, quick: bool) -> None:
-    """Multipliers alone, of 100 motions: `floquet`, whose linearised equations are written by hand, and the full equations
+    """Multipliers alone, of 100 motions: `floquet`, whose linearized equations are written by hand, and the full equations
     differentiated along the same motions by Radau's method of order 11, both over half a period."""
     group, omega = "multipliers of an exact orbit", jnp.linspace(0.6, 0.9, 100)
     model, grid = jammed_bodies(jammed_model(scene)), grid_of(16, True)

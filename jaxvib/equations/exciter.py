@@ -1,7 +1,7 @@
 """One exciter of a machine: its loads and its rotor, eliminated from the equations of motion.
 
 A load of mass m and inertia factor kappa (7/5 for balls) has the coordinates u, the position p(u) relative to the point that
-carries it, and the generalised forces Q_u. With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c, it
+carries it, and the generalized forces Q_u. With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c, it
 obeys u'' = H^-1 (r - E a). Here a is the acceleration of the point that carries the load. E is m J^T; if a friction is
 proportional to the normal force of the load, the factor of a in this friction is subtracted. The load exerts the force
 -(W a + g) on that point, with W = m 1 - m J H^-1 E (1 is the unit matrix) and g = m (J H^-1 r + c). The unbalanced rotor of a
@@ -382,11 +382,11 @@ class ExciterDynamics(RotorDynamics):
         return ExciterState(state.rate, acceleration, rotor, spin)
 
     def centre_forces(self, state: ExciterState, speed: Array) -> list[Array]:
-        """Return the generalised forces at the centres of the loads, without contact forces; N m for an angle."""
+        """Return the generalized forces at the centres of the loads, without contact forces; N m for an angle."""
         return self._forces(state, speed, rotation=False)[1]
 
     def _forces(self, state: ExciterState, speed: Array, *, rotation: bool = True) -> tuple[Array, list[Array]]:
-        """Return the torque of the drag, and the generalised forces on the loads without friction.
+        """Return the torque of the drag, and the generalized forces on the loads without friction.
 
         If `rotation` is False, the forces that turn a load about its own centre are left out.
         """

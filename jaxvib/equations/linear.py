@@ -115,7 +115,7 @@ class LinearModel(Model):
         return None
 
     def modes(self) -> tuple[Array, Array]:
-        """Return the undamped natural frequencies (nd,) rad/s, ascending, and the mass-normalised mode shapes (nd, nd).
+        """Return the undamped natural frequencies (nd,) rad/s, ascending, and the mass-normalized mode shapes (nd, nd).
 
         Each column is the shape of one mode.
         """

@@ -96,7 +96,7 @@ def modal_response(
     the modes. Each mode is then a separate block, whose eigenvalues are accurate to rounding, and this damping needs no
     separate case.
 
-    **Arguments**: undamped `frequencies` (nd,) rad/s and mass-normalised `shapes` (nd, nd); `stiffness` K, `damping` C
+    **Arguments**: undamped `frequencies` (nd,) rad/s and mass-normalized `shapes` (nd, nd); `stiffness` K, `damping` C
     and `mass` M (nd, nd); `direction` B^T e (nd,), or those of several masses (count, nd).
     """
     n, eps = frequencies.shape[0], jnp.finfo(frequencies.dtype).eps

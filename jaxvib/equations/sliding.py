@@ -68,7 +68,7 @@ def contact_force(
 
         [kappa m J^T (J u'' + (dJ/dt) u') + m J^T a - Q]_i / |dp/du_i|
 
-    The motion requires this force in addition to the generalised `force` Q.
+    The motion requires this force in addition to the generalized `force` Q.
 
     **Arguments**: `acceleration` u''; `a`, the acceleration of the points that carry the loads, by axis; `kappa`, which is 1
     for the mass without rotation.
@@ -83,7 +83,7 @@ def contact_force(
 
 
 class ContactSolution(NamedTuple):
-    """Inertia factor `kappa`, generalised `force` and `friction` of loads, each of which either rolls or slides.
+    """Inertia factor `kappa`, generalized `force` and `friction` of loads, each of which either rolls or slides.
 
     `on_rotor`: the friction that brakes the rotor, if it is not `friction`. The force of a sliding contact does not brake the
     rotor, like that of a rolling contact.
@@ -114,8 +114,8 @@ def resolve_contact(
     - `slip` of the loads, m/s; `limit`: Coulomb's law of the contact; `normal_force` of the loads
     - `needed`: force along the track in the motion in which all loads roll, N
     - `a`: acceleration in that motion of the points that carry the loads, by axis
-    - `rolling`: generalised forces on loads that roll
-    - `centre`: generalised forces at the centres of the loads, without the contact forces
+    - `rolling`: generalized forces on loads that roll
+    - `centre`: generalized forces at the centres of the loads, without the contact forces
     - `friction` of rolling loads
     """
     kappa = loads.inertia_factor()

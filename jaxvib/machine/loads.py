@@ -40,7 +40,7 @@ class DrillingSpin(NamedTuple):
     """Dynamics of the drilling spin s of each load: its spin about the normal of its contact, relative to its track.
 
     - `rate` s' (count,) rad/s^2 of a free spin
-    - `force`: generalised forces per s, a (count,) array for each coordinate
+    - `force`: generalized forces per s, a (count,) array for each coordinate
     - `inertia`, kg m^2; the energy of the spin is inertia s^2/2
     - `without_rotation` (count,) rad/s: the value of s for a load that does not rotate in space
     """
@@ -56,7 +56,7 @@ class Loads(Part):
 
     Arrays have one entry per load, or are scalars shared by all loads; functions act elementwise on (count,) arrays.
 
-    A load has one or several coordinates u. The first is its angle about the rotor's axis, rad; its generalised force is the
+    A load has one or several coordinates u. The first is its angle about the rotor's axis, rad; its generalized force is the
     torque that the load takes from the rotor. The analyses of jams and of balance accept `CircularLoads` only.
 
     **Attributes**
@@ -134,13 +134,13 @@ class Loads(Part):
 
     @abc.abstractmethod
     def resistance(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...]:
-        """Return the generalised force of the viscous resistance against the rotor, (count,) N m for the angle.
+        """Return the generalized force of the viscous resistance against the rotor, (count,) N m for the angle.
 
         **Arguments**: coordinates `u` and their rates `rate`, (count,) each; `speed` of the rotor, rad/s.
         """
 
     def spin_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...] | None:
-        """Return the generalised force, N m, of the gyroscopic moment of a rolling load; it does no work. None if there is no
+        """Return the generalized force, N m, of the gyroscopic moment of a rolling load; it does no work. None if there is no
         such moment.
 
         **Arguments**: coordinates `u` and their rates `rate`, (count,) each; `speed` of the rotor, rad/s.

@@ -1,4 +1,4 @@
-"""Quantities of machines whose exciters synchronise: motion of a deck, force, power, margins.
+"""Quantities of machines whose exciters synchronize: motion of a deck, force, power, margins.
 
 The quantities are those of the working regime, see `jaxvib.working_regime`. For a scene without a stable synchronous regime a
 quantity raises `ComputationError` with the status "none_stable" when it is computed; in a search its value is NaN.
@@ -269,9 +269,9 @@ def synchronization_margin() -> Quantity:
 
     >>> from optimize import synchronization_margin
     >>> (synchronization_margin() > 3.0).words
-    'margin of synchronisation at least 3'
+    'margin of synchronization at least 3'
     """
-    return RegimeQuantity("synchronization_margin", "", _margin, text="margin of synchronisation", tiers=("leading",))
+    return RegimeQuantity("synchronization_margin", "", _margin, text="margin of synchronization", tiers=("leading",))
 
 
 def _margin(evaluation: Evaluation, tier: Tier) -> Array:

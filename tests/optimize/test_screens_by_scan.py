@@ -21,7 +21,7 @@ from optimize import (
 
 DECK = [(-1.5, 0.1), (1.5, 0.1)]
 TORQUES = 80.0, 60.0
-"""Breakdown torques of the motors, N m; a margin of synchronisation needs unequal ones."""
+"""Breakdown torques of the motors, N m; a margin of synchronization needs unequal ones."""
 
 PLACE = {"exciters[1].position[0]": (0.2, 1.2), "exciters[1].position[1]": (0.2, 1.2)}
 LOW, HIGH = (0.2, 0.2, 3e5), (1.2, 1.2, 7e5)

@@ -69,7 +69,7 @@ def test_the_unit_of_an_acceleration_is_named():
 
 
 def test_runs_of_several_exciters_are_measured(tmp_path):
-    """Motors of opposite directions on soft supports; a no-load speed of 130 rad/s is beyond their synchronisation."""
+    """Motors of opposite directions on soft supports; a no-load speed of 130 rad/s is beyond their synchronization."""
     springs = [jv.support(at=(x, 0.0), stiffness=(1e4, 1e4), damping=(500.0, 500.0)) for x in (-1.0, 1.0)]
     body = jv.plane_body(mass=2000.0, inertia=600.0, supports=springs)
     parts = ((-0.9, 1, 100.0), (0.8, -1, 100.5))

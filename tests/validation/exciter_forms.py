@@ -190,7 +190,7 @@ def balancers(phase: float) -> Synchronous:
 
 
 def torque_limit(tier: Tier) -> float:
-    """Return the error of W = Omega^2 S^2 l_1 l_2 / (2 J): the exciters lose synchronisation if the half difference of the
+    """Return the error of W = Omega^2 S^2 l_1 l_2 / (2 J): the exciters lose synchronization if the half difference of the
     torques reaches W."""
     machine, w = body(30.0, 60.0), S**2 * 0.6 * 0.5 / (2.0 * INERTIA)
     speed = brentq(lambda speed: STALL * (1.0 - speed / NO_LOAD) - w * speed**2, 0.5 * NO_LOAD, NO_LOAD)
@@ -264,7 +264,7 @@ FORMS = (
     ClosedForm(f"1: {ONE_WAY}, M l^2 = 2.4 J", "in phase", of(lambda: pair(1.2)), (2e-14, 2e-14, 4e-14)),
     ClosedForm(f"1: {ONE_WAY}, M l^2 = 1.6 J", "in antiphase", of(lambda: pair(0.8)), (2e-14, 2e-14, 1e-12)),
     ClosedForm("2: two exciters of opposite directions", "phase -(d_1 + d_2)", of(opposite), (2e-14, 2e-14, 2e-12)),
-    ClosedForm("2: limit of synchronisation", "W = Omega^2 S^2 l_1 l_2 / (2 J)", torque_limit, (1e-3, 1e-3, 0.05)),
+    ClosedForm("2: limit of synchronization", "W = Omega^2 S^2 l_1 l_2 / (2 J)", torque_limit, (1e-3, 1e-3, 0.05)),
     ClosedForm(
         f"3: {TRIANGLE}, in phase",
         "circular translation, L(Omega) = N c S^2 Omega^5 / |D|^2",

@@ -153,7 +153,7 @@ class LoadContact(Effect):
         return sum(parts[1:], parts[0])
 
     def resistance(self, loads: Loads, u: Coordinates, rate: Coordinates) -> Coordinates:
-        """Return the generalised forces of the damping forces -c s' between `loads` that overlap, (count,) each.
+        """Return the generalized forces of the damping forces -c s' between `loads` that overlap, (count,) each.
 
         They are limited so that a contact never pulls. **Arguments**: coordinates `u` and their rates `rate`.
         """

@@ -1,7 +1,7 @@
 """Terms that effects add to the equations of a scene. Each analysis states the types of terms that it includes.
 
 Terms are created during a computation and contain functions (methods of their effect) or numbers. Energies are in J, forces in
-N; the generalised force of a load's angle is a torque in N m. A load's coordinates `u` and their rates are tuples of (count,)
+N; the generalized force of a load's angle is a torque in N m. A load's coordinates `u` and their rates are tuples of (count,)
 arrays. The types of terms are final; a new effect combines existing ones.
 """
 
@@ -26,7 +26,7 @@ Energy: TypeAlias = Callable[[Loads, Coordinates], Array]
 """Function of the loads and their coordinates that returns energies, (count,) J."""
 
 Resistance: TypeAlias = Callable[[Loads, Coordinates, Coordinates], Coordinates]
-"""Function of the loads, their coordinates and the rates of these that returns generalised forces."""
+"""Function of the loads, their coordinates and the rates of these that returns generalized forces."""
 
 
 @final
@@ -57,7 +57,7 @@ class LoadPotential:
     is_smooth: bool = False
 
     def forces(self, loads: Loads, u: Coordinates, rate: Coordinates) -> list[Coordinates]:
-        """Return the generalised forces on each load."""
+        """Return the generalized forces on each load."""
         return [_potential_force(self.energy, loads, u)]
 
 
@@ -68,7 +68,7 @@ class LoadResistance:
 
     **Attributes**
 
-    - `resistance`: function of the loads, `u` and the rates of `u`; it returns the generalised force on each coordinate
+    - `resistance`: function of the loads, `u` and the rates of `u`; it returns the generalized force on each coordinate
     - `is_smooth`: True if the force has all derivatives
     """
 
@@ -76,7 +76,7 @@ class LoadResistance:
     is_smooth: bool = False
 
     def forces(self, loads: Loads, u: Coordinates, rate: Coordinates) -> list[Coordinates]:
-        """Return the generalised forces on each load."""
+        """Return the generalized forces on each load."""
         return [self.resistance(loads, u, rate)]
 
 
@@ -89,7 +89,7 @@ class LoadInteraction:
     **Attributes**
 
     - `energy` of the pairs, J, (count,)
-    - `resistance`: generalised forces that dissipate energy of the relative motion, or None
+    - `resistance`: generalized forces that dissipate energy of the relative motion, or None
     - `validate_start`: function of the loads, of `u` (..., count), and of the stations (count,) of the loads, m (None for a
       single track). It raises `InputError` if the loads cannot start there. None: every start is allowed
     """
@@ -100,7 +100,7 @@ class LoadInteraction:
     is_smooth: ClassVar[bool] = False
 
     def forces(self, loads: Loads, u: Coordinates, rate: Coordinates) -> list[Coordinates]:
-        """Return the generalised forces on each load: those of the potential, and those of the resistance."""
+        """Return the generalized forces on each load: those of the potential, and those of the resistance."""
         force = _potential_force(self.energy, loads, u)
         return [force] if self.resistance is None else [force, self.resistance(loads, u, rate)]
 
@@ -162,7 +162,7 @@ class Friction(NamedTuple):
         return self.forces(a)[0]
 
     def forces(self, a: Mapping[int, Array]) -> tuple[Array, ...]:
-        """Return the torque of the friction, and its generalised forces on the further coordinates of a load."""
+        """Return the torque of the friction, and its generalized forces on the further coordinates of a load."""
         normal_force = self._normal_force(a)
         size = jnp.maximum(normal_force, 0.0) if self.one_sided else jnp.abs(normal_force)
         return tuple(lever * size for lever in (self.lever, *self.others))

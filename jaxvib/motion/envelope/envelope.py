@@ -155,7 +155,7 @@ def envelope(
     """Integrate the averaged equations of a scene from 0 to `until`: amplitudes and load speeds in place of vibrations.
 
     Each step spans many turns, also in a run-up in which loads jam at a resonance or pass through it. Several exciters may
-    synchronise, or turn at different speeds; in the second case the steps resolve the beats between them. Each mass that turns,
+    synchronize, or turn at different speeds; in the second case the steps resolve the beats between them. Each mass that turns,
     a load or the unbalance of a rotor, counts as a load here. The result is the limit of light loads:
 
     - its relative error is proportional to the share of the loads in the mass of the machine, multiplied by the dynamic

@@ -330,7 +330,7 @@ def _planes(scene: Scene) -> list[_Plane]:
 def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int | None = None) -> BalancedStability:
     """Return the exact stability of the motion in which the loads turn with the rotor and cancel each other and its imbalance.
 
-    The full equations are linearised about this motion; their coefficients are periodic with the turn of the rotor. No
+    The full equations are linearized about this motion; their coefficients are periodic with the turn of the rotor. No
     approximation is made for heavy loads or weak drag, unlike the criterion.
 
     **Arguments**

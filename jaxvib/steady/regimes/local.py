@@ -107,7 +107,7 @@ def quasi_static_growth(balance: TorqueBalance, omega: Array, phase: Array, neut
 
         I_i w_i' = L_i(w_i) + (S_i/2) sum_k S_k w_k^4 Im(exp(i (alpha_k - alpha_i)) H_ik(w_k)),      alpha_i' = w_i - Omega
 
-    This is the usual criterion of synchronisation. It neglects the free vibrations of the machine.
+    This is the usual criterion of synchronization. It neglects the free vibrations of the machine.
     """
     prescribed, averaged = balance.is_prescribed, balance.averaged
     free = np.flatnonzero(~prescribed)

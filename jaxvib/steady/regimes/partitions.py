@@ -131,7 +131,7 @@ class RegimePartitions(Result):
 def regime_partitions(scene: Scene, *, stable: bool = True) -> RegimePartitions:
     """Return the motions in which rotating masses turn in groups of different speeds, by averaging over a turn.
 
-    Unbalances or loads that cannot synchronise, or of which a resonance catches only some, turn at different speeds. At this
+    Unbalances or loads that cannot synchronize, or of which a resonance catches only some, turn at different speeds. At this
     order of the averaging, groups of different speeds do not act on each other. A motion is therefore a partition of the
     masses into groups, and a synchronous regime of each group. Motions of a single group are included.
 

@@ -1,4 +1,4 @@
-"""Bodies that move in their plane: matrices, equations of motion, files, and the synchronisation of two motors."""
+"""Bodies that move in their plane: matrices, equations of motion, files, and the synchronization of two motors."""
 
 import equinox as eqx
 import jax

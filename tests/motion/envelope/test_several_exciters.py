@@ -59,7 +59,7 @@ def rates_of_own_amplitudes(scene, y, v, angle, rate):
 
 
 def test_common_amplitudes_are_sums_over_the_exciters():
-    """At different speeds, without synchronisation."""
+    """At different speeds, without synchronization."""
     rng = np.random.default_rng(1)
     y, v = (scale * jnp.asarray(rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3))) for scale in (1e-3, 0.1))
     angle, rate = jnp.asarray(rng.uniform(0.0, 6.0, 3)), jnp.asarray([95.0, 60.0, 20.0])

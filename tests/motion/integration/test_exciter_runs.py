@@ -110,7 +110,7 @@ def test_reverse_derivatives_of_eight_exciters_equal_differences(kind):
     np.testing.assert_allclose(slope, difference, rtol=1e-7)
 
 
-def test_share_that_synchronises_jumps_at_the_closed_form():
+def test_share_that_synchronizes_jumps_at_the_closed_form():
     """Opposite motors on soft supports: up to a half difference of their torques of W = w^2 S^2 l_1 l_2 / (2 J)."""
     springs = [jv.support(at=(x, 0.0), stiffness=(1e4, 1e4), damping=(500.0, 500.0)) for x in (-1.0, 1.0)]
     body, speed, slope = jv.plane_body(mass=2000.0, inertia=600.0, supports=springs), 100.0, 3.0

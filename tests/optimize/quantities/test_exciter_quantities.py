@@ -203,7 +203,7 @@ def test_machines_without_a_regime_count_in_tolerances(screen):
         (lambda: motion_spread([(0.0, 0.0)]), "at least two points"),
         (lambda: motion_spread([(0.0, 0.0), (1.0, 0.0)], body=-1), "body"),
         (lambda: foundation_force(harmonic=3), "without a mode"),
-        (lambda: synchronization_margin() > "3 mm", "margin of synchronisation"),
+        (lambda: synchronization_margin() > "3 mm", "margin of synchronization"),
         (lambda: least_torque()(jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0), exciters=[
             jv.Exciter(drive=jv.ConstantSpeed(60.0), unbalance=0.1)])), "needs motors"),
     ],

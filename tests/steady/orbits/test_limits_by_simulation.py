@@ -62,7 +62,7 @@ def test_motion_stays_inside_the_limit_and_is_lost_outside(case):
 
 
 def run_up_shares(inertia, fold, away):
-    """Shares that synchronise after a run-up from rest, for speeds of the second motor within the fold and beyond it."""
+    """Shares that synchronize after a run-up from rest, for speeds of the second motor within the fold and beyond it."""
     motor = jv.DCMotor(100.0, stall_torque=300.0, inertia=inertia)
     scene = scene_of([motor, motor], (1, -1))
     speeds = jnp.concatenate([fold - away, fold + away])
@@ -71,7 +71,7 @@ def run_up_shares(inertia, fold, away):
 
 
 @pytest.mark.slow
-def test_share_that_synchronises_jumps_at_the_exact_limit():
+def test_share_that_synchronizes_jumps_at_the_exact_limit():
     """Speeds 3 to 20 % of the range within the fold and beyond it. Heavy rotors keep different speeds within the fold too."""
     motor = jv.DCMotor(100.0, stall_torque=300.0, inertia=0.2)
     scene = scene_of([motor, motor], (1, -1))

@@ -267,7 +267,7 @@ def test_stable_phase_of_two_motors_depends_on_their_distance():
             assert orbit.status_name == "found" and bool(orbit.stable) == (phase == steady)
 
 
-def test_motors_that_cannot_synchronise_end_in_a_status(general):
+def test_motors_that_cannot_synchronize_end_in_a_status(general):
     apart = with_numbers(general, (1.5, 200.0, 2000.0))
     with pytest.raises(jv.ComputationError, match="no periodic motion"):
         jv.synchronous_orbit(apart, phases=[0.0, 3.0])

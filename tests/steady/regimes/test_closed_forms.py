@@ -61,7 +61,7 @@ def test_antiphase_of_equal_exciters_only_turns_the_body():
     np.testing.assert_allclose(regime.amplitude[2], float(regime.speed) ** 2 * 2 * S * 0.3 * abs(response), rtol=1e-12)
 
 
-def test_opposite_exciters_synchronise_at_the_sum_of_angles():
+def test_opposite_exciters_synchronize_at_the_sum_of_angles():
     angles, length = np.array([2.3, 0.4]), 0.5
     places = [tuple(length * np.array([np.cos(d), np.sin(d)])) for d in angles]
     regime = jv.synchronous_regimes(scene_of(places, (1, -1), body(3e3, 150.0))).select(0)

@@ -62,7 +62,7 @@ def test_partitions_of_two_are_all_pairs_of_single_speeds():
 
 @pytest.mark.slow
 def test_run_up_and_simulation_end_in_one_of_the_partitions():
-    """Two motors synchronise, the third is too slow to follow them."""
+    """Two motors synchronize, the third is too slow to follow them."""
     drives = [motor(100.0, 60.0), motor(99.5, 60.0), motor(70.0, 30.0)]
     scene = scene_of(drives, [(-0.5, 0.3), (0.4, 0.1), (0.1, -0.4)], (1, -1, 1))
     found = jv.regime_partitions(scene)
