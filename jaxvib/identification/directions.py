@@ -183,14 +183,14 @@ def polar_unbalances(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, 
 
 
 def eliminate(matrix: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Return the information about the unknowns at the places `kept` if all other unknowns are free."""
+    """Return the information about the unknowns with the indices `kept` if all other unknowns are free."""
     free, size, vectors, values = _free(matrix, kept)
     coupling = (matrix[np.ix_(kept, free)] / size) @ vectors / np.sqrt(values)
     return matrix[np.ix_(kept, kept)] - coupling @ coupling.T
 
 
 def elimination(matrix: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Return L: the changes of all unknowns per change of the unknowns at the places `kept`, if all other unknowns are free.
+    """Return L: the changes of all unknowns per change of the unknowns with the indices `kept`, if all other unknowns are free.
 
     `eliminate` returns L^T F L of the matrix F; to first order its change by dF is L^T dF L.
     """

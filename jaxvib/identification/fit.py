@@ -105,21 +105,21 @@ class _Trial(NamedTuple):
     cost: float
 
 
-def linear_places(problem: Problem) -> list[np.ndarray]:
-    """Return, for each run, the places of its linear unknowns (state, unbalances, offsets) among all linear unknowns."""
+def linear_indices(problem: Problem) -> list[np.ndarray]:
+    """Return, for each run, the indices of its linear unknowns (state, unbalances, offsets) among all linear unknowns."""
     exciters = len(problem.unbalances)
-    places, after = [], 2 * exciters
+    indices, after = [], 2 * exciters
     for samples in problem.runs:
         offsets = len(samples.channels)
         states = state_count(problem.scene, samples.channels)
         of_run = np.arange(after, after + states + offsets)
-        places.append(np.concatenate([of_run[:states], np.arange(2 * exciters), of_run[states:]]))
+        indices.append(np.concatenate([of_run[:states], np.arange(2 * exciters), of_run[states:]]))
         after += states + offsets
-    return places
+    return indices
 
 
 def _linear_count(problem: Problem) -> int:
-    return int(max(place.max() for place in linear_places(problem))) + 1
+    return int(max(indices.max() for indices in linear_indices(problem))) + 1
 
 
 def unknown_count(problem: Problem) -> int:
@@ -185,9 +185,9 @@ def nonlinear_cost(problem: Problem, x: np.ndarray, linear: np.ndarray, left: np
 
 def nonlinear_differences(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
     """Return the weighted differences, readings minus model, of a nonlinear motion, those of all runs in one array."""
-    pairs = zip(problem.runs, linear_places(problem), strict=True)
+    pairs = zip(problem.runs, linear_indices(problem), strict=True)
     return np.concatenate(
-        [motion_differences(problem.unknowns, each, problem.scene, x, linear[place]) for each, place in pairs]
+        [motion_differences(problem.unknowns, each, problem.scene, x, linear[indices]) for each, indices in pairs]
     )
 
 
@@ -200,9 +200,9 @@ def known_cost(problem: Problem, x: np.ndarray, linear: np.ndarray) -> float:
 def _linear_equations(problem: Problem, x: np.ndarray) -> np.ndarray:
     """Return the normal equations (L + 1, L + 1) of the linear unknowns and the readings at `x`."""
     total = np.zeros((_linear_count(problem) + 1,) * 2)
-    for samples, place in zip(problem.runs, linear_places(problem), strict=True):
+    for samples, indices in zip(problem.runs, linear_indices(problem), strict=True):
         part = np.asarray(linear_equations(problem.unknowns, samples, problem.scene, jnp.asarray(x)))
-        where = np.append(place, total.shape[0] - 1)
+        where = np.append(indices, total.shape[0] - 1)
         total[np.ix_(where, where)] += part
     return total
 
@@ -220,10 +220,10 @@ def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[n
     if problem.linear is not None:
         return [columns.T @ columns for columns in nonlinear_columns(problem, x, linear)]
     p, size, of_runs = x.size, x.size + linear.size, []
-    for samples, place in zip(problem.runs, linear_places(problem), strict=True):
+    for samples, indices in zip(problem.runs, linear_indices(problem), strict=True):
         parts = problem.unknowns, samples, problem.scene
-        where, total = np.concatenate([np.arange(p), p + place, [size]]), np.zeros((size + 1, size + 1))
-        total[np.ix_(where, where)] = normal_equations(*parts, jnp.asarray(x), jnp.asarray(linear[place]))
+        where, total = np.concatenate([np.arange(p), p + indices, [size]]), np.zeros((size + 1, size + 1))
+        total[np.ix_(where, where)] = normal_equations(*parts, jnp.asarray(x), jnp.asarray(linear[indices]))
         of_runs.append(total)
     return of_runs
 
@@ -231,10 +231,10 @@ def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[n
 def nonlinear_columns(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
     """Return the columns (n C, p + L + 1) of each run: derivatives with respect to all unknowns, and the residuals."""
     p, size, of_runs = x.size, x.size + linear.size, []
-    for samples, place in zip(problem.runs, linear_places(problem), strict=True):
-        columns = motion_columns(problem.unknowns, samples, problem.scene, x, linear[place])
+    for samples, indices in zip(problem.runs, linear_indices(problem), strict=True):
+        columns = motion_columns(problem.unknowns, samples, problem.scene, x, linear[indices])
         total = np.zeros((len(columns), size + 1))
-        total[:, np.concatenate([np.arange(p), p + place, [size]])] = columns
+        total[:, np.concatenate([np.arange(p), p + indices, [size]])] = columns
         of_runs.append(total)
     return of_runs
 
@@ -275,7 +275,7 @@ def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.nd
         return project(problem, trial.x + limited_step(problem, step)[: x.size])
 
     start = project(problem, x)
-    best, (information, prior, _), converged = descend(start, equations, stepped, x.size, positive_places(problem))
+    best, (information, prior, _), converged = descend(start, equations, stepped, x.size, positive_indices(problem))
     return best, information, prior, converged
 
 
@@ -300,12 +300,12 @@ def _minimize_nonlinear(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.nda
     start = project(problem, x)
     count = p + start.linear.size
     with np.errstate(over="ignore", invalid="ignore"):  # a trial may diverge; its cost is then infinite
-        best, (information, prior, _), converged = descend(start, equations, stepped, count, positive_places(problem), bend)
+        best, (information, prior, _), converged = descend(start, equations, stepped, count, positive_indices(problem), bend)
     return best, information, prior, converged
 
 
-def positive_places(problem: Problem) -> np.ndarray:
-    """Return the places in x of positive numbers, whose logarithms are unknown."""
+def positive_indices(problem: Problem) -> np.ndarray:
+    """Return the indices in x of positive numbers, whose logarithms are unknown."""
     return np.flatnonzero(np.asarray(problem.unknowns.positive))
 
 
@@ -326,13 +326,13 @@ def descend(
     expected reduction of the cost would remain the same at every smaller value, and the descent would never end.
 
     **Arguments**: the first trial `best`, with its `cost`; `equations`: returns the equations of a trial; `stepped`: returns
-    the trial after a step; `damped_count`: number of the first unknowns, whose steps are damped; `positive`: places of the
+    the trial after a step; `damped_count`: number of the first unknowns, whose steps are damped; `positive`: indices of the
     positive numbers; `bend`: returns for a trial and a step the product J^T (differences after the step - differences
     + J step), where J are the derivatives of the model at the trial whose `equations` were computed last.
 
     Source of the correction: Transtrum, Sethna 2012, arXiv 1201.5885 (geodesic acceleration).
     """
-    damping, places = 1e-2, np.arange(damped_count)
+    damping, indices = 1e-2, np.arange(damped_count)
     for _ in range(_MAX_ITERATIONS):
         current = equations(best)
         matrix, gradient = _without_vanished(current, positive)
@@ -347,8 +347,8 @@ def descend(
                 best = trial
                 continue
         while True:
-            damped, size = matrix.copy(), np.diagonal(matrix)[places]
-            damped[places, places] += damping * (size + 1e-12 * np.max(size))
+            damped, size = matrix.copy(), np.diagonal(matrix)[indices]
+            damped[indices, indices] += damping * (size + 1e-12 * np.max(size))
             step = _damped_step(best, damped, gradient, bend)
             trial = best if step is None else stepped(best, step)
             if trial.cost < best.cost:
@@ -410,12 +410,12 @@ def _follow_valley(
 def differences_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
     """Return readings minus model (n, C) of each run."""
     differences = []
-    for samples, place, raw in zip(problem.runs, linear_places(problem), problem.raw, strict=True):
+    for samples, indices, raw in zip(problem.runs, linear_indices(problem), problem.raw, strict=True):
         parts = problem.unknowns, samples, problem.scene
         if problem.linear is not None:
-            model = closed_motion(*parts, x, linear[place])[0]
+            model = closed_motion(*parts, x, linear[indices])[0]
         else:
-            model = np.asarray(model_readings(*parts, jnp.asarray(x), jnp.asarray(linear[place])))
+            model = np.asarray(model_readings(*parts, jnp.asarray(x), jnp.asarray(linear[indices])))
         shown = np.stack(
             [_delayed(model[:, k], channel.delay / float(samples.step)) for k, channel in enumerate(samples.channels)],
             axis=1,

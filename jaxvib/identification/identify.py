@@ -375,10 +375,10 @@ def _with_ends(estimate: Estimate, scale: float, logarithmic: bool, low: float, 
 def _gains(fitted: Fitted) -> tuple[Estimate, ...]:
     unknowns = fitted.problem.unknowns
     number_count = len(unknowns.numbers)
-    places = np.arange(number_count, number_count + len(unknowns.gains))
+    indices = np.arange(number_count, number_count + len(unknowns.gains))
     data, prior, _ = in_polar_unbalances(fitted)
-    covariance = np.linalg.inv(eliminate(data + prior, places))
-    pairs = zip(fitted.x[places], np.sqrt(np.diagonal(covariance)), strict=True)
+    covariance = np.linalg.inv(eliminate(data + prior, indices))
+    pairs = zip(fitted.x[indices], np.sqrt(np.diagonal(covariance)), strict=True)
     return tuple(_estimate(math.exp(x), math.exp(x), True, float(spread), True) for x, spread in pairs)
 
 

@@ -158,8 +158,8 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
     problem, p, number_count = fitted.problem, fitted.x.size, len(fitted.problem.unknowns.numbers)
     data, prior, sizes = in_polar_unbalances(fitted)
     free_exciters = free_unbalances(problem)
-    places = np.array([*range(p), *(p + 2 * k for k in free_exciters)], int)
-    covariance = np.linalg.pinv(eliminate(data + prior, places), rcond=1e-13, hermitian=True)
+    indices = np.array([*range(p), *(p + 2 * k for k in free_exciters)], int)
+    covariance = np.linalg.pinv(eliminate(data + prior, indices), rcond=1e-13, hermitian=True)
     floor, intervals, columns = project(problem, fitted.x).cost, {}, None
     if problem.linear is not None:
         columns = np.concatenate(nonlinear_columns(problem, fitted.x, problem.linear))
@@ -167,10 +167,10 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
         if not known.determined[i]:
             continue
         is_unbalance, is_vanished = i >= number_count, bool(known.vanished[i])
-        place = p + i - number_count if is_unbalance else i
+        index = p + i - number_count if is_unbalance else i
         index = free_exciters[i - number_count] if is_unbalance else i
         center = math.log(sizes[index]) if is_unbalance else float(fitted.x[i])
-        slopes, variance = elimination(data + prior, places[[place]])[:, 0], covariance[place, place]
+        slopes, variance = elimination(data + prior, indices[[index]])[:, 0], covariance[index, index]
         if is_vanished:  # its information may be below the accuracy of the pseudoinverse
             slopes, variance = np.zeros(len(data)), known.covariance[i, i]
         spread = math.sqrt(variance)

@@ -101,7 +101,7 @@ class Samples(eqx.Module):
     - `step` h, s
     - `changed`: numbers of the scene that differ in this run; `actions` ("add", "scale" or "set") and `amounts` of the changes
     - `channels` that are compared; `turn`: index of the run's unknown zero of the angle, or None
-    - `errors`: place of the first error of the rotor's angle among the unknowns, and their number
+    - `errors`: index of the first error of the rotor's angle among the unknowns, and their number
     - `stretches` in which the motion of loads or on nonlinear supports is integrated: their number, samples of each, steps per
       sample; (0, 0, 0) for a linear response
     - `guide` (ns, C) of a motion on nonlinear supports: change of the state at a sample per difference between recorded and
@@ -360,7 +360,7 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
     steps = _built(unknowns, samples, scene, x)
     first, columns = _linear_columns(steps, samples)
     _, unbalance, _ = _split(steps, linear)
-    place, errors = samples.errors
+    first_error, errors = samples.errors
     moved = x.shape[0] - unknowns.errors
 
     def tangent(direction: Array) -> _Steps:
@@ -383,7 +383,7 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
                 force_changes, turning
             )
             others = jnp.zeros((unknowns.errors, *slopes.shape[1:]))
-            slopes = jnp.concatenate([slopes, others.at[place - moved : place - moved + errors].set(by_error)])
+            slopes = jnp.concatenate([slopes, others.at[first_error - moved : first_error - moved + errors].set(by_error)])
         elif unknowns.errors:
             slopes = jnp.concatenate([slopes, jnp.zeros((unknowns.errors, *slopes.shape[1:]))])
         slopes, after = _filtered(samples.taps, before, jnp.moveaxis(slopes, 0, 2))

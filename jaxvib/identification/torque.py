@@ -37,8 +37,8 @@ from jaxvib.identification.fit import (
     fit_from,
     known_cost,
     limited_step,
-    linear_places,
-    positive_places,
+    linear_indices,
+    positive_indices,
     prior_equations,
     run_equations,
     unknown_count,
@@ -160,14 +160,14 @@ def _runge_kutta(
 class _Run(NamedTuple):
     """Run of a fit of vibrations and rotor.
 
-    **Attributes**: `samples` with smaller steps; `rotor`: samples of the rotor; `places` (f,): places of the run's unknowns
+    **Attributes**: `samples` with smaller steps; `rotor`: samples of the rotor; `indices` (f,) of the run's unknowns
     among all unknowns; `rotor_count`: number of unknowns of this run's rotor (first angle, first speed, delay, offsets of all
     marks but the first); `noise` of the rotor.
     """
 
     samples: Samples
     rotor: RotorSamples
-    places: np.ndarray
+    indices: np.ndarray
     rotor_count: int
     noise: Noise
 
@@ -203,16 +203,16 @@ def fit_with_torques(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
 def _with_torque_balance(fitted: Fitted, motor: list[int]) -> tuple[Fitted, list[RecordedDrive]]:
     """Return the fit of vibrations and rotors together, and the predicted angle of the rotor in each run.
 
-    **Arguments**: `fitted` to the vibrations alone; places of the numbers of the `motor` in x.
+    **Arguments**: `fitted` to the vibrations alone; indices of the numbers of the `motor` in x.
     """
     problem, p, size = fitted.problem, fitted.x.size, fitted.x.size + fitted.linear.size
     runs, of_rotors = _runs(fitted)
-    y, all_places = np.concatenate([fitted.x, fitted.linear, of_rotors]), np.arange(size + of_rotors.size)
-    y = _minimum(problem, runs, y, np.concatenate([motor, all_places[size:]]).astype(int))[0].y
+    y, all_indices = np.concatenate([fitted.x, fitted.linear, of_rotors]), np.arange(size + of_rotors.size)
+    y = _minimum(problem, runs, y, np.concatenate([motor, all_indices[size:]]).astype(int))[0].y
     converged, information = False, np.zeros((size, size))
     for _ in range(_JOINT_PASSES):
-        trial, converged = _minimum(problem, runs, y, all_places)
-        y, information = trial.y, eliminate(trial.equations[0], all_places[:size])
+        trial, converged = _minimum(problem, runs, y, all_indices)
+        y, information = trial.y, eliminate(trial.equations[0], all_indices[:size])
         runs = [run._replace(noise=_noise(run, _deviations_of(problem, run, y)[0])) for run in runs]
     x, linear = y[:p], y[p:size]
     fitted = fitted._replace(
@@ -230,7 +230,7 @@ def _runs(fitted: Fitted) -> tuple[list[_Run], np.ndarray]:
     """Return the runs of a fit, and first values of the unknowns of the rotors."""
     problem, runs, first_values = fitted.problem, [], []
     nonlinear_count, size = fitted.x.size - problem.unknowns.errors, fitted.x.size + fitted.linear.size
-    for samples, (angle,), place in zip(problem.runs, problem.rotors, linear_places(problem), strict=True):
+    for samples, (angle,), of_run in zip(problem.runs, problem.rotors, linear_indices(problem), strict=True):
         drive, rotor = samples.drives[0], angle.samples
         assert isinstance(drive, RecordedDrive) and rotor is not None
         factor = max(1, math.ceil(float(samples.step) * float(drive.speed) / _FINE_ANGLE))
@@ -246,18 +246,18 @@ def _runs(fitted: Fitted) -> tuple[list[_Run], np.ndarray]:
         rotor = rotor._replace(**sampled, scatter=scatter)
         of_rotor = [drive.angle_at(samples.begin), drive.speed_at(samples.begin), *np.zeros(1 + int(np.max(rotor.marks)))]
         states = 2 * len(problem.scene.machine.structure().coordinates)
-        linear = np.concatenate([place[:states], place[-2 - len(samples.channels) : -len(samples.channels)]])
-        places = np.concatenate(
+        linear = np.concatenate([of_run[:states], of_run[-2 - len(samples.channels) : -len(samples.channels)]])
+        indices = np.concatenate(
             [np.arange(nonlinear_count), fitted.x.size + linear, size + len(first_values) + np.arange(len(of_rotor))]
         )
-        runs.append(_Run(fine, rotor, places, len(of_rotor), Noise(np.ones(1), float(scatter))))
+        runs.append(_Run(fine, rotor, indices, len(of_rotor), Noise(np.ones(1), float(scatter))))
         first_values += map(float, of_rotor)
     return runs, np.array(first_values)
 
 
 def _parts(problem: Problem, run: _Run, y: np.ndarray) -> list[Array]:
     """Return x, the state at the first sample with the unbalance, and the unknowns of the run's rotor."""
-    x, linear = y[: problem.unknowns.count], y[run.places[problem.unknowns.count - problem.unknowns.errors :]]
+    x, linear = y[: problem.unknowns.count], y[run.indices[problem.unknowns.count - problem.unknowns.errors :]]
     return [jnp.asarray(each) for each in (x, linear[: -run.rotor_count], linear[-run.rotor_count :])]
 
 
@@ -281,14 +281,14 @@ def _noise(run: _Run, deviations: np.ndarray) -> Noise:
 
 
 def _minimum(problem: Problem, runs: list[_Run], y: np.ndarray, free: np.ndarray) -> tuple[_Trial, bool]:
-    """Return the minimum near `y` over the unknowns at the places `free`, and True if it was reached."""
+    """Return the minimum near `y` over the unknowns with the indices `free`, and True if it was reached."""
 
     def stepped(trial: _Trial, step: np.ndarray) -> _Trial:
         whole = np.zeros(y.size)
         whole[free] = step
         return _trial(problem, runs, trial.y + limited_step(problem, whole), free)
 
-    positive = np.flatnonzero(np.isin(free, positive_places(problem)))
+    positive = np.flatnonzero(np.isin(free, positive_indices(problem)))
     best, _, converged = descend(_trial(problem, runs, y, free), lambda trial: trial.equations, stepped, free.size, positive)
     return best, converged
 
@@ -298,21 +298,21 @@ def _trial(problem: Problem, runs: list[_Run], y: np.ndarray, free: np.ndarray) 
     p, size = problem.unknowns.count, unknown_count(problem)
     x, linear = y[:p], y[p:size]
     total, prior = np.zeros((y.size + 1, y.size + 1)), np.zeros((y.size, y.size))
-    places = np.append(np.arange(size), y.size)
-    total[np.ix_(places, places)] = np.sum(run_equations(problem, x, linear), axis=0)
+    indices = np.append(np.arange(size), y.size)
+    total[np.ix_(indices, indices)] = np.sum(run_equations(problem, x, linear), axis=0)
     gradient = np.zeros(y.size)
     prior[:size, :size], gradient[:size] = prior_equations(problem, x, linear)
     cost = known_cost(problem, x, linear)
     for run in runs:
         deviations, slopes = _deviations_of(problem, run, y)
-        taps, places = run.noise.taps, np.append(run.places, y.size)
+        taps, indices = run.noise.taps, np.append(run.indices, y.size)
         both = np.concatenate([slopes, -deviations[:, None]], axis=1) / run.noise.deviation
         white = np.stack([np.convolve(each, taps, mode="valid") for each in both.T], axis=1)
-        total[np.ix_(places, places)] += white.T @ white
+        total[np.ix_(indices, indices)] += white.T @ white
         # The common delay is known as 0 with the standard error 1.
-        delay_places = np.array([run.places[2 - run.rotor_count], y.size])
-        row = np.array([1.0, -y[delay_places[0]]])
-        total[np.ix_(delay_places, delay_places)] += np.outer(row, row)
+        delay_indices = np.array([run.indices[2 - run.rotor_count], y.size])
+        row = np.array([1.0, -y[delay_indices[0]]])
+        total[np.ix_(delay_indices, delay_indices)] += np.outer(row, row)
     block = np.ix_(free, free)
     equations = total[:-1, :-1][block], prior[block], (total[:-1, -1] + gradient)[free]
     return _Trial(y, total[-1, -1] + cost, equations)

@@ -87,19 +87,19 @@ class PlannedRun(Readable):
 class Expected(NamedTuple):
     """Planned run, evaluated with the numbers of a fit.
 
-    **Attributes**: `fitted`: the run as a fit without iterations; `places_in_run` and `places_in_fit`: indices of the unknowns
+    **Attributes**: `fitted`: the run as a fit without iterations; `indices_in_run` and `indices_in_fit` of the unknowns
     that the run shares with the fit, among the unknowns of the run and in the information of the fit.
     """
 
     fitted: Fitted
-    places_in_run: np.ndarray
-    places_in_fit: np.ndarray
+    indices_in_run: np.ndarray
+    indices_in_fit: np.ndarray
 
     def shared(self, information: np.ndarray, size: int) -> np.ndarray:
         """Return the information (size, size) of the run about the unknowns of the fit, from its `information` about all
         unknowns of the run."""
         total = np.zeros((size, size))
-        total[np.ix_(self.places_in_fit, self.places_in_fit)] = eliminate(information, self.places_in_run)
+        total[np.ix_(self.indices_in_fit, self.indices_in_fit)] = eliminate(information, self.indices_in_run)
         return total
 
 
@@ -142,7 +142,7 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
             )
     fitted = information_at(problem, linear)
     has_mark = any(channel.kind in ("pulses", "angle") for channel in planned.channels)
-    return Expected(fitted, *shared_places(fit, problem, has_mark))
+    return Expected(fitted, *shared_indices(fit, problem, has_mark))
 
 
 def _noises(fit: MachineFit) -> dict[str, tuple[Noise, float]]:
@@ -179,8 +179,8 @@ def own_precisions(fit: MachineFit, problem: Problem) -> np.ndarray:
     return precisions
 
 
-def shared_places(fit: MachineFit, problem: Problem, has_mark: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places of the shared unknowns of a run and a fit: among the unknowns of the run, and in `fit.information`.
+def shared_indices(fit: MachineFit, problem: Problem, has_mark: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of the shared unknowns of a run and a fit: among the unknowns of the run, and in `fit.information`.
 
     **Arguments**: `has_mark`: True if the zero of the rotor's angle in the run is that of the fit.
     """
@@ -192,8 +192,8 @@ def shared_places(fit: MachineFit, problem: Problem, has_mark: bool) -> tuple[np
     gains = enumerate(unknowns.gains)
     pairs += [(number_count + at, count + fit.gain_names.index(name)) for at, name in gains if name in fit.gain_names]
     pairs += [(p + 1, count + len(fit.gain_names))] * has_mark
-    places_in_run, places_in_fit = np.array(pairs, int).T
-    return places_in_run, places_in_fit
+    indices_in_run, indices_in_fit = np.array(pairs, int).T
+    return indices_in_run, indices_in_fit
 
 
 def expected_information(fit: MachineFit, expected: Expected) -> np.ndarray:

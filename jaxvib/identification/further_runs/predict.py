@@ -13,7 +13,7 @@ from jaxvib.display import Drawn, Onto
 from jaxvib.identification.checks import CHANCE, Disagreement, disagreement, pseudoinverse, residual_chance
 from jaxvib.identification.directions import eliminate, elimination, polar_unbalances
 from jaxvib.identification.fit import differences_of, linear_at, minimize, run_equations
-from jaxvib.identification.further_runs.planned import own_precisions, problem_of_run, shared_places
+from jaxvib.identification.further_runs.planned import own_precisions, problem_of_run, shared_indices
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.jammed.start import with_first_motion
 from jaxvib.identification.problem import EXACT, Known, Problem, require_linear_supports, with_noise
@@ -234,7 +234,7 @@ def _deviation(fit: MachineFit, at: _Predicted) -> Disagreement:
     for k in range(len(fit.scene.exciters)):
         if f"exciters[{k}].unbalance" not in fit.names:  # known exactly
             matrix[p + 2 * k, p + 2 * k] += 1.0 / EXACT**2
-    in_run, in_fit = shared_places(fit, problem, at.has_mark)
+    in_run, in_fit = shared_indices(fit, problem, at.has_mark)
     part, gradient = np.zeros((size, size)), np.zeros(size)
     part[np.ix_(in_fit, in_fit)] = eliminate(matrix, in_run)
     gradient[in_fit] = elimination(matrix, in_run).T @ slope

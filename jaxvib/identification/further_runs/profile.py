@@ -14,7 +14,7 @@ from jax import Array
 from jaxvib.display import speed_text
 from jaxvib.errors import InputError
 from jaxvib.identification.directions import elimination, in_polar_unbalances, polar_unbalances
-from jaxvib.identification.fit import linear_places
+from jaxvib.identification.fit import linear_indices
 from jaxvib.identification.further_runs.planned import Expected, PlannedRun
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.response import Samples, Unknowns, normal_equations
@@ -110,18 +110,18 @@ def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.n
     product of F: the vector contains the derivatives of the objective with respect to the entries of F.
     """
     fitted, k, p = expected.fitted, len(fit.names), expected.fitted.x.size
-    problem, place = fitted.problem, linear_places(fitted.problem)[0]
-    where = np.concatenate([np.arange(p), p + place])
+    problem, indices = fitted.problem, linear_indices(fitted.problem)[0]
+    where = np.concatenate([np.arange(p), p + indices])
 
     def of_run(speeds: Array) -> Array:
-        x, linear = jnp.asarray(fitted.x), jnp.asarray(fitted.linear[place])
+        x, linear = jnp.asarray(fitted.x), jnp.asarray(fitted.linear[indices])
         return _information(problem.unknowns, problem.runs[0], problem.scene, x, linear, jnp.asarray(times), speeds)
 
     equations, vector_product = jax.vjp(of_run, jnp.asarray(speeds))
     run = np.zeros_like(fitted.information)
     run[np.ix_(where, where)] = np.asarray(equations)[:-1, :-1]
     data, known, _ = in_polar_unbalances(fitted._replace(information=run))
-    inner = elimination(data + known, expected.places_in_run)
+    inner = elimination(data + known, expected.indices_in_run)
     total = fit.information + expected.shared(data + known, len(fit.information))
     outer = elimination(total, np.arange(k))
     covariance = np.linalg.inv(outer.T @ total @ outer + np.eye(k))
@@ -129,7 +129,7 @@ def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.n
 
     weights = -0.5 * outer @ (covariance / variances) @ covariance @ outer.T
     polar, _ = polar_unbalances(problem, fitted.linear)
-    weights = polar @ inner @ weights[np.ix_(expected.places_in_fit, expected.places_in_fit)] @ inner.T @ polar.T
+    weights = polar @ inner @ weights[np.ix_(expected.indices_in_fit, expected.indices_in_fit)] @ inner.T @ polar.T
     padded = np.zeros(equations.shape)
     padded[:-1, :-1] = weights[np.ix_(where, where)]
     (gradient,) = vector_product(jnp.asarray(padded))

@@ -227,7 +227,7 @@ def linearized(
     values, slopes = _slopes(unknowns, samples, scene, jnp.asarray(x), jnp.asarray(own[count : count + 2]), jnp.asarray(starts))
     (readings, ends), (by_readings, by_ends) = jax.tree.map(np.asarray, (values, slopes))
     gaps, width = ends[:-1] - starts[1:], p + count + 2 + len(samples.channels) + 1
-    direct = np.concatenate([np.arange(p), p + count + np.arange(2)])  # places of x and pair
+    direct = np.concatenate([np.arange(p), p + count + np.arange(2)])  # indices of x and pair
     change, start_changes, columns = np.zeros((count, width)), [], []
     change[:, p : p + count] = np.eye(count)
     for j in range(len(starts)):

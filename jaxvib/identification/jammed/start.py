@@ -24,8 +24,8 @@ from jaxvib.identification.fit import (
     descend,
     known_cost,
     limited_step,
-    linear_places,
-    positive_places,
+    linear_indices,
+    positive_indices,
     prior_equations,
     project,
     unknown_count,
@@ -122,7 +122,7 @@ def _stiffnesses_of_jam(problem: Problem, jams: Sequence[_Jam]) -> np.ndarray | 
     loads is slightly above this speed, as in a jam; None if no stiffness is unknown, or if the number is nearly 1."""
     speed, frequency = float(np.median(np.abs(jams[0].speed))), natural(problem.scene)[0]
     names = [number.name for number in problem.unknowns.numbers]
-    own = [k for k in positive_places(problem) if "stiffness" in names[k] and problem.precisions[k] == 0.0]
+    own = [k for k in positive_indices(problem) if "stiffness" in names[k] and problem.precisions[k] == 0.0]
     if not own or not frequency.size:
         return None
     nearest = frequency[np.argmin(np.abs(np.log(frequency / speed)))]
@@ -135,9 +135,9 @@ def _first_fit(problem: Problem, jams: Sequence[_Jam], x: np.ndarray) -> tuple[_
     """Return the motion of all runs that results from the first values x, and the information of `load_spread_of`."""
     x, linear = x.copy(), np.zeros(unknown_count(problem) - problem.unknowns.count)
     starts, pairs = [], []
-    for r, (jam, place) in enumerate(zip(jams, linear_places(problem), strict=True)):
+    for r, (jam, indices) in enumerate(zip(jams, linear_indices(problem), strict=True)):
         states, pair, offsets = _linear_motion(problem, r, jam, x)
-        linear[place] = np.concatenate([states[0], pair, offsets])
+        linear[indices] = np.concatenate([states[0], pair, offsets])
         starts.append(states)
         pairs.append(pair)
     linear[:2] = pairs[0]
@@ -160,8 +160,8 @@ def first_states(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, ...]
     """Return the states of each run at the first sample, without those of filters: displacements, velocities, angles of the
     loads, their rates; and the angle of the rotor."""
     count = 2 * (len(problem.scene.machine.structure().coordinates) + _loads_of(problem.scene).count)
-    places = zip(linear_places(problem), problem.angles, strict=True)
-    return tuple(np.append(linear[place[:count]], angles[0, 0]) for place, angles in places)
+    pairs = zip(linear_indices(problem), problem.angles, strict=True)
+    return tuple(np.append(linear[indices[:count]], angles[0, 0]) for indices, angles in pairs)
 
 
 def with_jam(problem: Problem, linear: np.ndarray, state: np.ndarray) -> tuple[Problem, np.ndarray]:
@@ -169,8 +169,8 @@ def with_jam(problem: Problem, linear: np.ndarray, state: np.ndarray) -> tuple[P
 
     **Arguments**: `linear` (L,) with the components of the unbalance.
     """
-    places, samples = linear_places(problem)[0], problem.runs[0]
-    linear[places[: state.size - 1]] = state[:-1]
+    indices, samples = linear_indices(problem)[0], problem.runs[0]
+    linear[indices[: state.size - 1]] = state[:-1]
     (drive,), begin = samples.drives, samples.begin
     shifted = ShiftedDrive(drive=drive, phase=state[-1] - drive.rotor_angle(begin, None), end=samples.end, speed=drive.speed)
     turned = dataclasses.replace(samples, drives=(shifted,))
@@ -179,8 +179,8 @@ def with_jam(problem: Problem, linear: np.ndarray, state: np.ndarray) -> tuple[P
 
 def is_jammed(problem: Problem, linear: np.ndarray) -> bool:
     """Return True if the loads of the first run turn slower than the rotor at the first sample of each stretch."""
-    samples, place = problem.runs[0], linear_places(problem)[0]
-    _, starts = closed_motion(problem.unknowns, samples, problem.scene, np.zeros(problem.unknowns.count), linear[place])
+    samples, indices = problem.runs[0], linear_indices(problem)[0]
+    _, starts = closed_motion(problem.unknowns, samples, problem.scene, np.zeros(problem.unknowns.count), linear[indices])
     loads = _loads_of(problem.scene).count
     rates = starts[:, 2 * len(problem.scene.machine.structure().coordinates) + loads :][:, :loads]
     speed = np.abs(np.gradient(problem.angles[0][:, 0], float(samples.step)))[:: samples.stretches[1]]
@@ -193,8 +193,8 @@ def load_spread_of(problem: Problem, linear: np.ndarray) -> np.ndarray:
     loads, mount = _loads_of(problem.scene), problem.scene.mounting
     nd, information = len(problem.scene.machine.structure().coordinates), np.zeros((linear.size, linear.size))
     spread = _COINCIDENT_SPREAD if loads.alike and mount.at_one_point else _FREE_SPREAD
-    for place in linear_places(problem):
-        angles, rates = np.split(place[2 * nd : 2 * (nd + loads.count)], 2)
+    for indices in linear_indices(problem):
+        angles, rates = np.split(indices[2 * nd : 2 * (nd + loads.count)], 2)
         for group, size in ((angles, 1.0), (rates, abs(float(linear[rates[0]])))):
             information[np.ix_(group, group)] = (np.eye(loads.count) - 1.0 / loads.count) / (spread * size) ** 2
     return information
@@ -273,7 +273,7 @@ def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[
 
 def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.ndarray]) -> _Trial:
     """Return the best motion near the first values `x`, `linear` and `starts`, which leave gaps between the stretches."""
-    p, size, places = x.size, x.size + linear.size, linear_places(problem)
+    p, size, indices_of_runs = x.size, x.size + linear.size, linear_indices(problem)
     whole = np.concatenate(starts)
     scale = np.maximum(np.sqrt(np.mean(whole**2, axis=0)), 1e-9 * np.max(np.abs(whole)))
     turns = 2 * len(problem.scene.machine.structure().coordinates) + np.arange(_loads_of(problem.scene).count)
@@ -282,9 +282,9 @@ def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.
     def trial(x: np.ndarray, linear: np.ndarray, starts: tuple[np.ndarray, ...]) -> _Trial:
         total, prior, gradient = np.zeros((size + 2, size + 2)), np.zeros((size + 1, size + 1)), np.zeros(size + 1)
         start_changes = []
-        for samples, place, starts_of_run in zip(problem.runs, places, starts, strict=True):
-            at = linearized(problem.unknowns, samples, problem.scene, x, linear[place], starts_of_run)
-            where = np.concatenate([np.arange(p), p + place, [size, size + 1]])
+        for samples, indices, starts_of_run in zip(problem.runs, indices_of_runs, starts, strict=True):
+            at = linearized(problem.unknowns, samples, problem.scene, x, linear[indices], starts_of_run)
+            where = np.concatenate([np.arange(p), p + indices, [size, size + 1]])
             columns = weighted_columns(samples, at, at.columns)
             total[np.ix_(where, where)] += columns.T @ columns
             total[size:, size:] += np.sum((at.gaps / (_GAP_SIZE * scale)) ** 2)  # the last unknown is 1 for closed gaps
@@ -296,11 +296,11 @@ def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.
 
     def stepped(at: _Trial, step: np.ndarray) -> _Trial:
         step = limited_step(problem, step)
-        steps = (np.concatenate([step[:p], step[p + place], step[size:]]) for place in places)
+        steps = (np.concatenate([step[:p], step[p + indices], step[size:]]) for indices in indices_of_runs)
         changes = [change @ each for change, each in zip(at.start_changes, steps, strict=True)]
         factor = min(1.0, _MAX_TURN / max(float(np.max(np.abs(each[:, turns]))) for each in changes))
         new = tuple(each + factor * change for each, change in zip(at.starts, changes, strict=True))
         return trial(at.x + factor * step[:p], at.linear + factor * step[p:size], new)
 
     first = trial(x, linear, tuple(starts))
-    return descend(first, lambda at: at.equations, stepped, size + 1, positive_places(problem))[0]
+    return descend(first, lambda at: at.equations, stepped, size + 1, positive_indices(problem))[0]

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.identification.fit import Fitted, linear_at, linear_places, minimize, project
+from jaxvib.identification.fit import Fitted, linear_at, linear_indices, minimize, project
 from jaxvib.identification.problem import Problem, channel_sizes, with_noise
 from jaxvib.identification.response import Samples, linear_steps, model_states
 from jaxvib.machine.effects.supports import Stop
@@ -49,8 +49,8 @@ def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     alone = [project(weighted._replace(runs=(samples,)), x).linear for samples in weighted.runs]
     for samples, linear in zip(weighted.runs, alone, strict=True):
         if samples.turn is not None:
-            place = problem.unknowns.first.shape[0] + len(problem.unknowns.gains) + samples.turn
-            x[place] = math.atan2(linear[1], linear[0]) - math.atan2(alone[0][1], alone[0][0])
+            index = problem.unknowns.first.shape[0] + len(problem.unknowns.gains) + samples.turn
+            x[index] = math.atan2(linear[1], linear[0]) - math.atan2(alone[0][1], alone[0][0])
     begins = tuple(_beginning(samples) for samples in weighted.runs)
     linear = linear_at(weighted._replace(runs=begins), x, project(weighted, x).linear[:2])
     guides = [jnp.asarray(_guide(weighted, r, x, linear)) for r in range(len(problem.runs))]
@@ -68,16 +68,16 @@ def _with_first_states(problem: Problem, x: np.ndarray, linear: np.ndarray) -> n
     """Return the linear unknowns of a linear response with the displacements of the first states in m. Those of the response
     are multiplied by a frequency."""
     first = linear.copy()
-    for samples, place in zip(problem.runs, linear_places(problem), strict=True):
-        states = model_states(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear[place]))
-        first[place[: states.shape[1]]] = states[0]
+    for samples, indices in zip(problem.runs, linear_indices(problem), strict=True):
+        states = model_states(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear[indices]))
+        first[indices[: states.shape[1]]] = states[0]
     return first
 
 
 def _beginning(samples: Samples) -> Samples:
     """Return the samples, of which only those of the first stretch count."""
-    place = jnp.arange(samples.weights.shape[0] * samples.weights.shape[1]).reshape(samples.weights.shape[:2])
-    weights = jnp.where(place[:, :, None] < samples.stretches[1], samples.weights, 0.0)
+    index = jnp.arange(samples.weights.shape[0] * samples.weights.shape[1]).reshape(samples.weights.shape[:2])
+    weights = jnp.where(index[:, :, None] < samples.stretches[1], samples.weights, 0.0)
     return dataclasses.replace(samples, weights=weights)
 
 
@@ -87,7 +87,7 @@ def _guide(problem: Problem, r: int, x: np.ndarray, linear: np.ndarray) -> np.nd
 
     parts = problem.unknowns, problem.runs[r], problem.scene, jnp.asarray(x)
     power, outputs = (np.asarray(each) for each in linear_steps(*parts))
-    states = np.asarray(model_states(*parts, jnp.asarray(linear[linear_places(problem)[r]])))
+    states = np.asarray(model_states(*parts, jnp.asarray(linear[linear_indices(problem)[r]])))
     nd, random = states.shape[1] // 2, np.zeros(len(power))
     random[nd : 2 * nd] = (_STRENGTH * np.max(np.abs(states[: len(problem.raw[r]), nd:]), axis=0)) ** 2
     noise = np.diag(np.array(channel_sizes(problem)[r]) ** 2)
@@ -102,8 +102,8 @@ def _with_open_stops(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.
     """
     x, names = x.copy(), [number.name for number in problem.unknowns.numbers]
     paths, nd = [], len(problem.scene.machine.structure().coordinates)
-    for samples, place, raw in zip(problem.runs, linear_places(problem), problem.raw, strict=True):
-        states = model_states(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear[place]))
+    for samples, indices, raw in zip(problem.runs, linear_indices(problem), problem.raw, strict=True):
+        states = model_states(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear[indices]))
         paths.append(states[: len(raw), :nd])
     stops = [effect for effect in problem.unknowns.scene(problem.scene, x).effects if isinstance(effect, Stop)]
     for k, stop in enumerate(stops):

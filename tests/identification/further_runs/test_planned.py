@@ -21,7 +21,7 @@ from jaxvib.identification.further_runs.planned import (
     expected_information,
     expected_run,
     own_precisions,
-    shared_places,
+    shared_indices,
 )
 from jaxvib.identification.further_runs.profile import Limits, _spread, optimized_profile, require_within
 
@@ -54,7 +54,7 @@ def test_planned_run_has_the_numbers_and_the_noise_of_the_fit():
     np.testing.assert_allclose(found.fitted.linear[:2], 0.05 * np.array([np.cos(0.4), np.sin(0.4)]))
     assert not np.any(found.fitted.linear[2:]) and not np.any(found.fitted.x)
     # Numbers, gain and unbalance; the runs have no common zero of the angle.
-    assert found.places_in_run.tolist() == [0, 1, 3, 2] and found.places_in_fit.tolist() == [0, 2, 1, 4]
+    assert found.indices_in_run.tolist() == [0, 1, 3, 2] and found.indices_in_fit.tolist() == [0, 2, 1, 4]
     np.testing.assert_allclose(problem.precisions, 0.0)  # the gain is known by the fit
     assert problem.unbalances == (None,)
 
@@ -65,7 +65,7 @@ def test_noise_of_another_rate_and_of_new_channels(noise, deviation):
     deck, tacho = jv.Channel("deck", "velocity", at=1), jv.Channel("tacho", "pulses")
     found = expected_run(fit(), ramp(channels=(deck, tacho), noise=noise))
     np.testing.assert_allclose(found.fitted.problem.runs[0].weights[0, :, 0], 1.0 / deviation)
-    assert found.places_in_run.tolist() == [0, 1, 2, 3] and found.places_in_fit.tolist() == [
+    assert found.indices_in_run.tolist() == [0, 1, 2, 3] and found.indices_in_fit.tolist() == [
         0,
         2,
         1,
@@ -106,14 +106,14 @@ def test_new_gains_keep_their_known_errors():
     assert own_precisions(fit(), problem).tolist() == [0.0, 3.0, 0.0, 16.0] and problem.precisions[2] == 25.0
 
 
-def test_places_of_shared_unknowns():
+def test_indices_of_shared_unknowns():
     named = tuple(SimpleNamespace(name=name) for name in ("machine.damping[0]", "machine.stiffness[0]"))
     unknowns = SimpleNamespace(numbers=named, gains=("new", "frame"), count=5)
     problem = SimpleNamespace(unknowns=unknowns, unbalances=(None,))
     for has_mark, pairs in ((False, [(0, 2), (1, 0), (5, 1), (3, 4)]), (True, [(0, 2), (1, 0), (5, 1), (3, 4), (6, 5)])):
-        own, place = shared_places(fit(), problem, has_mark)
-        assert list(zip(own.tolist(), place.tolist(), strict=True)) == pairs
-    shared = Expected(None, own[:2], place[:2]).shared(np.diag([3.0, 4.0, 5.0]), 4)
+        in_run, in_fit = shared_indices(fit(), problem, has_mark)
+        assert list(zip(in_run.tolist(), in_fit.tolist(), strict=True)) == pairs
+    shared = Expected(None, in_run[:2], in_fit[:2]).shared(np.diag([3.0, 4.0, 5.0]), 4)
     np.testing.assert_array_equal(shared, np.diag([4.0, 0.0, 3.0, 0.0]))
 
 

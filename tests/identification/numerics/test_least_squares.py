@@ -266,7 +266,7 @@ def test_known_unbalance_without_influence_stays_small(monkeypatch):
         return total * np.outer(factors, factors)
 
     problem = problem_with(unbalance=Known(1.0, 1e-4))
-    first = int(np.flatnonzero(fit.linear_places(problem)[0] == 0)[0])
+    first = int(np.flatnonzero(fit.linear_indices(problem)[0] == 0)[0])
     monkeypatch.setattr(fit, "linear_equations", equations)
     found = fit.project(problem, TRUTH)
     assert np.hypot(*found.linear[:2]) == pytest.approx(1.0, abs=1e-3)
