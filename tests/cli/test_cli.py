@@ -59,7 +59,7 @@ def test_modes_name_a_resonance_without_a_peak(typed, tmp_path):
     plain = scene("two_mass", speed=150.0)
     damped = eqx.tree_at(lambda s: s.machine.damping, plain, 30.0 * plain.machine.damping)
     jv.save_scene(damped, tmp_path / "damped.toml")
-    said = "modes 1, 2 exist at no rotor speed: the branch has no peak of its own"
+    said = "modes 1, 2 exist at no rotor speed: resonance 1 has no peak of its own"
     assert said in typed("modes", "damped.toml")[1] and said in jv.jam_modes(damped).summary()
     assert json.loads(typed("modes", "damped.toml", "--json")[1])["unresolved"] == [1, 2]
     assert "at no rotor speed" not in typed("modes", "machine.toml")[1] + jv.jam_modes(plain).summary()

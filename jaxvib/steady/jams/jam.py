@@ -45,7 +45,7 @@ from jaxvib.units.known import when_known
 STABILITY_CRITERION = "by slope, for light loads that stay together"
 """Name of the stability criterion of jam modes, with its assumption."""
 
-_UNRESOLVED = "the branch has no peak of its own, because of damping, a close resonance or an exciter that does not move,"
+_UNRESOLVED = "no peak of its own on the branch (strong damping, a close resonance, or an exciter that does not move)"
 
 
 class JamStatus(eqx.Enumeration):
@@ -69,7 +69,7 @@ class AbstractJam(Result):
     - `mode`: number of the mode
     - `status`: a `JamStatus`
     - `omega`: speed of the loads, rad/s; `rotor_speed`, rad/s
-    - `stable`: True if the slope dn/dOmega > 0, for light loads that stay together (`phase_jams` shows if they do)
+    - `stable`: True if the slope dn/dOmega > 0, for light loads that stay together (`phase_jams` shows whether they do)
     - `slope`: dn/dOmega
     - `displacement` (nd,): complex amplitudes of q = Re(displacement exp(i Omega t)), m (rad for tilts)
     - `amplitude` (nd,), m (rad for tilts), zero to peak; typical: 0.5 to 10 mm
@@ -158,8 +158,8 @@ class JamModes(AbstractJam):
         if not (modes := self.unresolved):
             return ""
         resonances = sorted({(mode + 1) // 2 for mode in modes})
-        at = f"resonance{'s' if len(resonances) > 1 else ''} {', '.join(map(str, resonances))}"
-        return f"modes {', '.join(map(str, modes))} exist at no rotor speed: {_UNRESOLVED} at {at}"
+        subject = f"{'each of resonances' if len(resonances) > 1 else 'resonance'} {', '.join(map(str, resonances))}"
+        return f"modes {', '.join(map(str, modes))} exist at no rotor speed: {subject} has {_UNRESOLVED}"
 
     def mode_numbers(self) -> list[int]:
         """Return the numbers of the modes that exist, from 1 to 2 nd + 1."""
@@ -181,7 +181,7 @@ class JamModes(AbstractJam):
     def _require_mode(self, mode: int) -> None:
         if status_names(self.status)[mode - 1] == "absent":
             there, rotor = ", ".join(map(str, self.mode_numbers())), speed_text(np.asarray(self.rotor_speed)[0], 6)
-            why = f": {_UNRESOLVED} at resonance {(mode + 1) // 2}" if mode in self.unresolved else ""
+            why = f": resonance {(mode + 1) // 2} has {_UNRESOLVED}" if mode in self.unresolved else ""
             raise ComputationError(
                 "absent", f"jam mode {mode} does not exist at rotor speed {rotor}{why}; existing modes: {there}"
             )
@@ -384,7 +384,7 @@ def jam_at(
     speed, slope, displacement = branch_tangent(model, omega)
     rotor_speed = speed if rotor_speed is None else rotor_speed
     at_fold = jnp.abs(slope) < jnp.sqrt(jnp.finfo(omega.dtype).eps) if at_fold is None else at_fold
-    # Within a few units in the last place of an undamped resonance the amplitude consists of rounding errors.
+    # Within a few units in the last place of the speed of an undamped resonance, the amplitude consists of rounding errors.
     radius = model.unbalance / jnp.min(jnp.diagonal(model.mass))
     bounded = jnp.all(magnitude(displacement) * 100.0 * jnp.finfo(radius.dtype).eps < radius)
     displacement = jnp.where(bounded, displacement, jnp.nan)
