@@ -12,7 +12,7 @@ import numpy as np
 from jaxvib.identification.directions import Information, eliminate, elimination, polar_unbalances
 from jaxvib.identification.fit import Fitted, angle_shares, prior_equations, run_equations
 from jaxvib.identification.records.orders import foreign_vibration
-from jaxvib.identification.torque import MISFIT
+from jaxvib.identification.torque import MAX_MISFIT
 
 CHANCE = 1e-5
 """Chance below which residuals are not noise, and below which a run deviates from other runs. Residuals of pure noise get the
@@ -89,7 +89,7 @@ def status_of(fitted: Fitted, information: Information) -> tuple[FitStatus, floa
             "the noise is assumed to be white, and the intervals are too narrow: fit runs one by one, or record them again"
         )
     for k, misfit in enumerate(fitted.misfits):
-        if misfit > MISFIT:
+        if misfit > MAX_MISFIT:
             is_inaccurate = True
             notes.append(
                 f"the rotor in run {k + 1} deviates from the torque balance of its motor by {misfit:.3g} times the scatter of "

@@ -15,23 +15,25 @@ from jaxvib.identification.fit import Fitted
 from jaxvib.identification.problem import Problem
 
 UNDETERMINED = 1.0
-"""Relative standard error of a direction above which it counts as undetermined: a factor of e."""
+"""Standard error of a direction, as a relative change, above which it counts as undetermined. On the logarithmic scale 1 is a
+factor of e."""
 
 _UNBOUNDED_ERROR = 1e3
 """Standard error of the logarithm of a number above which the records do not bound the number, not even from above."""
 
 _SINGLE = 0.99
-"""Absolute component of a number in a direction (a vector of length 1) above which the direction is that of the number
-alone."""
+"""Absolute value of the component of a number in a direction (a vector of length 1) above which the direction is that of the
+number alone."""
 
 _MIN_SHARE = 0.05
-"""Absolute component of a number in an undetermined direction above which the number itself counts as undetermined."""
+"""Absolute value of the component of a number in an undetermined direction above which the number itself counts as
+undetermined."""
 
 _MIN_COMMON_PART = 0.95
 """Part of the direction of the common factor (of all masses, stiffnesses, dampings and unbalances) that lies within the
 undetermined directions; above this value the factor itself counts as undetermined."""
 
-_ADVICE = "give one of them in kg or N as known, or record a run with a known mass added"
+_ADVICE = "give one of these numbers as known, or record a run with a known mass added"
 
 
 class Direction(NamedTuple):
@@ -53,8 +55,8 @@ class Information(NamedTuple):
     **Attributes**
 
     - `names` (k,) of the numbers; `values` (k,), SI
-    - `logarithmic` (k,): each number has a variable of the fit; True if the variable is the logarithm of the number. Otherwise
-      it is the number divided by its scale
+    - `logarithmic` (k,): True if the variable of the fit is the logarithm of the number; otherwise the variable is the number
+      divided by its scale
     - `scale` (k,): change of the number per unit of this variable
     - `covariance` (k, k) of the variables in the determined directions
     - `undetermined` (k, u): directions that the records do not determine; `errors` (u,): their standard errors
@@ -164,7 +166,8 @@ def free_unbalances(problem: Problem) -> list[int]:
 def in_polar_unbalances(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the information of the data, that of known values, both (p + L, p + L), and the sizes (E,) of the unbalances.
 
-    The unknowns are those of the fit, but with (logarithm of the size, angle) instead of (a, b) for each unbalance.
+    The unknowns are those of the fit, but with (logarithm of the size, angle) instead of the components (a, b) of each
+    unbalance. p is the number of nonlinear unknowns, L that of the linear ones.
     """
     jacobian, sizes = polar_unbalances(fitted.problem, fitted.linear)
     return jacobian.T @ fitted.information @ jacobian, jacobian.T @ fitted.prior @ jacobian, sizes
@@ -172,7 +175,7 @@ def in_polar_unbalances(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 def polar_unbalances(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives (p + L, p + L) of all unknowns with respect to the polar unknowns, and the sizes (E,) of the
-    unbalances. The polar unknowns have (logarithm of the size, angle) instead of (a, b) for each unbalance."""
+    unbalances. The polar unknowns have (logarithm of the size, angle) instead of the components (a, b) of each unbalance."""
     p, exciters = problem.unknowns.count, len(problem.unbalances)
     jacobian, sizes = np.eye(p + linear.size), np.zeros(exciters)
     for k in range(exciters):

@@ -5,13 +5,17 @@ predicted speed w and angle obey
 
     J w' = T(w) + c(t),      c = -Re[conj(i p) (a + i g)],      angle' = w
 
-p(t), kg m, is the unbalance times the unit vector to it, a the acceleration of the rotor's axis (horizontal + i up), both at
-the recorded angle, and g gravity. The first angle and speed are unknowns, and the predicted angle is compared with the pulses
-(or with samples of an angle or a speed). No derivative of the record is needed, the errors of the pulses are independent except
-for a common delay, and the dependence of the torque of the motor on the speed keeps the prediction near the record. The numbers
-of the motor, those of the machine and the motion at the first sample are fitted together, because the decrease of the speed at
-a resonance is a measure of the torque of the vibration. The rotation of a housing that turns with the machine is neglected in
-T.
+p(t), kg m, is the unbalance times the unit vector in its direction, a the acceleration of the rotor's axis (horizontal + i
+up), both at the recorded angle, and g gravity. The first angle and speed are unknowns, and the predicted angle is compared with
+the pulses (or with samples of an angle or a speed). This comparison has three advantages:
+
+- It needs no derivative of the record
+- The errors of the pulses are independent except for a common delay
+- The torque of the motor depends on the speed, which keeps the prediction near the record
+
+The numbers of the motor, those of the machine and the motion at the first sample are fitted together, because the decrease of
+the speed at a resonance is a measure of the torque of the vibration. T neglects the rotation of a housing that turns with the
+machine.
 """
 
 from __future__ import annotations
@@ -56,7 +60,7 @@ _AXES = tuple(
     for direction in ("across", "up")
 )
 
-MISFIT = 2.0
+MAX_MISFIT = 2.0
 """Deviation of a rotor from its torque balance, relative to that from a smooth curve, above which the balance does not describe
 the rotor."""
 
@@ -191,7 +195,7 @@ def fit_with_torques(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
     if not motor or not fitted.converged:
         return fitted
     fitted, drives = _with_torque_balance(fitted, motor)
-    if not fitted.converged or max(fitted.misfits) > MISFIT:
+    if not fitted.converged or max(fitted.misfits) > MAX_MISFIT:
         return fitted
     rotors = tuple((angle._replace(drive=drive),) for (angle,), drive in zip(problem.rotors, drives, strict=True))
     pairs = zip(problem.runs, rotors, strict=True)

@@ -41,7 +41,7 @@ _BELOW_ROTOR = 0.95
 """Largest speed of a jam relative to the smallest speed of the rotor."""
 
 _BAND_HALF_WIDTH = 0.25
-"""Relative half-width of the band about the speed of a jam from which its angle follows."""
+"""Relative half-width of the band of frequencies about the speed of a jam from which the angle of the loads follows."""
 
 _EDGE_TURNS = 3
 """Number of turns at each end of a record in which the angle is extrapolated with the mean speed."""
@@ -178,7 +178,7 @@ def with_jam(problem: Problem, linear: np.ndarray, state: np.ndarray) -> tuple[P
 
 
 def is_jammed(problem: Problem, linear: np.ndarray) -> bool:
-    """Return True if the loads of the first run turn slower than the rotor at the first sample of each stretch."""
+    """Return True if the loads of the first run turn more slowly than the rotor at the first sample of each stretch."""
     samples, indices = problem.runs[0], linear_indices(problem)[0]
     _, starts = closed_motion(problem.unknowns, samples, problem.scene, np.zeros(problem.unknowns.count), linear[indices])
     loads = _loads_of(problem.scene).count
@@ -217,8 +217,9 @@ def _jam_of(problem: Problem, r: int) -> _Jam:
     if not np.max(power) > _MIN_LINE_POWER * np.sum(power) / max(np.count_nonzero(in_range), 1):
         raise InputError(
             f"records[{r}]",
-            f"has no vibration of jammed loads below the smallest speed of the rotor, {high:.3g} rad/s; identify needs "
-            "records in which the loads of the scene are jammed from the first sample to the last, for at least 8 turns",
+            f"has no vibration of jammed loads below {high:.3g} rad/s, {_BELOW_ROTOR:.0%} of the smallest speed of the rotor; "
+            "identify needs records in which the loads of the scene are jammed from the first sample to the last, for at least "
+            "8 turns",
         )
     peak = float(frequency[np.argmax(power)])
     band = in_range & (np.abs(frequency / peak - 1.0) < _BAND_HALF_WIDTH)
@@ -236,8 +237,8 @@ def _jam_of(problem: Problem, r: int) -> _Jam:
 
 
 def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the states (J, ns) at the starts of the stretches of a run, the pair of its unbalance, and its offsets, at the
-    values `x`."""
+    """Return the states (J, ns) at the starts of the stretches of a run, the components of its unbalance, and its offsets, at
+    the values `x`."""
     samples = problem.runs[r]
     scene_of_run = samples.scene(problem.unknowns.scene(problem.scene, x))
     exciter, loads = scene_of_run.exciters[0], _loads_of(scene_of_run)

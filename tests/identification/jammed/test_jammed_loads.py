@@ -207,7 +207,8 @@ def test_scene_without_a_jam_in_the_record_is_refused():
     slow = {"a1": TIMES, "a2": TIMES, "tacho": np.arange(0.0, 16.0, 0.5)}
     channels = (*run.channels[:2], jv.Channel("tacho", "pulses"))
     with pytest.raises(
-        jv.InputError, match=r"records\[0\] has no vibration of jammed loads below the smallest speed of the rotor"
+        jv.InputError,
+        match=r"records\[0\] has no vibration of jammed loads below 11\.9 rad/s, 95% of the smallest speed",
     ):
         jv.identify(scene_of(TRUTH), jv.MeasuredRun.from_arrays(channels, slow, noise), unknown=UNKNOWN)
 
