@@ -1,9 +1,9 @@
 """Averaged equations of motion: complex amplitudes of the carrier and load speeds in place of vibrations.
 
 **Carrier.** Let theta be the loads' mean angle and Omega = theta' their mean rate, phi_j = theta + psi_j, w_j = phi_j'. The
-motion is q = Re(Y e^{i theta}), q' = Re(V e^{i theta}), and the position of a load is Re(R e e^{i phi}) with e = (1, -i) for
-the directions (horizontal, up). The carrier's equations M q'' + (C + n G) q' + K q = - sum_j m_j B^T p_j'', where M includes
-the loads' masses, become without any approximation
+motion is q = Re(Y e^{i theta}), q' = Re(V e^{i theta}), and the position of a load is R Re(exp(i phi) e), where e is the vector
+(1, -i) of the directions (horizontal, up). The carrier's equations M q'' + (C + n G) q' + K q = - sum_j m_j B^T p_j'', where M
+includes the loads' masses, become without any approximation
 
     Y' = V - i Omega Y
     V' = A - i Omega V,     M A = - (C + n G) V - K Y + B^T e sum_j S_j e^{i psi_j} (w_j^2 - i w_j'),     S_j = m_j R_j
@@ -231,7 +231,7 @@ class Averaged(eqx.Module):
         spin = shift + 1j * omega
 
         def completed(z: Array, r: Amplitudes) -> tuple[Array, Amplitudes]:
-            """Return what is left of the equations for the changes z, and the solution if nothing is left."""
+            """Return the residuals of the equations for the changes z, and the solution, valid if the residuals are 0."""
             dv, domega = z[:nd] + 1j * z[nd : 2 * nd], z[2 * nd]
             da = spin * dv + 1j * state.velocity * domega - r.velocity
             dy = (dv - 1j * state.displacement * domega + r.displacement) / spin
@@ -243,16 +243,16 @@ class Averaged(eqx.Module):
             if self.gyroscopic is not None:
                 speed, change = jax.jvp(gyroscopic_speed, (state.rate,), (dw,))
                 carrier = carrier - times(self.gyroscopic, speed * dv + change * state.velocity)
-            left = da - carrier
-            return jnp.concatenate([left.real, left.imag, (domega - jnp.mean(dw))[None]]), Amplitudes(dy, dv, dw, dpsi)
+            residual = da - carrier
+            return jnp.concatenate([residual.real, residual.imag, (domega - jnp.mean(dw))[None]]), Amplitudes(dy, dv, dw, dpsi)
 
         nothing = jax.tree.map(jnp.zeros_like, state)
         unit = jnp.eye(2 * nd + 1, dtype=rate.dtype)
         inverse = unrolled_inverse(jax.vmap(lambda z: completed(z, nothing)[0], out_axes=1)(unit))
 
         def solve(r: Amplitudes) -> Amplitudes:
-            left = completed(jnp.zeros_like(unit[0]), r)[0]
-            return completed(-jnp.sum(inverse * left[None, :], axis=1), r)[1]
+            residual = completed(jnp.zeros_like(unit[0]), r)[0]
+            return completed(-jnp.sum(inverse * residual[None, :], axis=1), r)[1]
 
         return solve
 
@@ -269,7 +269,8 @@ class Averaged(eqx.Module):
         return acceleration, times(v, acceleration)
 
     def rotor_speeds(self, t: Array, rate: Array) -> list[Array]:
-        """Return the rotor speeds of each group in their directions, rad/s, from the rates (count,) of the rotating masses."""
+        """Return the rotor speeds of each group, rad/s, positive in the direction of rotation of each exciter, from the rates
+        (count,) of the rotating masses."""
 
         def speed(drive: Drive, first: Array | None) -> Array:
             return drive.rotor_speed(t, None if first is None else (jnp.zeros_like(t), first))
@@ -328,14 +329,14 @@ class Averaged(eqx.Module):
         return [slice(at[0], at[-1] + 1) if at[-1] - at[0] + 1 == at.size else at for at in found]
 
     def _in_order(self, values: Sequence[Array]) -> Array:
-        """Return values (count,) of all masses in order from those of each group."""
+        """Return the values (count,) of all masses in their order, from the values of each group."""
         masses = np.arange(self.drag.size)
         places = np.concatenate([masses[at] for at in self._masses_of_groups()])
         together = jnp.concatenate(values)
         return together if np.array_equal(places, masses) else together[np.argsort(places)]
 
     def ripple(self, state: Amplitudes) -> Array:
-        """Return the amplitude of each load's angle under the dropped torque, (count,) rad.
+        """Return the amplitude of the vibration of each load's angle that the dropped torque causes, (count,) rad.
 
         S |e^T B i Omega V| / (2 I (2 Omega)^2)
         """
@@ -355,7 +356,7 @@ class Averaged(eqx.Module):
 
 
 def averaged_loads(scene: Scene) -> CircularLoads:
-    """Return the loads of a scene that the averaged equations include. **Raises** `InputError` as `turning_loads`."""
+    """Return the loads of a scene that the averaged equations include. **Raises** `InputError` like `turning_loads`."""
     return turning_loads(scene, AVERAGED_TERMS)
 
 

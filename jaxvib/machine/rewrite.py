@@ -22,15 +22,15 @@ _Path = tuple[str | int, ...]
 """Names of tables and indices of arrays of tables."""
 
 _DIGITS = 8
-"""Digits of changed numbers. More would hide the size of a number from a reader."""
+"""Digits of changed numbers. Numbers with more digits are hard to read."""
 
 
 def rewrite_scene(text: str, scene: Scene) -> str:
     """Return the text of a scene file with the numbers of another scene of the same kind.
 
-    Comments, order and units stay. A changed number has 8 digits, and a comment with its old value; a changed default is a new
-    line. If the text cannot be changed in this way, for example because the scene has other effects, the result is
-    `scene_to_toml(scene)`.
+    Comments, order and units stay. A changed number has 8 digits, and a comment with its old value. A number that differs from
+    its default and is not in the text is added in a new line. If the text cannot be changed in this way, for example because
+    the scene has other effects, the result is `scene_to_toml(scene)`.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
@@ -66,7 +66,7 @@ def rewrite_scene(text: str, scene: Scene) -> str:
 
 
 def _added_lines(read: object, old: object, new: object) -> list[str]:
-    """Return lines for the numbers of a table that differ from a default, which the file does not state."""
+    """Return lines for the numbers of a table that differ from their defaults and are not in the file."""
     if not (isinstance(read, dict) and isinstance(old, dict) and isinstance(new, dict)):
         return []
     return [
@@ -111,9 +111,10 @@ def _value_at(tables: object, path: _Path) -> object:
 
 
 def _rewritten_line(line: str, entry: re.Match[str], read: object, old: object, new: object, is_other_machine: bool) -> str:
-    """Return a line whose value, `read` in the file, is `old` in SI, with the value `new` in SI.
+    """Return a line with the value `new`, SI, in place of its value `read`, which is `old` in SI.
 
-    A damping that is given as a ratio is written as a number for another machine: its constant stays, the ratio does not.
+    If the machine has changed, a damping that is given as a ratio is written as a number: the coefficient has stayed the same,
+    but the ratio has not.
     """
     if old is None or new is None or (_is_close(old, new) and not (is_other_machine and _RELATIVE.search(entry[3]))):
         return line
@@ -144,7 +145,7 @@ def _with_unit(read: object, old: object, new: object) -> str:
 
 
 def _is_close(one: object, other: object) -> bool:
-    """Return True if two values of TOML are equal, numbers to the digits of changed numbers."""
+    """Return True if two values of TOML are equal, numbers to `_DIGITS` digits."""
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(_is_close(one[name], other[name]) for name in one)
     if isinstance(one, list) and isinstance(other, list):

@@ -3,9 +3,9 @@
 XLA's CPU backend calls the C library once for each number. Here the nearest multiple of pi (for the cosine: the nearest odd
 multiple of pi/2) is subtracted from the angle. The multiple is a sum of three parts, which keeps the remainder accurate (Cody
 and Waite). The sine of the remainder, which is at most pi/2, is an odd polynomial. The sine and the cosine share no
-intermediate result: the compiler would compute it twice, so that sharing would save nothing. For angles up to 1e5 (single
-precision: 1e3) the error is below 1.1 times the distance from 1 to the next floating-point number. For larger angles it is
-proportional to the rounding error of the angle, like the error of any sine of a rounded angle.
+intermediate result, because the compiler would compute it twice in any case. For angles up to 1e5 (single precision: 1e3) the
+error is below 1.1 times the distance from 1 to the next floating-point number. For larger angles it is proportional to the
+rounding error of the angle, like the error of any sine of a rounded angle.
 """
 
 from __future__ import annotations

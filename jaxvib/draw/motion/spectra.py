@@ -68,9 +68,8 @@ def waterfall_chart(
 ) -> Drawn:
     """Draw amplitudes (P, nf) as shades of grey over P times, s, and nf frequencies.
 
-    `name` is that of the amplitudes, with their unit.
-    The rotor speeds (P, exciters) and the load speeds (P, loads) are drawn as lines, resonances as horizontal lines.
-    Frequencies and speeds are in rad/s, drawn in `unit`.
+    `name` is that of the amplitudes, with their unit. The rotor speeds (P, exciters) and the load speeds (P, loads) are drawn
+    as lines, resonances as horizontal lines. Frequencies and speeds are in rad/s, drawn in `unit`.
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.4), ax=ax)

@@ -98,8 +98,8 @@ class Spectrum(Result):
         if show not in ("displacement", "force"):
             raise InputError("show", f"is {quoted(show)}; it must be 'displacement' or 'force'")
         if show == "force" and not np.all(np.isfinite(self.force)):
-            problem = "is 'force', which is unknown for matrices without a foundation; show displacements"
-            raise InputError("show", problem)
+            problem = "is 'force', but the machine is from matrices without a foundation, and its force is unknown"
+            raise InputError("show", f"{problem}; use show='displacement'")
         if coordinate is not None and (show == "force" or coordinate not in self.coordinates):
             advice = (
                 "a force has no coordinate; leave it out" if show == "force" else f"there are {', '.join(self.coordinates)}"

@@ -22,7 +22,7 @@ _PARTS_PER_INTERVAL = 32
 """Number of interpolated parts of the interval between two neighbouring points of the branch."""
 
 _NEAR_FOLD_DISTANCE = 1e-6
-"""Relative distance of the rotor's speed from a fold of the cubics below which the fold itself is computed."""
+"""Relative distance of the rotor speed from a fold of the interpolated branch below which the fold itself is computed."""
 
 
 @cached
@@ -104,7 +104,7 @@ def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
     def one(w: Array) -> tuple[Array, Array]:
         motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model.linear, w))
         branch = branch_tangent(model, grid, motion)
-        is_met = branch.residual < 4096.0 * jnp.finfo(w.dtype).eps
-        return jnp.where(is_met, motion.rotor_speed, jnp.nan), jnp.where(is_met, branch.slope, jnp.nan)
+        has_converged = branch.residual < 4096.0 * jnp.finfo(w.dtype).eps
+        return jnp.where(has_converged, motion.rotor_speed, jnp.nan), jnp.where(has_converged, branch.slope, jnp.nan)
 
     return jax.lax.map(jax.vmap(one), omega)

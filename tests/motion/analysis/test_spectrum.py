@@ -60,7 +60,7 @@ def test_an_unknown_force_has_no_figure():
         (time,),
     )
     found = spectrum_of(SCENE, motion, None, 1)
-    with pytest.raises(jv.InputError, match=r"^show is 'force', which is unknown for matrices without a foundation"):
+    with pytest.raises(jv.InputError, match=r"^show is 'force', but the machine is from matrices without a foundation"):
         found.plot(show="force")
 
 
