@@ -285,7 +285,7 @@ class CircularLoads(Loads):
         return whole if self.ball_radius is None else whole * jnp.mean(jnp.cos(self.offsets()))
 
     def drag_sum(self) -> Array:
-        """Return sum b_W R^2 of all loads, N m s: the driving torque per speed difference to the rotor."""
+        """Return sum b_W R^2 of all loads, N m s: the driving torque per difference of speed from the rotor."""
         return jnp.sum(jnp.broadcast_to(self.drag * self.radius**2, (self.count,)))
 
 

@@ -194,7 +194,7 @@ def integrate(
     numbers, whole_run, speeds = where_start_exists((numbers, whole_run, window.rotor_speeds))
     window = dataclasses.replace(window, rotor_speeds=speeds)
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
-    # A run that did not reach its end has no window; its last state shows if it diverged.
+    # A run that did not reach its end has no window; its last state shows whether it diverged.
     has_ended = solution.result == diffrax.RESULTS.successful
     is_bounded = jnp.where(has_ended, is_finite(states), ~_diverged(unit, state, last))
     steps = solution.stats["num_steps"]

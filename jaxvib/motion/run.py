@@ -119,7 +119,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
     The `error` is the largest error of a state in the window: displacements and velocities relative to the largest, angles in
     rad, speeds of loads relative to the rotor speed.
 
-    - It is estimated as a fraction of the difference to a run with larger steps, or as twice this difference if an effect is
+    - It is estimated as a fraction of the difference from a run with larger steps, or as twice this difference if an effect is
       not `smooth`, or if the acceleration of a drive jumps and the steps are equal; rounding errors are added
     - A motion whose phase is not determined has a large error, but its amplitudes may be exact
     """

@@ -61,7 +61,7 @@ left."""
 
 
 _MAX_ACCELERATION, _MAX_THROW_NUMBER = 8.0, 8.0
-"""Acceleration, g, and throw number above which `VibrationMeasures.notes` doubts a vibration: usual values of practice are 3 to
+"""Acceleration, g, and throw number above which `VibrationMeasures.notes` doubts a vibration: values usual in practice are 3 to
 6 g, and up to 7 g for fine sieving and dewatering."""
 
 
@@ -97,7 +97,7 @@ def vibration_zone(
     - `limits` A/B, B/C, C/D, m/s, ascending, from your copy of the standard or from a contract, in place of the built-in ones;
       typical: ["2.3 mm/s", "4.5 mm/s", "7.1 mm/s"]
 
-    The built-in limits are the usual values of practice. They were not compared with the text of the standard: use `limits` if
+    The built-in limits are values usual in practice. They were not compared with the text of the standard: use `limits` if
     a contract depends on them.
 
     **Returns** a letter. **Raises** `InputError` for a negative velocity, and for limits that do not ascend.

@@ -53,7 +53,7 @@ class ChunkState(IntEnum):
 def versions() -> dict[str, str]:
     """Return the versions of all packages on which a result depends, and a digest of the sources of jaxvib.
 
-    The digest also shows if parts of jaxvib were replaced in this process.
+    The digest also shows whether parts of jaxvib were replaced in this process.
     """
     changed = "" if code_state(look=True).is_on_disk else " with changes in this process"
     return {name: importlib.metadata.version(name) for name in _PACKAGES} | {"sources": digest_of_sources()[:16] + changed}

@@ -132,7 +132,7 @@ def envelope(
 def growth(scene: Path, speed: str | None, output: Output, **options: Any) -> None:
     """Measure the growth of small disturbances of a motion of SCENE.
 
-    The growth shows if the motion is regular, unstable, chaotic or undecided. It also determines the time after which
+    The growth shows whether the motion is regular, unstable, chaotic or undecided. It also determines the time after which
     derivatives are meaningless."""
     result = jv.growth(loaded_scene(scene, speed=speed, constant=True), **_with_start(options))
     output.picture("growth.png", result.plot)

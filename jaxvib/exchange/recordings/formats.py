@@ -41,7 +41,7 @@ _RATE = re.compile(
 _RATE_CELL = re.compile(
     r"(?!\d+,\d{3}(?!\d))(?P<number>(?:\d+(?:[.,]\d*)?|\.\d+)(?:e[+-]?\d+)?)\s*(?P<unit>(?:1/)?[^\d\s,].*)?", re.IGNORECASE
 )
-"""Number and unit of a sampling rate. Three digits behind a comma may be thousands or decimals, and are not matched."""
+"""Number and unit of a sampling rate. Three digits after a comma may be thousands or decimals, and are not matched."""
 
 _SI = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "force": "N"}
 

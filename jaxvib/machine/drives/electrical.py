@@ -106,8 +106,8 @@ class NamePlateMotor(Motor):
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Synchronous speed, rad/s."""
-        # Without the factor, rounding would decide if a rated speed of 1000 rpm at 50 Hz belongs to 1000 rpm or to 1500 rpm; it
-        # belongs to 1500 rpm, because a rated speed is below the synchronous speed.
+        # Without the factor, rounding would decide whether a rated speed of 1000 rpm at 50 Hz belongs to 1000 or to 1500 rpm.
+        # It belongs to 1500 rpm, because a rated speed is below the synchronous speed.
         return self.frequency / (jnp.ceil(self.frequency / self.rated_speed * (1.0 - 1e-6)) - 1.0)
 
     @property

@@ -91,7 +91,7 @@ def jam_orbit(
     - `points`: a fixed number of collocation points in place of an accuracy; typical: 12 to 32. They are on half a period if
       the scene has half-turn symmetry, which gravity and imbalances break, otherwise on a whole period. The time grows at least
       with the square of this number. Under JAX transformations the values that decide on this number are not known; the default
-      is then 16 on half a period and 33 on a whole period, and the status shows if it is too small
+      is then 16 on half a period and 33 on a whole period, and the status shows whether it is too small
     - `throw`: raise if there is no such motion; otherwise, and under a JAX transformation, the status shows it
 
     **Returns** `Orbit`; its fields have derivatives with respect to every parameter of the scene (implicit function theorem,

@@ -219,7 +219,7 @@ def synchronous_orbit(
     - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-8 (the default; in
       single precision 1e-3)
     - `points`: a fixed number of points on a period in place of an accuracy; typical: 17 to 65. Under `jit` and `vmap` the
-      default is 33, and the status shows if it is too small
+      default is 33, and the status shows whether it is too small
     - `throw`: raise if there is no such motion; otherwise, and under a JAX transformation, the status shows it
 
     **Returns** `SynchronousOrbit`; its fields have derivatives with respect to every parameter of the scene (implicit function

@@ -22,7 +22,7 @@ from jaxvib.study.bearing.swing import BearingPendulum, Friction, controller_to,
 _MAX_ITERATIONS = 64
 
 TOLERANCE = 1e-9
-"""Relative error of a step of the integration behind a fit."""
+"""Relative error of a step of an integration in a fit."""
 
 
 class Unknowns(NamedTuple):

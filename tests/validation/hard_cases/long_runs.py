@@ -243,7 +243,7 @@ CASES = (
     ),
     run_case(
         "run-up through the resonance, slow",
-        hard="small differences during the passage decide if the load jams at the resonance",
+        hard="small differences during the passage decide whether the load jams at the resonance",
         scene=lambda: _passing(RunUp(60.0, acceleration=3.0)),
         answer=_SLOW[0],
         reference=_SLOW[1],
