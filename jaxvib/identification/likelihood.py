@@ -167,10 +167,10 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
         if not known.determined[i]:
             continue
         is_unbalance, is_vanished = i >= number_count, bool(known.vanished[i])
-        index = p + i - number_count if is_unbalance else i
+        entry = p + i - number_count if is_unbalance else i
         index = free_exciters[i - number_count] if is_unbalance else i
         center = math.log(sizes[index]) if is_unbalance else float(fitted.x[i])
-        slopes, variance = elimination(data + prior, indices[[index]])[:, 0], covariance[index, index]
+        slopes, variance = elimination(data + prior, indices[[entry]])[:, 0], covariance[entry, entry]
         if is_vanished:  # its information may be below the accuracy of the pseudoinverse
             slopes, variance = np.zeros(len(data)), known.covariance[i, i]
         spread = math.sqrt(variance)
