@@ -43,7 +43,7 @@ from jaxvib.machine.effects.base import Effect, Gravity, MomentImbalance, Static
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction
 from jaxvib.machine.effects.rolling import RollingFriction
-from jaxvib.machine.effects.spin import FreeSpin, Sliding
+from jaxvib.machine.effects.sliding import FreeSpin, Sliding
 from jaxvib.machine.effects.supports import CubicSupport, Stop
 
 # Scenes, and their files

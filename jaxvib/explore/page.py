@@ -1,4 +1,4 @@
-"""Page of the sliders, a marimo app. It only connects sliders to pictures; `serve` runs it and selects the scene."""
+"""Page of the sliders, a marimo app. It only connects sliders to pictures; `server.py` runs it and selects the scene."""
 
 import marimo
 
@@ -13,7 +13,7 @@ def _():
 
     from jaxvib.errors import InputError
     from jaxvib.explore import pictures
-    from jaxvib.explore.serve import served_path
+    from jaxvib.explore.server import served_path
     from jaxvib.explore.sliders import scene_at, sliders_of, typed_value
     from jaxvib.machine.files import load_scene
 

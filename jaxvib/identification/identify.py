@@ -24,8 +24,8 @@ from jaxvib.identification.directions import (
 )
 from jaxvib.identification.fit import Fitted, unknown_count
 from jaxvib.identification.jammed.start import first_states, with_first_motion
-from jaxvib.identification.likelihood import QUANTILE, profile_intervals
 from jaxvib.identification.problem import Problem, build_problem, has_supports, natural
+from jaxvib.identification.profile_likelihood import QUANTILE, profile_intervals
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.identification.start import track_orders
 from jaxvib.identification.supports.start import untouched_stops, with_guided_motion

@@ -144,7 +144,7 @@ def test_all_printed_commands_run_one_after_the_other(folder, monkeypatch, capsy
     record(folder / "swing.csv")
     record_run_up(folder / "run_up.csv")
     for line in COMMANDS:
-        # explore serves until it is interrupted, see tests/explore/test_serve.py; the fit of a machine needs its recordings,
+        # explore serves until it is interrupted, see tests/explore/test_server.py; the fit of a machine needs its recordings,
         # see tests/cli/test_identify_machine.py
         if words_of(line)[0][0] != "explore" and words_of(line)[0][1:2] != ["fit.toml"]:
             answered(line, folder, monkeypatch, capsys)

@@ -16,7 +16,7 @@ import jaxvib as jv
 from jaxvib.cli.app import run
 from jaxvib.draw import whirl
 from jaxvib.draw.style import COLORS
-from jaxvib.explore import pictures, serve
+from jaxvib.explore import pictures, server
 from jaxvib.explore.campbell import _SENSE_STYLES
 from jaxvib.explore.panel import TALL, WIDE, Panel
 from jaxvib.explore.pictures import SceneOrProblem, scene_or_problem
@@ -367,12 +367,12 @@ def test_the_command_serves_the_page_to_this_computer_alone(one_mass, tmp_path, 
     counted = threading.Event()
     monkeypatch.setattr(pictures, "prepare", lambda scene: None)
     monkeypatch.setattr(pictures, "prepare_counts", lambda scene: counted.set())
-    monkeypatch.setattr(serve, "leave", lambda: None)
+    monkeypatch.setattr(server, "leave", lambda: None)
     assert run(["explore", str(path), "--port", "27180", "--no-browser"]) == 0
     assert callable(served["page"]) and (served["host"], served["port"]) == ("127.0.0.1", 27180)
     assert served["log_level"] == "warning"  # no line on the terminal for each picture
     address = re.search(r"the page is at (http://127.0.0.1:27180/[-\w]{43}/);", capsys.readouterr().out)
-    assert address and serve.served_path() == path.resolve()
+    assert address and server.served_path() == path.resolve()
     assert counted.wait(10.0)  # beside the page, the next numbers of loads are compiled
 
 
@@ -396,7 +396,7 @@ def test_a_port_that_was_just_released_is_free():
         with socket.create_connection(("127.0.0.1", port)) as other:
             listener.accept()[0].close()
             assert other.recv(1) == b""
-    serve.require_free(port)
+    server.require_free(port)
 
 
 def test_failures_of_the_page_print_one_sentence(one_mass, tmp_path, monkeypatch, capsys):
@@ -409,9 +409,9 @@ def test_failures_of_the_page_print_one_sentence(one_mass, tmp_path, monkeypatch
     assert f"--port is {port}, which cannot be used" in capsys.readouterr().err
     assert run(["explore", str(tmp_path / "none.toml"), "--port", "27181"]) == 2
     assert "none.toml cannot be read" in capsys.readouterr().err
-    monkeypatch.setattr(serve.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(server.importlib.util, "find_spec", lambda name: None)
     assert run(["explore", path]) == 2
     assert "explore needs marimo; install it with: pip install '.[explore]'" in capsys.readouterr().err
     monkeypatch.delenv("JAXVIB_EXPLORE", raising=False)
     with pytest.raises(jv.InputError, match="start the page with: jaxvib explore"):
-        serve.served_path()
+        server.served_path()

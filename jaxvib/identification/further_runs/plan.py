@@ -11,7 +11,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.errors import InputError
 from jaxvib.identification.further_runs.planned import PlannedRun, expected_errors, expected_information, expected_run
-from jaxvib.identification.further_runs.profile import optimized_profile, read_limits, require_within
+from jaxvib.identification.further_runs.speed_profile import optimized_profile, read_limits, require_within
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.problem import require_unbalances_only
 from jaxvib.machine.drives.controlled import SpeedProfile

@@ -12,7 +12,7 @@ from run_ups_by_scipy import TOP, TRUTH, Ramp, accelerations, ramp, record, scen
 import jaxvib as jv
 from jaxvib.identification.checks import coverage_notes
 from jaxvib.identification.further_runs.planned import expected_run
-from jaxvib.identification.further_runs.profile import _spread
+from jaxvib.identification.further_runs.speed_profile import _spread
 
 T = 0.002 * np.arange(8000)
 NOISE = 0.05

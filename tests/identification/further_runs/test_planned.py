@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 import jaxvib as jv
 from jaxvib.identification.directions import eliminate
 from jaxvib.identification.fit import model_readings
-from jaxvib.identification.further_runs import plan, profile
+from jaxvib.identification.further_runs import plan, speed_profile
 from jaxvib.identification.further_runs.plan import RunPlan, plan_runs
 from jaxvib.identification.further_runs.planned import (
     Expected,
@@ -23,7 +23,7 @@ from jaxvib.identification.further_runs.planned import (
     own_precisions,
     shared_indices,
 )
-from jaxvib.identification.further_runs.profile import Limits, _spread, optimized_profile, require_within
+from jaxvib.identification.further_runs.speed_profile import Limits, _spread, optimized_profile, require_within
 
 FRAME = jv.Channel("frame", "velocity", at=1, gain_error=0.02)
 NAMES = ("machine.stiffness[0]", "exciters[0].unbalance", "machine.damping[0]")
@@ -170,7 +170,9 @@ def test_gradient_of_short_runs_by_the_speed_is_the_difference():
 def test_optimized_speed_stays_within_its_limits(monkeypatch):
     """An objective with its minimum at speeds that are too high, and that change too fast."""
     wanted, limits = np.array([0.0, 20.0, 30.0, 70.0, 50.0, 45.0, 40.0, 20.0, -9.0]), Limits(60.0, 15.0)
-    monkeypatch.setattr(profile, "_spread", lambda *args: (np.sum((args[3] - wanted) ** 2) / 50.0, (args[3] - wanted) / 25.0))
+    monkeypatch.setattr(
+        speed_profile, "_spread", lambda *args: (np.sum((args[3] - wanted) ** 2) / 50.0, (args[3] - wanted) / 25.0)
+    )
     found = optimized_profile(None, ramp(16.0), None, limits)
     times, speeds = np.asarray(found.times), np.asarray(found.speeds)
     np.testing.assert_allclose(times, np.linspace(0.0, 16.0, 9))

@@ -15,7 +15,7 @@ from jax import Array
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.state import State
 from jaxvib.machine.effects.contact import LoadContact
-from jaxvib.machine.effects.spin import FreeSpin
+from jaxvib.machine.effects.sliding import FreeSpin
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import require_torus_balls
 from jaxvib.motion.ensemble import Equations, ensemble

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize
 
-from jaxvib.identification import fit, likelihood
-from jaxvib.identification.likelihood import QUANTILE, _Profile, profile_intervals
+from jaxvib.identification import fit, profile_likelihood
 from jaxvib.identification.problem import Known, Problem
+from jaxvib.identification.profile_likelihood import QUANTILE, _Profile, profile_intervals
 
 
 class _Rise(_Profile):
@@ -103,11 +103,11 @@ def test_intervals_of_numbers_with_a_cubic_cost(monkeypatch, skew, names):
     def project(problem, x):
         return solve(problem, np.append(x, MINIMUM[2]), skew, np.array([False, False, True]))
 
-    monkeypatch.setattr(likelihood, "minimize", minimum)
-    monkeypatch.setattr(likelihood, "project", project)
+    monkeypatch.setattr(profile_likelihood, "minimize", minimum)
+    monkeypatch.setattr(profile_likelihood, "project", project)
     information = np.zeros((5, 5))
     information[:4, :4][np.ix_([0, 1, 2], [0, 1, 2])] = 0.75 * HESSIAN
-    monkeypatch.setattr(likelihood, "in_polar_unbalances", lambda _: (information, information / 3.0, np.array([0.05])))
+    monkeypatch.setattr(profile_likelihood, "in_polar_unbalances", lambda _: (information, information / 3.0, np.array([0.05])))
     problem = Problem(*[None] * len(Problem._fields))._replace(
         unknowns=SimpleNamespace(numbers=(1, 2)), means=np.zeros(2), precisions=np.zeros(2), unbalances=(None,)
     )
@@ -127,8 +127,8 @@ def test_intervals_of_numbers_with_a_cubic_cost(monkeypatch, skew, names):
 def test_a_cost_not_quadratic_on_one_side_has_a_profile(monkeypatch, rises, is_quadratic):
     """A cost that rises by 10 % more or less than 4 at two standard errors."""
     information = np.diag([0.0, 4.0])
-    monkeypatch.setattr(likelihood, "in_polar_unbalances", lambda _: (information, np.diag([4.0, 0.0]), np.zeros(0)))
-    monkeypatch.setattr(likelihood, "project", lambda *_: SimpleNamespace(cost=0.0))
+    monkeypatch.setattr(profile_likelihood, "in_polar_unbalances", lambda _: (information, np.diag([4.0, 0.0]), np.zeros(0)))
+    monkeypatch.setattr(profile_likelihood, "project", lambda *_: SimpleNamespace(cost=0.0))
     costs = {-2.0: rises[0], 2.0: rises[1]}
     monkeypatch.setattr(_Profile, "rise", lambda self, distance, is_exact: 9e9 if is_exact else costs[distance])
     monkeypatch.setattr(_Profile, "end", lambda self, side: 3.0 + side)
@@ -150,11 +150,11 @@ def test_states_of_loads_follow_the_quadratic_form(monkeypatch, bend, expected):
         y = np.array([*(now - x), np.log(size / 0.05), angle - np.arctan2(0.04, 0.03), problem.linear[2] - 2.0])
         return SimpleNamespace(cost=y @ matrix @ y + bend * (now is not x))
 
-    monkeypatch.setattr(likelihood, "project", cost)
-    monkeypatch.setattr(likelihood, "minimize", lambda *_: (SimpleNamespace(cost=4.0),))
-    monkeypatch.setattr(likelihood, "nonlinear_columns", lambda *_: [np.zeros((3, 6))])
+    monkeypatch.setattr(profile_likelihood, "project", cost)
+    monkeypatch.setattr(profile_likelihood, "minimize", lambda *_: (SimpleNamespace(cost=4.0),))
+    monkeypatch.setattr(profile_likelihood, "nonlinear_columns", lambda *_: [np.zeros((3, 6))])
     monkeypatch.setattr(_Profile, "_in_valley", lambda self, problem, x, linear: (x, linear))
-    monkeypatch.setattr(likelihood, "in_polar_unbalances", lambda _: (0.75 * matrix, 0.25 * matrix, np.array([0.05])))
+    monkeypatch.setattr(profile_likelihood, "in_polar_unbalances", lambda _: (0.75 * matrix, 0.25 * matrix, np.array([0.05])))
     rises, rise = [], _Profile.rise
     monkeypatch.setattr(_Profile, "rise", lambda *arguments: rises.append(rise(*arguments)) or rises[-1])
     problem = Problem(*[None] * len(Problem._fields))._replace(
@@ -174,11 +174,11 @@ def test_steps_lead_into_a_curved_valley(monkeypatch):
         return np.array([20.0 * (linear[0] - x[0] - x[0] ** 2), 20.0 * (linear[1] + x[1] - 0.4 * x[0] ** 2), x[0], x[1], 0.0])
 
     slopes = np.array([[20.0, 0.0, -20.0, 0.0], [0.0, -20.0, 0.0, -20.0], [-1.0, 0, 0, 0], [0, -1.0, 0, 0], [0, 0, 0, 0]])
-    monkeypatch.setattr(likelihood, "nonlinear_differences", differences)
+    monkeypatch.setattr(profile_likelihood, "nonlinear_differences", differences)
     prior = np.diag([1e6, 0.0, 0.0, 0.0])
     monkeypatch.setattr(fit, "known_cost", lambda problem, x, linear: 1e6 * (x[0] - 0.5) ** 2)
     monkeypatch.setattr(
-        likelihood, "prior_equations", lambda problem, x, linear: (prior, -1e6 * np.array([x[0] - 0.5, 0.0, 0.0, 0.0]))
+        profile_likelihood, "prior_equations", lambda problem, x, linear: (prior, -1e6 * np.array([x[0] - 0.5, 0.0, 0.0, 0.0]))
     )
     profile = _Profile(None, 0, False, 0.0, 0.25, np.zeros(4), 0.0, columns=np.column_stack([slopes, np.zeros(5)]))
     x, linear = profile._in_valley(None, np.array([0.5, 0.0]), np.array([0.5, 0.0]))

@@ -18,7 +18,7 @@ from jaxvib.machine.files import TEMPLATES
 
 SERVE = """
 import pathlib, sys
-from jaxvib.explore.serve import serve
+from jaxvib.explore.server import serve
 serve(pathlib.Path(sys.argv[1]), int(sys.argv[2]), False, lambda address: print(address, flush=True))
 """
 
