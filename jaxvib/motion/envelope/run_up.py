@@ -12,6 +12,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.linear import natural_frequencies
+from jaxvib.equations.model import assemble
 from jaxvib.errors import InputError
 from jaxvib.machine.drives.drive import Motor, MotorWrapper, SwitchedOff
 from jaxvib.machine.scene import Scene
@@ -69,8 +70,8 @@ class MotorRunUp(Result):
     - `speed` (exciter,), rad/s: mean speed at the end, in the direction of rotation
     - `caught_at` (exciter,): number, from 1, of the lowest resonance that the exciter does not pass; 0 if it passes all
       resonances below 0.95 of the no-load speed of its motor
-    - `peak_amplitude` (nd,), m, zero to peak, and `peak_force`, N: largest values on the way, of all initial angles between the
-      exciters that were computed
+    - `peak_amplitude` (nd,), m, zero to peak, and `peak_force`, N: largest amplitudes and largest magnitude of the foundation
+      force on the way, of all initial angles between the exciters that were computed
     - `least_torque`: the smallest factor by which the torques of all motors can be multiplied such that all exciters still pass
       their resonances; 1/64 if this factor is still sufficient; NaN if it was not requested, or if even motors 64 times as
       strong do not pass
@@ -233,11 +234,16 @@ def _turned_motors(scene: Scene) -> list[int]:
 
 
 def _peaks(run: Envelope) -> tuple[np.ndarray, float]:
-    """Return the largest amplitudes and the largest force of a run."""
-    trajectory = run.trajectory
+    """Return the largest amplitudes of a run, and the largest magnitude of the force on the foundation, N.
+
+    The largest magnitude of the vector Re(F exp(i theta)) within a turn is sqrt((sum |F_k|^2 + |sum F_k^2|)/2).
+    """
+    trajectory, model = run.trajectory, assemble(run.scene)
     assert trajectory is not None
-    force = np.sqrt(np.sum(np.asarray(trajectory.foundation_force) ** 2, axis=1))
-    return np.max(np.asarray(trajectory.amplitude), axis=0), float(np.max(force))
+    each = model.carrier.foundation_force(trajectory.displacement.T, trajectory.velocity.T)
+    force = np.asarray(model.known_force(each))
+    square = (np.sum(np.abs(force) ** 2, axis=0) + np.abs(np.sum(force**2, axis=0))) / 2.0
+    return np.max(np.asarray(trajectory.amplitude), axis=0), float(np.sqrt(np.max(square)))
 
 
 def _judgement(scene: Scene, run: Envelope, resonances: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:

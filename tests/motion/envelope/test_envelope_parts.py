@@ -450,14 +450,11 @@ def test_scaled_motor_has_a_multiple_of_the_torque():
 def test_run_up_reads_peaks_and_speeds(monkeypatch):
     scene = mixed()
     window, whole = several_window(), several_window()
-    whole = eqx.tree_at(
-        lambda w: (w.amplitude, w.foundation_force),
-        whole,
-        (
-            jnp.asarray([[1e-3, 5e-3, 0.02], [4e-3, 2e-3, 0.01], [1e-3, 1e-3, 0.03]]),
-            jnp.asarray([[3.0, 4.0], [6.0, 1.0], [0.0, 0.0]]),
-        ),
-    )
+    force = np.array([[3.0, 4.0], [6.0, 6.0j], [0.0, 0.0]])  # 5 N along a line, 6 N on a circle
+    moved = jnp.asarray(force @ np.linalg.pinv(scene.machine.carrier().foundation_stiffness).T)
+    amplitude = jnp.asarray([[1e-3, 5e-3, 0.02], [4e-3, 2e-3, 0.01], [1e-3, 1e-3, 0.03]])
+    values = amplitude, moved, 0.0 * moved
+    whole = eqx.tree_at(lambda w: (w.amplitude, w.displacement, w.velocity), whole, values)
     run = eqx.tree_at(lambda r: (r.window, r.scene), run_of(), (window, scene))
     run = eqx.tree_at(lambda r: r.trajectory, run, whole, is_leaf=lambda x: x is None)
     asked, angles = [], []
@@ -471,7 +468,7 @@ def test_run_up_reads_peaks_and_speeds(monkeypatch):
     monkeypatch.setattr(run_up_module, "_least_torque", lambda *_, passed: 0.5 if passed else 2.0)
     found = jv.run_up(scene, "9 s")
     assert asked == [(9.0, 4096, False)] * 8 and found.status_name == "passed" and np.isnan(found.least_torque)
-    assert found.peak_amplitude.tolist() == [4e-3, 5e-3, 0.03] and float(found.peak_force) == pytest.approx(np.sqrt(37.0))
+    assert found.peak_amplitude.tolist() == [4e-3, 5e-3, 0.03] and float(found.peak_force) == pytest.approx(6.0)
     assert found.speed.tolist() == [90.0, 80.0] and found.caught_at.tolist() == [0, 0]
     np.testing.assert_allclose(found.resonances, np.sort(jv.natural_frequencies(scene)), rtol=1e-12)
     again = jv.run_up(scene, "9 s", least=True)
@@ -481,7 +478,7 @@ def test_run_up_reads_peaks_and_speeds(monkeypatch):
     assert lines[1:3] == ["  exciter 1: 859.44 rpm", "  exciter 2: 763.94 rpm"]
     np.testing.assert_allclose(angles[:8], np.arange(8) * np.pi / 4.0, rtol=1e-12)
     assert lines[3] == "  peaks on the way (largest of several initial angles; the figure shows one run):"
-    assert lines[4].startswith("    x 4 mm") and lines[4].endswith("foundation force 6.083 N")
+    assert lines[4].startswith("    x 4 mm") and lines[4].endswith("foundation force 6 N")
     assert lines[5] == "  all pass with torques of at least 0.5 times those of the motors" and len(lines) == 6
     assert len(found.summary().splitlines()) == 5
     slow = eqx.tree_at(lambda r: r.window.rotor_speeds[0], run, jnp.full(3, -5.0))
