@@ -36,6 +36,7 @@ from jaxvib.motion.analysis.points import (
 from jaxvib.motion.analysis.regime import STILL_SHARE, Regime, regime
 from jaxvib.motion.analysis.separation import overlap, would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
+from jaxvib.numerics.extrema import known_maximum
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import member, status_name
@@ -150,23 +151,28 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
     @property
     def largest_displacement(self) -> Array:
         """Largest displacement of each coordinate from rest during the run, (nd,), m (rad for tilts), among the stored
-        states."""
-        return jnp.max(jnp.abs(self._stored.state.displacement), axis=-2)
+        states; NaN for a run that failed."""
+        return known_maximum(jnp.abs(self._stored.state.displacement), axis=-2)
 
     @property
     def largest_force(self) -> Array:
-        """Largest magnitude of the force on the foundation during the run, N, among the stored states.
+        """Largest magnitude of the force on the foundation during the run, N, among the stored states; NaN if the run failed.
 
         In two directions this is the largest length of the vector, not the root of the sum of both squared peaks, which is
         `foundation_force`.
         """
-        return jnp.sqrt(jnp.max(jnp.sum(self._stored.foundation_force**2, axis=-1), axis=-1))
+        return jnp.sqrt(known_maximum(jnp.sum(self._stored.foundation_force**2, axis=-1), axis=-1))
 
     def _require_end(self) -> None:
         """**Raises** `InputError` for a batch of runs, and for a run that failed: its window has no values."""
         self.require_single()
-        if not all(np.all(np.isfinite(np.asarray(values))) for values in (self.window.time, self.window.state.displacement)):
+        if not self._has_end:
             raise InputError("run", f"has no values at its end: {self.message}; simulate with throw=True for advice")
+
+    @property
+    def _has_end(self) -> bool:
+        """True unless the run failed, so that the states of its window are unknown."""
+        return all(np.all(np.isfinite(np.asarray(values))) for values in (self.window.time, self.window.state.displacement))
 
     @property
     def _stored(self) -> Trajectory:
@@ -179,6 +185,9 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         **Arguments**: `measures` of the vibration that are shown; default: those of the centre of mass on a level deck.
         """
         self.require_single()
+        if not self._has_end:
+            cost = f"{int(self.evaluations)} evaluations, {float(self.seconds):.3g} s"
+            return f"{self.message}: amplitudes, speeds and forces are unknown after {int(self.steps)} steps\n  {cost}"
         error = f"estimated error of the states in the window, phase included, {float(self.error):.1e}"
         error = "error not estimated" if np.isnan(self.error) else error
         rotors = [w[-1] for w in self.window.rotor_speeds]

@@ -57,6 +57,11 @@ def _extrapolation() -> tuple[np.ndarray, np.ndarray]:
 _BEFORE, _AFTER = _extrapolation()
 
 
+def known_maximum(values: Array, axis: int) -> Array:
+    """Return the largest of the values along an axis, and NaN unless all are finite: XLA's maximum can ignore a NaN."""
+    return jnp.where(jnp.all(jnp.isfinite(values), axis=axis), jnp.max(values, axis=axis), jnp.nan)
+
+
 def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     """Locate the extrema of an evenly sampled motion over its first half, its second half and all of it.
 

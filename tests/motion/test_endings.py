@@ -1,5 +1,7 @@
 """Endings of runs: missing starts, unfinished runs, divergence, and the known error."""
 
+import re
+
 import diffrax
 import equinox as eqx
 import jax
@@ -25,6 +27,12 @@ def test_a_run_that_does_not_finish_says_so():
         with pytest.raises(jv.InputError, match=r"^run has no values at its end: the run needs more steps than max_steps .*"):
             ask()
     assert "max_steps" in run._repr_html_()  # a notebook shows the text without a figure
+    for largest in (run.largest_displacement, run.largest_force, run.point().largest_displacement):
+        assert np.all(np.isnan(largest))
+    unknown = (
+        r"the run needs more steps than max_steps to reach its end: amplitudes, speeds and forces are unknown after \d+ steps"
+    )
+    assert re.match(unknown, run.summary())
 
 
 @pytest.mark.parametrize(
