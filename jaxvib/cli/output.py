@@ -222,7 +222,8 @@ class Output:
         if path is not None:
             write_file(path, body + "\n")
         if self.report is not None:
-            self._write_report(self.report, values, text, name, result)
+            shown = {key: plain(value, infinity=True) for key, value in document.items()}
+            self._write_report(self.report, shown, text, name, result)
         if self.as_json:
             click.echo(body)
             return

@@ -19,7 +19,7 @@ from jaxvib.display import Figure
 from jaxvib.errors import written
 from jaxvib.machine.scene import Scene
 from jaxvib.report.tables import Units, accuracy_table, escaped, in_display_units, parameter_tables, result_tables
-from jaxvib.results.fields import Plain
+from jaxvib.results.fields import Plain, as_dict
 from jaxvib.results.result import Result
 from jaxvib.steady.measures import VibrationMeasures
 
@@ -30,7 +30,7 @@ _LIBRARIES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "nu
 class Report:
     """Contents of a page.
 
-    **Arguments**: `title`; `document`: the result as plain values, as in JSON; `units` of its numbers by name; `command` that
+    **Arguments**: `title`; `document`: the result as plain values; `units` of its numbers by name; `command` that
     computed the result; `text` of the result on the terminal; `scene` of the result and a `sketch` of the scene; `figures`:
     pairs of a name and a figure; `author`.
     """
@@ -53,8 +53,8 @@ class Report:
             parts.append(f"<p>{escaped(self.author)}</p>")
         if self.command:
             parts.append(f'<p class="command"><code>{escaped(self.command)}</code></p>')
-        units = self.units if self.scene is None else _with_coordinate_units(self.units, self.scene)
-        document, units = in_display_units(self.document, units)
+        coordinate_units = () if self.scene is None else self.scene.machine.structure().units
+        document, units = in_display_units(self.document, self.units, coordinate_units)
         numbers = [_section("Accuracy", accuracy_table(document, units)), _section("Numbers", result_tables(document, units))]
         if self.text:
             parts.append(_section("Results", f"<pre>{escaped(self.text)}</pre>"))
@@ -107,7 +107,8 @@ def html_report(
     if scene is None and isinstance(own_scene, Scene):
         scene = own_scene
     named_figures = [(kind, result.plot())] if figures is None else figures
-    page = Report(title or kind, result.as_dict(), units_of(result), "", result.summary(), scene, named_figures, author=author)
+    document = as_dict(result, infinity=True)
+    page = Report(title or kind, document, units_of(result), "", result.summary(), scene, named_figures, author=author)
     with written(path) as part:
         part.write_text(page.html(), encoding="utf-8", errors="replace")
     return path
@@ -116,12 +117,13 @@ def html_report(
 def units_of_document(document: Mapping[str, Plain], result: eqx.Module | None) -> dict[str, str]:
     """Return the units of the numbers in the document of a command, by name: those of its `result`, of measures of vibrations,
     and of speeds that commands add."""
-    units = {"natural_frequencies": "rad/s", "rotor_speed": "rad/s"}
+    units = {} if result is None else units_of(result)
+    units |= {"natural_frequencies": "rad/s", "rotor_speed": "rad/s", "largest_displacement": "m or rad", "largest_force": "N"}
     rows = [row for value in document.values() if isinstance(value, list) for row in value if isinstance(row, Mapping)]
     if any("measures" in each for each in (document, *rows)):
         of_measures = {each.name: each.metadata.get("unit", "") for each in dataclasses.fields(VibrationMeasures)}
         units |= {name: unit for name, unit in of_measures.items() if unit}
-    return units if result is None else units | units_of(result)
+    return units
 
 
 def units_of(result: eqx.Module) -> dict[str, str]:
@@ -135,13 +137,6 @@ def units_of(result: eqx.Module) -> dict[str, str]:
             for name, unit in units_of(value).items():
                 units.setdefault(name, unit)
     return units
-
-
-def _with_coordinate_units(units: Units, scene: Scene) -> dict[str, str]:
-    """Replace a unit such as "m or rad" by the unit of the machine's coordinates if all coordinates have the same unit."""
-    coordinate_units = set(scene.machine.structure().units)
-    choice = 0 if coordinate_units == {"m"} else 1 if coordinate_units == {"rad"} else None
-    return {name: unit if choice is None or " or " not in unit else unit.split(" or ")[choice] for name, unit in units.items()}
 
 
 def _section(title: str, body: str) -> str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import html
+import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias, TypeGuard, cast
 
 import equinox as eqx
 
-from jaxvib.display import shown_unit
+from jaxvib.display import quantity_text, shown_unit
 from jaxvib.machine.files import EFFECTS, scene_to_toml
 from jaxvib.machine.numbers import number_specs
 from jaxvib.machine.scene import Exciter, Scene
@@ -42,34 +43,61 @@ def escaped(text: object) -> str:
     return html.escape(str(text), quote=True)
 
 
-def in_display_units(document: Mapping[str, Plain], units: Units) -> tuple[Mapping[str, Plain], Units]:
+def in_display_units(
+    document: Mapping[str, Plain], units: Units, coordinate_units: Sequence[str] = ()
+) -> tuple[Mapping[str, Plain], Units]:
     """Return a document whose numbers are in display units, and these units.
 
     Each name has one unit. It is chosen for the largest value with this name in the document, including lists and rows of
-    tables.
+    tables. Values at the coordinates of a machine have a unit such as "m or rad"; if the `coordinate_units` differ, each value
+    is a text with its own unit.
 
     >>> in_display_units({"omega": 10.0, "jams": [{"amplitude": [0.002]}]}, {"omega": "rad/s", "amplitude": "m"})
     ({'omega': 95.49296585513721, 'jams': [{'amplitude': [2.0]}]}, {'omega': 'rpm', 'amplitude': 'mm'})
+    >>> in_display_units({"amplitude": [0.002, 0.001, 0.01]}, {"amplitude": "m or rad"}, ("m", "m", "rad"))
+    ({'amplitude': ['2 mm', '1 mm', '0.572958 deg']}, {'amplitude': ''})
     """
+    kinds = {"m": 0, "rad": 1}
+    if len(set(coordinate_units)) == 1:
+        units = {name: _choice(unit, kinds[coordinate_units[0]]) for name, unit in units.items()}
+    # Two numbers could also be the real and the imaginary part of one number.
+    mixed = {name for name, unit in units.items() if " or " in unit and len(coordinate_units) > 2}
     sizes = dict.fromkeys(units, 0.0)
 
-    def note_size(name: str, x: float) -> float:
-        sizes[name] = max(sizes.get(name, 0.0), abs(x))
+    def note_size(name: str, x: float, place: tuple[int, int]) -> float:
+        sizes[name] = max(sizes.get(name, 0.0), abs(x) if math.isfinite(x) else 0.0)
         return x
 
+    def shown_number(name: str, x: float, place: tuple[int, int]) -> float | str:
+        k, count = place
+        if name in mixed and count in (0, len(coordinate_units)):  # a single value is that of a point, in the first unit
+            return quantity_text(x, _choice(units[name], kinds[coordinate_units[k]] if count else 0), 6)
+        return shown[name][1] * x if name in shown else x
+
     _map_numbers(document, "", note_size)
-    shown = {name: shown_unit(unit, sizes[name]) for name, unit in units.items()}
-    scaled = _map_numbers(document, "", lambda name, x: shown[name][1] * x if name in shown else x)
+    shown = {name: ("", 1.0) if name in mixed else shown_unit(unit, sizes[name]) for name, unit in units.items()}
+    scaled = _map_numbers(document, "", shown_number)
     return cast("Mapping[str, Plain]", scaled), {name: unit for name, (unit, _) in shown.items()}
 
 
-def _map_numbers(value: Plain | Mapping[str, Plain], name: str, scale: Callable[[str, float], float]) -> Plain:
-    """Apply `scale`, a function of name and number, to all numbers of a plain value except Booleans."""
+def _choice(unit: str, kind: int) -> str:
+    """Return the unit for coordinates of a kind, 0 for displacements and 1 for angles, from a unit such as "m or rad"."""
+    return unit.split(" or ")[kind] if " or " in unit else unit
+
+
+def _map_numbers(
+    value: Plain | Mapping[str, Plain],
+    name: str,
+    convert: Callable[[str, float, tuple[int, int]], float | str],
+    place: tuple[int, int] = (0, 0),
+) -> Plain:
+    """Apply `convert`, a function of the name, the number, and its place in and the length of its list ((0, 0) outside lists),
+    to all numbers of a plain value except Booleans."""
     if isinstance(value, Mapping):
-        return {key: _map_numbers(entry, key, scale) for key, entry in value.items()}
+        return {key: _map_numbers(entry, key, convert) for key, entry in value.items()}
     if isinstance(value, list):
-        return [_map_numbers(entry, name, scale) for entry in value]
-    return scale(name, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+        return [_map_numbers(entry, name, convert, (k, len(value))) for k, entry in enumerate(value)]
+    return convert(name, value, place) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
 
 
 def accuracy_table(document: Mapping[str, Plain], units: Units) -> str:
@@ -166,11 +194,9 @@ def _pair_table(pairs: Sequence[tuple[str, Plain]], units: Units) -> str:
 
 
 def _row_table(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
-    """Return a table with a row for each entry. A long text is below its row, over the whole width."""
+    """Return a table with a row for each entry. A long text, or an inner table, is below its row, over the whole width."""
     all_names = list(dict.fromkeys(name for row in rows for name in row))
-    long_names = [
-        name for name in all_names if any(isinstance(x := row.get(name), str) and len(x) > _MAX_CELL_CHARACTERS for row in rows)
-    ]
+    long_names = [name for name in all_names if any(_is_long(row.get(name)) for row in rows)]
     names = [name for name in all_names if name not in long_names]
     heads = "".join(f"<th{_column_class(rows, name)}>{escaped(_words(name))}{_unit_of(name, units)}</th>" for name in names)
     body = ""
@@ -182,6 +208,10 @@ def _row_table(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
                 text = f"{escaped(_words(name))}: {_cell(row[name], units)}"
                 body += f"<tr><td class='below' colspan='{len(names)}'>{text}</td></tr>"
     return f"<div class='wide'><table><tr>{heads}</tr>{body}</table></div>{_more_rows_note(len(rows))}"
+
+
+def _is_long(value: Plain) -> bool:
+    return isinstance(value, Mapping) or (isinstance(value, str) and len(value) > _MAX_CELL_CHARACTERS)
 
 
 def _column_class(rows: Sequence[Mapping[str, Plain]], name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypedDict, TypeGuard, TypeVar
@@ -96,42 +97,47 @@ def is_named_tuple(value: object) -> TypeGuard[NamedTuple]:
     return isinstance(value, tuple) and hasattr(value, "_fields")
 
 
-def as_dict(result: eqx.Module) -> dict[str, Plain]:
+def as_dict(result: eqx.Module, *, infinity: bool = False) -> dict[str, Plain]:
     """Return a result as plain Python values for JSON, in SI units, with the `status` and the `message` before the fields.
 
-    Statuses are represented by their names, complex numbers by pairs [real, imaginary], and NaN and infinity by None.
+    Statuses are represented by their names, complex numbers by pairs [real, imaginary], and NaN and infinity by None. With
+    `infinity`, infinite numbers are kept, for documents for readers.
     """
     status = getattr(result, "status", None)
     head = {} if status is None else {"status": plain(status), "message": sentence(status)}
-    return {**head, **_plain_fields(result)}
+    return {**head, **_plain_fields(result, infinity)}
 
 
-def plain(value: object) -> Plain:
+def plain(value: object, *, infinity: bool = False) -> Plain:
     """Return a value in a form that JSON can represent, see `as_dict`. **Raises** `TypeError` for a value of another class."""
+    inner = functools.partial(plain, infinity=infinity)
     if is_status(value):
         return status_names(value).tolist()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _plain_fields(value)
+        return _plain_fields(value, infinity)
     if is_named_tuple(value):
-        return {name: plain(getattr(value, name)) for name in value._fields}
+        return {name: inner(getattr(value, name)) for name in value._fields}
     if isinstance(value, Mapping):
-        return {str(name): plain(entry) for name, entry in value.items()}
+        return {str(name): inner(entry) for name, entry in value.items()}
     if isinstance(value, (jax.Array, np.ndarray, np.generic)):
-        return plain(np.asarray(value).tolist())
+        return inner(np.asarray(value).tolist())
     if isinstance(value, (tuple, list)):
-        return [plain(entry) for entry in value]
+        return [inner(entry) for entry in value]
     if isinstance(value, complex):
-        return [plain(value.real), plain(value.imag)]
+        return [inner(value.real), inner(value.imag)]
     if value is None or isinstance(value, (bool, int, str)):
         return value
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return value if math.isfinite(value) or (infinity and math.isinf(value)) else None
     raise TypeError(f"{value!r} is neither a plain value nor an array")
 
 
-def _plain_fields(value: DataclassInstance) -> dict[str, Plain]:
+def _plain_fields(value: DataclassInstance, infinity: bool) -> dict[str, Plain]:
     entries = {field.name: (field.metadata, getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return {name: meta["write"](entry) if "write" in meta else plain(entry) for name, (meta, entry) in entries.items()}
+    return {
+        name: meta["write"](entry) if "write" in meta else plain(entry, infinity=infinity)
+        for name, (meta, entry) in entries.items()
+    }
 
 
 def to_xarray(result: eqx.Module) -> xarray.Dataset:

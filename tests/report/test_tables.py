@@ -1,10 +1,14 @@
 """Documents as tables of a page, cell by cell."""
 
+import math
 import re
+
+import numpy as np
 
 import jaxvib as jv
 from jaxvib.machine.files import SCREENS
-from jaxvib.report.tables import accuracy_table, parameter_tables, result_tables
+from jaxvib.report.tables import accuracy_table, in_display_units, parameter_tables, result_tables
+from jaxvib.results.fields import plain
 
 UNITS = {"force": "N", "rows": "m"}
 
@@ -56,6 +60,19 @@ def test_a_report_shows_what_the_terminal_would(tmp_path):
     assert cells(text, "h1") == ["Größe µ"] and 'class="command"' not in text
     shown = re.search(r"<pre>(.*?)</pre>", text, re.DOTALL)
     assert shown and shown[1].strip().splitlines()[0].split() == modes.summary().strip().splitlines()[0].split()
+
+
+def test_values_of_coordinates_have_their_own_units():
+    units = {"amplitude": "m or rad", "margin": ""}
+    document = {"regimes": [{"amplitude": [0.002, 0.0015, 0.01], "margin": math.inf}], "deck": [{"amplitude": 0.003}]}
+    shown, units = in_display_units(document, units, ("m", "m", "rad"))
+    assert cells(result_tables(shown, units), "th") == ["amplitude", "margin", "amplitude"]
+    assert cells(result_tables(shown, units)) == ["2 mm, 1.5 mm, 0.572958 deg", "inf", "3 mm"]
+
+
+def test_reports_show_infinite_numbers_that_json_omits():
+    assert plain([math.inf, math.nan]) == [None, None]
+    assert plain({"margin": np.asarray([-math.inf, math.nan, 1.0])}, infinity=True) == {"margin": [-math.inf, None, 1.0]}
 
 
 def test_exciters_are_numbered_and_placed_with_a_unit():
