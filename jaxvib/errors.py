@@ -251,7 +251,9 @@ def read_text(path: str | Path, what: str, max_bytes: int = MAX_TEXT_BYTES) -> s
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(str(path), "is not UTF-8 text; save it as UTF-8") from error
+        archive = f"is an archive, such as a saved result; give the path of {what}"
+        problem = archive if content.startswith(b"PK") else "is not UTF-8 text; save it as UTF-8"
+        raise InputError(str(path), problem) from error
 
 
 class ComputationError(RuntimeError):

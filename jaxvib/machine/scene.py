@@ -22,6 +22,7 @@ from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.machine.shapes import require_drive, require_forces, require_loads, require_machine, require_terms
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_if_known, when_known
+from jaxvib.units.reading import in_own_unit, unit_ratio
 
 MAX_USUAL_SPEED = 700.0
 """Largest usual speed of a rotor, rad/s. A larger plain number was probably intended in rpm."""
@@ -166,10 +167,25 @@ def read_unbalance(drive: Drive, unbalance: Number | None, unbalance_mass: Numbe
     given = {name: value for name, value in (("unbalance", unbalance), ("unbalance_mass", unbalance_mass)) if value is not None}
     if "unbalance_mass" in given and "unbalance" not in given:
         raise InputError("unbalance_mass", f"is {quoted(unbalance_mass)} without an unbalance; give unbalance=..., in kg m")
-    values = read_numbers(Exciter, "", **given)
+    try:
+        values = read_numbers(Exciter, "", **given)
+    except InputError as error:
+        if error.field != "unbalance" or not _is_force(unbalance):
+            raise
+        needs = f"{{ force = '{unbalance}', at = '1500 rpm' }}"
+        problem = f"is {quoted(unbalance)}, a force; state its speed too, as {needs} in a file, by jaxvib.unbalance in Python"
+        raise InputError("unbalance", problem) from error
     if len(values) == 2 and not drive.ideal:
         when_known(_require_inertia, *values.values(), drive.inertia)  # pyright: ignore[reportAttributeAccessIssue]
     return values.get("unbalance"), values.get("unbalance_mass")
+
+
+def _is_force(value: object) -> bool:
+    """Return True for a text with a unit of a force."""
+    try:
+        return isinstance(value, str) and unit_ratio(in_own_unit(value, "unbalance")[1], "N") is not None
+    except InputError:
+        return False
 
 
 def _require_inertia(unbalance: float, mass: float, inertia: float) -> None:

@@ -129,6 +129,10 @@ _MAX_RADIUS, _MAX_SAG, _MIN_MASS = 5.0, 1.0, 10.0
 whose sag is examined. Machines with dimensionless parameters have masses of about 1."""
 
 
+_MIN_POWER = 0.02
+"""Smallest usual rated power of a motor for each kg of the machine, W; usual values are about 1."""
+
+
 def _largest_lever(machine: Machine) -> float:
     """Return the largest distance of a support from the centre of mass, m; 0 for a machine without positions of supports."""
     places = [np.linalg.norm(each.at) for each in getattr(machine, "supports", ())]
@@ -145,6 +149,7 @@ def implausible_numbers(scene: Scene) -> list[str]:
     ["drive.speed is 14324 rpm; a plain number is in rad/s: did you mean '1500 rpm'?"]
     """
     notes = []
+    mass = float(np.sum(getattr(scene.machine, "mass", 0.0)))
 
     def note(name: str, value: str, si: str, meant: str) -> None:
         notes.append(f"{name} is {value}; a plain number is in {si}: did you mean '{meant}'?")
@@ -154,6 +159,9 @@ def implausible_numbers(scene: Scene) -> list[str]:
         speed = float(exciter.drive.speed)
         if speed > MAX_USUAL_SPEED:
             note(f"{place}drive.speed", speed_text(speed), "rad/s", f"{speed:g} rpm")
+        power = float(getattr(exciter.drive, "power", np.inf))
+        if mass >= _MIN_MASS and power < _MIN_POWER * mass:
+            note(f"{place}drive.power", f"{power:g} W for a machine of {mass:g} kg", "W", f"{power:g} kW")
         radius = 0.0 if loads is None else float(np.max(getattr(loads, "radius", 0.0)))
         if radius > _MAX_RADIUS:
             note(f"{place}loads.radius", f"{radius:g} m", "m", f"{radius:g} mm")
@@ -164,7 +172,6 @@ def implausible_numbers(scene: Scene) -> list[str]:
     for k, support in enumerate(getattr(scene.machine, "supports", ())):
         if (angle := abs(float(getattr(support, "angle", 0.0)))) > 2.0 * np.pi:
             note(f"machine.supports[{k}].angle", f"{angle:g} rad", "rad", f"{angle:g} deg")
-    mass = float(np.sum(getattr(scene.machine, "mass", 0.0)))
     if mass > _MAX_MASS:
         note("machine.mass", f"{mass / 1e3:g} t", "kg", f"{mass / 1e3:g} kg")
     supports = [each.stiffness for each in getattr(scene.machine, "supports", ())]

@@ -389,6 +389,10 @@ def test_implausible_bodies_in_a_plane_are_noted():
         "machine.supports.stiffness is so small that the machine sags by 2.98e+03 m; a plain number is in N/m: "
         "did you mean '460 N/mm'?",
     ]
+    motor = 'kind = "name_plate_motor"\npower = 1.1\nrated_speed = "930 rpm"\nbreakdown_ratio = 2.6\ninertia = 0.6\n'
+    head, _, tail = SCREENS["linear_screen"].partition('kind = "induction_motor"')
+    (note,) = implausible_numbers(jv.scene_from_toml(head + motor + tail[tail.index("[[exciters]]") :]))
+    assert note == ("exciters[0].drive.power is 1.1 W for a machine of 2600 kg; a plain number is in W: did you mean '1.1 kW'?")
     turned = SCREENS["linear_screen"].replace('# angle = "0 deg"', "angle = 15.0     #", 1)
     (note,) = implausible_numbers(jv.scene_from_toml(turned))
     assert note == "machine.supports[0].angle is 15 rad; a plain number is in rad: did you mean '15 deg'?"

@@ -135,6 +135,10 @@ def test_numbers_of_several_exciters_have_names():
 BAD = {
     "direction": (lambda: two(direction=0), r"direction is 0; it must be 1 \(anticlockwise\) or -1"),
     "negative unbalance": (lambda: two(unbalance=-0.2), r"unbalance is -0.2 kg m; it must be greater than 0"),
+    "force as unbalance": (
+        lambda: two(unbalance="10 kN"),
+        r"unbalance is '10 kN', a force; .*, as \{ force = '10 kN', at = '1500 rpm' \} in a file, by jaxvib.unbalance",
+    ),
     "huge unbalance": (
         lambda: two(unbalance=1e308, unbalance_mass=1.0),
         "less than that of the unbalance alone, .* = inf kg m",

@@ -194,6 +194,9 @@ def test_a_file_that_cannot_be_read_says_which(tmp_path):
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(jv.InputError, match=r"bytes\.toml is not UTF-8 text"):
         jv.load_scene(tmp_path / "bytes.toml")
+    np.savez(tmp_path / "run.npz", time=np.zeros(3))
+    with pytest.raises(jv.InputError, match=r"run\.npz is an archive, such as a saved result; give the path of a TOML file"):
+        jv.load_scene(tmp_path / "run.npz")
     with pytest.raises(jv.InputError, match="cannot be read"):
         jv.load_scene(tmp_path)
     with pytest.raises(jv.InputError, match="scene is not a TOML"):
