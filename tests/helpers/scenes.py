@@ -1,4 +1,4 @@
-"""The scenes that tests go through: one of every machine, load and effect."""
+"""Platforms, loads on a circle, and states of scenes with them, which many tests share."""
 
 import jax.numpy as jnp
 import numpy as np
