@@ -30,6 +30,10 @@ SpeedUnit: TypeAlias = Literal["rad/s", "rpm", "Hz"]
 _SPEED_FACTORS = {"rad/s": 1.0, "rpm": 30.0 / math.pi, "Hz": 0.5 / math.pi}
 
 
+ELECTRICAL = "rad/s of a supply"
+"""Unit of frequencies that are shown in Hz where speeds are shown in rpm."""
+
+
 class _CurrentUnits:
     """Display units of this process: that of speeds, and True in `si` for SI units of all other quantities."""
 
@@ -88,6 +92,8 @@ def shown_unit(unit: str, size: float) -> tuple[str, float]:
     """
     if unit == "rad/s":
         return speed_unit()
+    if unit == ELECTRICAL:
+        return ("rad/s", 1.0) if _CurrentUnits.si else ("Hz", _SPEED_FACTORS["Hz"])
     if _CurrentUnits.si:
         return unit, 1.0
     if unit == "N/m" and size >= 1e3:

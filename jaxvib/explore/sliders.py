@@ -226,7 +226,7 @@ def _slider(scene: Scene, number: NamedNumber, factors: tuple[float, ...], reach
         return Slider(number.name, f"{field.replace('_', ' ')} of the {part}, common factor", "", steps, 1.0, number)
     label = number.words(scene)[0]
     if not _is_shifted(number):
-        unit, scale = shown_unit(number.unit, float(values[0]))
+        unit, scale = shown_unit(number.spec.unit_of_tables, float(values[0]))
         start = float(f"{scale * values[0]:.6g}")
         return Slider(number.name, label, unit, _steps(start, factors), start, number)
     unit, scale = shown_unit(number.unit, 1e-3)

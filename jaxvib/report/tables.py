@@ -152,7 +152,7 @@ def parameter_tables(scene: Scene) -> str:
 
 
 def _units(part: type) -> dict[str, str]:
-    return {name: spec.unit for name, spec in number_specs(part).items()}
+    return {name: spec.unit_of_tables for name, spec in number_specs(part).items()}
 
 
 def _units_of(part: object) -> dict[str, str]:

@@ -83,3 +83,10 @@ def test_exciters_are_numbered_and_placed_with_a_unit():
     assert "<td>-800, -150</td><td>80, 126</td><td>300, 400</td>" in text
     table = text.partition("exciter 2<")[2]
     assert cells(table)[:2] == ["-481, -390", "mm"]
+
+
+def test_frequencies_of_supplies_are_shown_in_hertz():
+    motor = jv.NamePlateMotor("3 kW", "930 rpm", breakdown_ratio=2.6, inertia=0.6)
+    scene = jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), exciters=[jv.Exciter(drive=motor, unbalance=0.4)])
+    values = cells(parameter_tables(scene))
+    assert values[values.index("Hz") - 1] == "50" and values[values.index("rpm") - 1] == "930"

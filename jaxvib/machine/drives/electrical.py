@@ -18,6 +18,8 @@ from jaxvib.units.known import when_known
 
 _POSITIVE = {"low": 0.0, "open_low": True}
 
+_FREQUENCY = unit("rad/s", **_POSITIVE, words="frequency of the supply", electrical=True)
+
 _MAX_POLE_PAIRS = 48
 """Largest number of pole pairs of a motor by its name plate; usual motors have 1 to 6."""
 
@@ -71,7 +73,7 @@ class NamePlateMotor(Motor):
         metadata=unit("", low=1.0, open_low=True, words="breakdown torque divided by rated torque", typical=2.5)
     )
     inertia: Array = eqx.field(metadata=INERTIA)
-    frequency: Array = eqx.field(metadata=unit("rad/s", **_POSITIVE, words="frequency of the supply"))
+    frequency: Array = eqx.field(metadata=_FREQUENCY)
     starting_ratio: Array | None = eqx.field(
         metadata=unit("", **_POSITIVE, words="starting torque divided by rated torque", typical=2.2)
     )
@@ -257,7 +259,7 @@ class InductionMotorCircuit(Motor):
     """
 
     voltage: Array = eqx.field(metadata=unit("V", **_POSITIVE, words="voltage between two lines of the supply"))
-    frequency: Array = eqx.field(metadata=unit("rad/s", **_POSITIVE, words="frequency of the supply"))
+    frequency: Array = eqx.field(metadata=_FREQUENCY)
     stator_resistance: Array = eqx.field(metadata=unit("ohm", **_POSITIVE, words="resistance of the stator"))
     rotor_resistance: Array = eqx.field(metadata=unit("ohm", **_POSITIVE, words="resistance of the rotor"))
     stator_leakage: Array = eqx.field(metadata=unit("H", **_POSITIVE, words="leakage inductance of the stator"))

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.display import ELECTRICAL
 from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.startup import start
 from jaxvib.units import Bounds, Numbers, number, numbers
@@ -36,6 +37,7 @@ class NumberSpec(NamedTuple):
     - `words`: name of the parameter in text for users
     - `each`: kind of part to which each entry of an array belongs, such as "platform"; "" for a single number
     - `typical`: typical magnitude in SI of a number that may have either sign; None if its lower bound is 0
+    - `electrical`: True for the frequency of a supply, which tables show in Hz
     """
 
     units: tuple[str, ...]
@@ -43,11 +45,17 @@ class NumberSpec(NamedTuple):
     words: str = ""
     each: str = ""
     typical: float | None = None
+    electrical: bool = False
 
     @property
     def unit(self) -> str:
         """Unit, or the different units of the entries separated by commas, for tables."""
         return ", ".join(dict.fromkeys(self.units))
+
+    @property
+    def unit_of_tables(self) -> str:
+        """Unit for `jaxvib.display.shown_unit`."""
+        return ELECTRICAL if self.electrical else self.unit
 
     @property
     def zero_is_absent(self) -> bool:
@@ -68,6 +76,7 @@ def unit(
     words: str = "",
     each: str = "",
     typical: float | None = None,
+    electrical: bool = False,
 ) -> Mapping[str, NumberSpec]:
     """Return the metadata of a field of a machine, a load, a drive or an effect with a number or an array of numbers.
 
@@ -81,7 +90,7 @@ def unit(
     >>> number_specs(Seal)["torque"].bounds.words
     'at least 0'
     """
-    return {_KEY: NumberSpec(units, Bounds(low, open_low, high, open_high), words, each, typical)}
+    return {_KEY: NumberSpec(units, Bounds(low, open_low, high, open_high), words, each, typical, electrical)}
 
 
 @functools.lru_cache(maxsize=256)
