@@ -140,12 +140,13 @@ def test_the_same_numbers_are_looked_at_once(monkeypatch):
     assert len(looked) == 6
 
 
-def test_one_station_in_a_list_is_that_of_all_loads():
+@pytest.mark.parametrize("stations", [[0.1], [0.1, 0.1], [np.nextafter(0.1, 1.0), 0.1]])
+def test_equal_stations_in_a_list_are_one(stations):
     parts = dict(mass=20.0, transverse_inertia=0.5, polar_inertia=0.1, stiffness=1e5, damping=100.0, position=(0.2, -0.2))
     for count in (1, 4):
         loads = jv.balls(count=count, mass=0.1, radius=0.1, drag=0.5)
-        listed, single = (jv.Scene(jv.rotor(stations=s, **parts), loads, jv.ConstantSpeed(60.0)) for s in ([0.1], 0.1))
-        validate_scene(listed)
+        listed, single = (jv.Scene(jv.rotor(stations=s, **parts), loads, jv.ConstantSpeed(60.0)) for s in (stations, 0.1))
+        assert validate_scene(listed).mounting.at_one_point
         assert jv.scene_to_toml(listed) == jv.scene_to_toml(single)
 
 

@@ -202,8 +202,8 @@ def rotor(
     - `damping` (2,) of the supports, N s/m; typical: 100 to 1000; also a ratio "5 %" or a loss factor, see `one_mass`. With
       "5 %" at both supports the translation of the rotor without tilt has this ratio (without `stiffness_terms`)
     - `position` (2,) of the supports along the axis, m from the centre of mass, one side negative; typical: 0.1 to 0.5
-    - `stations` of the loads along the axis, m from the centre of mass, one number or one for each load; typical: -0.3 to 0.3,
-      default 0
+    - `stations` of the loads along the axis, m from the centre of mass, one number or one for each load; a list of equal
+      numbers is one number; typical: -0.3 to 0.3, default 0
     - `stiffness_terms` (c1, c2, c3) in N/m, N, N m: a list of three in place of the terms that follow from the supports;
       typical: 1e6, up to 2e4, 3e4
     - `damping_terms` (b1, b2, b3) in N s/m, N s, N m s: a list of three in place of the terms that follow from the supports;
@@ -260,10 +260,9 @@ def rotor(
             damping_up, "machine.damping_up", vertical, lambda: found["mass"] * vertical / jnp.sum(vertical)
         )
         resisting = read(2, damping_up=constants)["damping_up"]
-    station = read(stations=stations)["stations"]
     return Rotor(
         **found,
-        stations=jnp.reshape(station, ()) if station.size == 1 else station,
+        stations=_without_equal(read(stations=stations)["stations"]),
         transverse_inertia=transverse,
         polar_inertia=polar,
         position=places,
@@ -273,6 +272,21 @@ def rotor(
         damping_up=resisting,
         kind="rotor",
     )
+
+
+def _without_equal(stations: Array) -> Array:
+    """Return stations (n,), or one station () if all are equal."""
+    distinct = when_known(_distinct, stations)
+    stations = stations if distinct is None else jnp.asarray(distinct, stations.dtype)
+    return jnp.reshape(stations, ()) if stations.size == 1 else stations
+
+
+def _distinct(stations: np.ndarray | float) -> np.ndarray:
+    """Return stations (n,) of which those that differ by rounding are equal; one station (1,) if all are equal."""
+    places, which = np.unique(np.atleast_1d(stations), return_inverse=True)
+    rounding = max(1e-9, 32.0 * float(np.finfo(places.dtype).eps)) * np.max(np.abs(places))
+    is_new = np.diff(places, prepend=-np.inf) > rounding
+    return places[is_new][np.cumsum(is_new)[which] - 1] if np.sum(is_new) > 1 else places[:1]
 
 
 def _require_passive(field: str, one: float, two: float, three: float) -> None:

@@ -286,14 +286,7 @@ def _imbalances(scene: Scene) -> tuple[complex, complex, np.ndarray]:
     imbalances = [term.at(jnp.zeros_like(scene.drive.speed)) for term in terms_of(scene.all_effects, RotorImbalance)]
     static = sum((complex(*map(float, each.static)) for each in imbalances), 0j)
     moment = sum((complex(*map(float, each.moment)) for each in imbalances), 0j)
-    return static, moment, _without_rounding(np.asarray(_distances(scene)))
-
-
-def _without_rounding(distances: np.ndarray) -> np.ndarray:
-    """Return distances (N,) of which those that differ by rounding are equal."""
-    places, which = np.unique(distances, return_inverse=True)
-    is_new = np.diff(places, prepend=-np.inf) > _rounding() * np.max(np.abs(places))
-    return places[is_new][np.cumsum(is_new)[which] - 1]
+    return static, moment, np.asarray(_distances(scene))
 
 
 @cached
