@@ -1,6 +1,7 @@
 """An effect, a load with two coordinates and a drive from outside the package: what their properties allow runs, the rest is
 refused by a sentence that names the property."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from plugins.drive import Turbine
 from plugins.effect import SealFriction
 from plugins.load import TorusPoints
+from plugins.machine import Beam
 from scenes import jam_rotor_speed, machines, published
 
 import jaxvib as jv
@@ -158,3 +160,16 @@ def test_plugin_motor_turns_the_rotor_and_balances_power():
 def test_what_a_property_does_not_allow_is_refused_by_its_name(make, ask, says):
     with pytest.raises(jv.InputError, match=says):
         ask(make())
+
+
+class WithScatter(Beam):
+    def carrier(self):
+        carrier = super().carrier()
+        return eqx.tree_at(lambda each: each.mass, carrier, carrier.mass.at[0, 1].set(0.0))
+
+
+def test_operation_of_a_part_that_prevents_fmus_is_named(tmp_path):
+    loads = jv.balls(count=1, mass=0.4, radius=0.1, drag=1.0)
+    scene = jv.Scene(WithScatter(100.0, 12.0, [4e4] * 2, [-0.5, 0.5], 0.0), loads, jv.ConstantSpeed(90.0))
+    with pytest.raises(jv.InputError, match=r"needs the operation 'scatter' .* write .* jnp.stack in place of .at\[\].set"):
+        jv.export_fmu(scene, tmp_path / "m.fmu")

@@ -217,7 +217,8 @@ def _programs(scene: Scene, equations: Equations, events: bool, parameters: int)
         tangents = scalar_program(tangent, *arguments, *arguments[2:]), scalar_program(full_tangent, *arguments, *arguments)
     except NotScalarizable as error:
         problem = f"needs the operation {str(error)!r} of JAX, which is not available for scalars"
-        raise InputError("scene", f"{problem}; remove the part that needs it") from error
+        remedy = "write the part that needs it by other operations, such as jnp.stack in place of .at[].set, or remove the part"
+        raise InputError("scene", f"{problem}; {remedy}") from error
     numbers, number_seeds = ([f"{name}[{k}]" for k in range(parameters)] for name in ("p", "p_seed"))
     count = {"x": len(equations.state_signals), "u": len(equations.input_signals), "y": len(equations.output_signals)}
     changing = [f"{name}[{k}]" for name in "xu" for k in range(count[name])]
