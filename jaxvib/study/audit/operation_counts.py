@@ -10,12 +10,11 @@ from typing import NamedTuple, TypeVar
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor
-from jaxvib.machine.files import DRIVES, EFFECTS
-from jaxvib.machine.loads import Loads, balls, pendulums
+from jaxvib.machine.files import DRIVES, EFFECTS, LOADS
+from jaxvib.machine.loads import balls
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.structures.rotor import planar_rotor, rotor
-from jaxvib.machine.torus import torus_balls
 from jaxvib.study.audit.compared import field_operations
 from jaxvib.units import Numbers
 
@@ -71,12 +70,7 @@ def operation_counts() -> list[OperationCount]:
         "rotor, loads at one station": _rotor(0.0),
         "rotor, loads at stations": _rotor((0.5, -0.5)),
     }
-    sized = {"count": 1, "mass": 0.1, "radius": 0.2, "drag": 0.1}
-    loads: dict[str, Loads] = {
-        "ball": balls(**sized, ball_radius=0.02),
-        "pendulum": pendulums(**sized),
-        "torus_ball": torus_balls(**sized, tube=0.05, ball_radius=0.02),
-    }
+    loads = {kind: _build_with_halves(build) for kind, build in LOADS.items()}
     constant = ConstantSpeed(1.0)
 
     def row(part: str, kind: str, scene: Scene, beside: Scene) -> OperationCount:
@@ -90,7 +84,7 @@ def operation_counts() -> list[OperationCount]:
         for kind, drive in DRIVES.items()
     ]
     for kind, machine in machines.items():
-        loads_of_kind = balls(**{**sized, "count": 2}) if "stations" in kind else platform.loads
+        loads_of_kind = balls(count=2, mass=0.5, radius=0.5, drag=0.5) if "stations" in kind else platform.loads
         counts.append(row("machine", kind, Scene(machine, loads_of_kind, constant), platform))
     counts += [
         row("loads", kind, Scene(planar.machine, loads_of_kind, constant), planar) for kind, loads_of_kind in loads.items()
@@ -111,7 +105,10 @@ def operation_counts() -> list[OperationCount]:
 
 
 def _build_with_halves(build: Callable[..., T]) -> T:
-    """Build an effect or a drive whose required parameters are 0.5, or a special value if 0.5 is not allowed."""
+    """Build an effect, loads or a drive whose required parameters are 0.5, or a special value if 0.5 is not allowed.
+
+    Balls and rollers have a radius, because some effects require it.
+    """
     special_values = {
         "motor": DCMotor(1.0, 1.0, 1.0),
         "reference": ConstantSpeed(1.0),
@@ -121,11 +118,13 @@ def _build_with_halves(build: Callable[..., T]) -> T:
         "times": [0.5, 1.0],
         "speeds": [0.5, 1.0],
         "torques": [0.5, -0.5],
+        "count": 1,
+        "tube": 0.05,
+        "ball_radius": 0.02,
     }
-    required = [
-        parameter.name for parameter in inspect.signature(build).parameters.values() if parameter.default is parameter.empty
-    ]
-    return build(**{name: special_values.get(name, 0.5) for name in required})
+    parameters = inspect.signature(build).parameters.values()
+    names = [each.name for each in parameters if each.default is each.empty or each.name == "ball_radius"]
+    return build(**{name: special_values.get(name, 0.5) for name in names})
 
 
 def _rotor(stations: Numbers) -> Machine:

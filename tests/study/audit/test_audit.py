@@ -16,7 +16,7 @@ from jaxvib.cli.app import run as command
 from jaxvib.cli.study.audit import audit_text
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import RotorImbalance
-from jaxvib.machine.files import DRIVES, EFFECTS, TEMPLATES
+from jaxvib.machine.files import DRIVES, EFFECTS, LOADS, TEMPLATES
 from jaxvib.results.status import member
 from jaxvib.study.audit import compared, tiers
 from jaxvib.study.audit.audit import _with_computed_advice
@@ -181,10 +181,11 @@ def test_every_part_has_a_price_and_none_if_absent():
     rows = {(row.part, row.kind): row for row in operation_counts()}
     assert {kind for part, kind in rows if part == "effect"} == set(EFFECTS)
     assert {kind for part, kind in rows if part == "drive"} == set(DRIVES)
+    assert {kind for part, kind in rows if part == "loads"} == set(LOADS)
     bare = rows["machine", "one_mass"]
     # What was counted when this was written, and a little to spare: more says that something absent is traced.
     assert bare.added == 0 and bare.operations == rows["drive", "constant_speed"].operations <= 185
-    assert all((row.added > 0) == (row.kind not in ("constant_speed", "one_mass", "ball")) for row in rows.values())
+    assert all((row.added > 0) == (row.kind not in ("constant_speed", "one_mass", "ball", "roller")) for row in rows.values())
     sizes = [
         rows["machine", kind].operations for kind in ("planar_rotor", "rotor, loads at one station", "rotor, loads at stations")
     ]
