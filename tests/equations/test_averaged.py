@@ -151,6 +151,20 @@ def test_ripple_of_a_point_mass_is_its_closed_form():
         np.testing.assert_allclose(field.ripple(state), swing, rtol=1e-12)
 
 
+def test_ideal_drives_turn_unbalances_at_their_acceleration():
+    machine = jv.two_mass(mass=(100.0, 80.0), stiffness=(4e4, 5e4), damping=(60.0, 60.0), link_stiffness=1e5, link_damping=50.0)
+    profile = jv.SpeedProfile(times=[0.0, 4.0], speeds=[20.0, 60.0])
+    exciters = [
+        jv.Exciter(drive=profile, unbalance=0.1, at=1, direction=-1),
+        jv.Exciter(drive=jv.ConstantSpeed(35.0), unbalance=0.2, at=2),
+        jv.Exciter(drive=profile, loads=jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5), at=2),
+    ]
+    field, zero = averaged_model(linear_model(jv.Scene(machine, exciters=exciters))), jnp.zeros(2, complex)
+    change = field(jnp.asarray(1.5), Amplitudes(zero, zero, jnp.asarray([30.0, 35.0, 20.0, 25.0]), jnp.zeros(4)))
+    np.testing.assert_allclose(change.rate[:2], [profile.rotor_acceleration(1.5), 0.0], rtol=1e-12)
+    assert float(profile.rotor_acceleration(1.5)) > 5.0
+
+
 @pytest.mark.parametrize("count", [3, 5])
 def test_motors_accelerate_by_torque_and_vibration(count):
     """Up to three exciters the accelerations at their axes are the unknowns, beyond those of the body's three coordinates."""

@@ -73,6 +73,15 @@ def test_modal_influence_coefficients_are_dense_ones(name):
         np.testing.assert_allclose(along[k], slope, atol=1e-9 * np.max(np.abs(slope)), rtol=0.0)
 
 
+def test_sizes_of_torques_are_those_after_all_changes():
+    """A motor that is switched off after 2 s has the friction of its bearings, 0.1 N m s at 60 rad/s; without friction 1."""
+    scene = chain()
+    off = [jv.SwitchedOff(scene.exciters[0].drive, at=2.0, bearing=bearing) for bearing in (0.1, 0.0)]
+    sizes = assemble_torque_balance(eqx.tree_at(lambda s: [each.drive for each in s.exciters[:2]], scene, off)).motor_torque
+    np.testing.assert_allclose(sizes[:2], [0.1 * 60.0, 1.0], rtol=1e-12)
+    assert 55.0 < float(sizes[2]) <= 60.0
+
+
 def test_search_and_margin_in_modal_form_are_those_of_matrices():
     """The slope of the margin follows from the matrices, although the search for the fold is in modal form."""
     scene: Any = chain(count=2)

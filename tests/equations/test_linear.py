@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.equations.linear import jammed_model
+from jaxvib.equations.linear import jammed_model, linear_model, lost_frequencies
 from jaxvib.equations.modal import modal_response
 
 
@@ -52,6 +52,14 @@ def test_a_carrier_that_is_free_to_drift_has_frequency_0(double):
         np.testing.assert_allclose(found, closed(0.0, 1e8), rtol=1e-3)
 
 
+def test_rounding_of_a_free_motion_is_no_lost_frequency():
+    """The motion of the platform without springs contains 1e-9 of that of the other one."""
+    model, frequencies = linear_model(two_masses(1e4, 0.0)), jnp.asarray([0.0, np.sqrt(1e4 / 10.1)])
+    shapes = jnp.asarray([[1e-9, 1.0], [1.0, 0.0]])
+    assert lost_frequencies(model, frequencies, shapes).tolist() == [False, False]
+    assert lost_frequencies(model, frequencies, shapes.at[0, 0].set(1e-2)).tolist() == [True, False]
+
+
 def test_gradients_are_right_with_asymmetric_damping():
     """The derivative of one coordinate with respect to a spring at another, d q_0/d k = -(D^-1)_03 q_3."""
     stiffness = np.diag([4e4, 5e4, 6e4, 7e4]) - 1e4 * (np.eye(4, k=1) + np.eye(4, k=-1))
@@ -78,6 +86,7 @@ def test_the_modal_form_solves_critically_damped_modes():
     damping, stiffness = (inverse.T @ np.diag(own) @ inverse for own in (2.0 * w * np.array([1.0, 0.1]), w**2))
     direction, force = jnp.asarray([1.0, 0.0]), np.array([3.0, -1.0])
     modal = modal_response(*map(jnp.asarray, (w, shapes, stiffness, damping, mass)), direction)
+    np.testing.assert_allclose(modal.norms, [np.linalg.norm(a, np.inf) for a in (stiffness, damping, mass)], rtol=1e-12)
     for omega in (5.0, 10.0, 25.0):
         dense = np.linalg.solve(stiffness + 1j * omega * damping - omega**2 * mass, force)
         np.testing.assert_allclose(modal.solve(jnp.asarray(omega), force), dense, rtol=1e-8)
