@@ -20,30 +20,34 @@ import jaxvib as jv
 from jaxvib.errors import InputError, quoted, written
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.figure import Figure
 
     from jaxvib.results.fields import Plain
     from jaxvib.results.result import Result
 
 
+_COMMA = "jaxvib.decimal_comma"
+"""Name of the option in the context of click."""
+
+DECIMAL_COMMA = click.option(
+    "--decimal-comma",
+    is_flag=True,
+    expose_value=False,
+    callback=lambda context, _, value: context.meta.update({_COMMA: value}),
+    help="Write decimal commas, and semicolons between columns, into the CSV file.",
+)
+"""Option of commands that write a CSV file, for `Output.csv` and `Output.table`."""
+
+
 def csv_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of commands that have curves: --csv, and --decimal-comma for `Output.csv`."""
-    comma = click.option(
-        "--decimal-comma",
-        is_flag=True,
-        expose_value=False,
-        callback=lambda context, _, value: context.meta.update({_COMMA: value}),
-        help="Write decimal commas, and semicolons between columns, into the CSV file.",
-    )
+    """Add the options of commands that have curves: --csv and --decimal-comma."""
     path = click.Path(path_type=Path, dir_okay=False)
-    return click.option("--csv", type=path, help="Write the curves into this CSV file.")(comma(command))
+    return click.option("--csv", type=path, help="Write the curves into this CSV file.")(DECIMAL_COMMA(command))
 
 
 SECONDS_BETWEEN_LINES = 10.0
 """Time between lines of progress, s, if the output is not a terminal."""
-
-_COMMA = "jaxvib.decimal_comma"
-"""Name of the option in the context of click."""
 
 
 def fields_of(result: object, *names: str) -> dict[str, object]:
@@ -207,6 +211,14 @@ class Output:
         self._make(path.parent, "--csv")
         write_csv(result, axis, path, display=True, decimal_comma=click.get_current_context().meta.get(_COMMA, False))
         self.files.append(str(path))
+
+    def table(self, name: str, columns: Mapping[str, np.ndarray]) -> None:
+        """Write columns by their heads to the CSV file `name` if --out is used."""
+        path = self.file(name)
+        if path is not None:
+            from jaxvib.results.csv import write_table  # slow import, which --help does not need
+
+            write_table(columns, path, decimal_comma=click.get_current_context().meta.get(_COMMA, False))
 
     def done(self, document: Mapping[str, object], text: Callable[[], str], name: str, result: Result | None = None) -> None:
         """Print the document or the text; write the document to NAME.json in the folder, and write the report.

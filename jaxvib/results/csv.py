@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import csv
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import equinox as eqx
@@ -45,14 +45,20 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
     ['rotor_speed (rad/s)', 'speed 1 (rad/s)', 'speed 2 (rad/s)', 'decay 1 (1/s)']
     """
     table = table_along(result, axis, display=display)
+    return write_table(table, path, decimal_comma=decimal_comma, unique=axis == "point")
+
+
+def write_table(
+    table: Mapping[str, np.ndarray], path: str | Path, *, decimal_comma: bool = False, unique: bool = False
+) -> Path:
+    """Write columns by their heads to a CSV file. With `unique`, equal rows that follow each other are one row, because a point
+    at which two pieces of a curve meet occurs twice."""
     path = Path(path)
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n", delimiter=";" if decimal_comma else ",")
         writer.writerow(table)
         rows = ([_shown(x, decimal_comma) for x in row] for row in zip(*table.values(), strict=True))
-        if axis == "point":  # a point at which two pieces of a curve meet occurs twice
-            rows = (row for row, _ in itertools.groupby(rows))
-        writer.writerows(rows)
+        writer.writerows((row for row, _ in itertools.groupby(rows)) if unique else rows)
     return path
 
 

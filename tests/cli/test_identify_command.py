@@ -31,9 +31,24 @@ def test_identify_from_the_command_line(typed, tmp_path):
     kept = np.loadtxt(tmp_path / "o" / "fit.csv", delimiter=",", skiprows=1)
     assert kept.shape == (400, 3) and np.std(kept[:, 1] - kept[:, 2]) < 1.1e-3
 
-    words = ["identify", "swing.csv", "--mass", "300 g", "--length", "25 cm", "--inertia", "0.00625"]
+    (tmp_path / "swing.csv").write_text((tmp_path / "swing.csv").read_text().replace(",", ";").replace(".", ","))
+    words = [
+        "identify",
+        "swing.csv",
+        "--decimal-comma",
+        "--out",
+        "p",
+        "--mass",
+        "300 g",
+        "--length",
+        "25 cm",
+        "--inertia",
+        "0.00625",
+    ]
     code, out, err = typed(*words)
     assert code == 0 and "mu1, N m s" in out and "found: the fit explains" in out
+    lines = (tmp_path / "p" / "fit.csv").read_text().splitlines()
+    assert lines[0] == "time (s);angle (rad);fit (rad)" and lines[2].startswith("0,05") and lines[2].count(";") == 2
 
 
 @pytest.mark.parametrize(

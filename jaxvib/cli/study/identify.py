@@ -10,7 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.cli.output import fields_of, write_file
+from jaxvib.cli.output import DECIMAL_COMMA, fields_of, write_file
 from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ def _with_options(tables: Tables, given: Mapping[str, str | bool | None]) -> Tab
 )
 @click.option("--air/--no-air", "identify__air", default=None, help="Identify the quadratic drag of the air as well.")
 @click.option("--torque/--no-torque", "identify__torque", default=None, help="Identify a constant torque as well.")
+@DECIMAL_COMMA
 @shared
 def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Identify numbers of a machine from recorded runs, or the friction of a bearing from a recorded swing.
@@ -80,10 +81,8 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     pendulum, swing, options = measurement_from_tables(_with_options(tables, given), record.parent)
     found = identify_bearing(pendulum, swing, **options)
     output.picture("record.png", found.plot)
-    data = output.file("fit.csv")
-    if data is not None:
-        columns = np.stack([swing.time, swing.angle, found.fitted], axis=1)
-        np.savetxt(data, columns, fmt="%.9g", delimiter=",", header="time (s),angle (rad),fit (rad)", comments="")
+    columns = {"time (s)": swing.time, "angle (rad)": swing.angle, "fit (rad)": found.fitted}
+    output.table("fit.csv", {head: np.asarray(values) for head, values in columns.items()})
     decrement = found.decrement
     document = {
         "status": found.status_name,
