@@ -36,12 +36,17 @@ from jaxvib.steady.orbits.whole import (
     periodic_scene,
     residual_of,
 )
+from jaxvib.units import Bounds
 
 _STEP = 0.1
 """Distance between two points of a branch: change of the phase, rad, or of the speed in units of `_SPEED_PER_STEP`."""
 
 _SPEED_PER_STEP = 0.1
 """Relative change of the speed that counts as a phase of 1 rad, if no phase is free."""
+
+_SAME_VALUE = 1e-4
+"""Relative difference of the parameter's value at the first point of the branch from that of the scene, above which the motion
+does not depend on the parameter."""
 
 _MAX_BRANCH_POINTS = 70
 """Largest number of points of a branch up to its fold; their phases cover more than a full turn."""
@@ -51,7 +56,8 @@ class LimitStatus(eqx.Enumeration):
     """Outcomes of a search for the limit of synchronization. The value of each member is the message shown to the user."""
 
     found = "the motion ends at this fold and does not exist beyond it"
-    not_found = "no fold was found in this direction: the motion could not be followed to a fold"
+    not_found = "no fold was found among the allowed values in this direction: the motion could not be followed to a fold"
+    no_effect = "the parameter changes neither the phases nor the speed of this motion: there is no fold over it"
 
 
 class SynchronizationLimit(Result):
@@ -64,7 +70,7 @@ class SynchronizationLimit(Result):
     - `status`: a `LimitStatus` for each end
     - `value` (2,) of the parameter `over`, SI; NaN without a fold
     - `speed` (2,), rad/s, and `phases` (2, N), rad, of the motion at each end, see `SynchronousOrbit`
-    - `start`: value of the parameter in the scene, SI
+    - `start`: value of the parameter in the scene, SI, and `stable`: True if the motion is stable at this value
     - `branch_values`, `branch_phases`, rad, and `branch_speeds`, rad/s, (P,): value of the parameter, phase of one exciter and
       speed along the branch
     """
@@ -76,6 +82,7 @@ class SynchronizationLimit(Result):
     speed: np.ndarray = eqx.field(metadata=in_unit("rad/s", "end"))
     phases: np.ndarray = eqx.field(metadata=in_unit("rad", "end", "exciter"))
     start: np.ndarray = eqx.field(metadata=in_unit(""))
+    stable: np.ndarray = eqx.field(metadata=in_unit(""))
     branch_values: np.ndarray = eqx.field(metadata=in_unit("", "branch_point"))
     branch_phases: np.ndarray = eqx.field(metadata=in_unit("rad", "branch_point"))
     branch_speeds: np.ndarray = eqx.field(metadata=in_unit("rad/s", "branch_point"))
@@ -84,7 +91,8 @@ class SynchronizationLimit(Result):
     def summary(self) -> str:
         """Return both ends of the range as text."""
         low, high = (float(x) for x in self.value)
-        return f"{self.over} from {low:.8g} to {high:.8g} (now {float(self.start):.8g})\n{self.message}"
+        now = f"{float(self.start):.8g}, {'stable' if self.stable else 'not stable'}"
+        return f"{self.over} from {low:.8g} to {high:.8g} (now {now})\n{self.message}"
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
@@ -114,7 +122,8 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
     - `regime`: a motion with `speed` and `phases`, such as a `SynchronousOrbit` of the scene
     - `over`: name of the parameter, such as "exciters[1].drive.speed", "exciters[0].unbalance"
 
-    **Returns** `SynchronizationLimit`; an end without a fold is NaN and has the status "not_found".
+    **Returns** `SynchronizationLimit`; an end without a fold is NaN and has the status "not_found" or "no_effect". The motion
+    can lose its stability before its fold.
 
     **Raises** `InputError` for a name that the scene does not have and for scenes without a free phase; `ComputationError` if
     the scene has no such motion.
@@ -159,15 +168,18 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
         return new if exciter is not None else new._replace(slope=new.slope * unit * _SPEED_PER_STEP)
 
     first = at(near, 0.0 if exciter is None else float(near.phases[exciter]))
+    has_effect = bool(first.is_met) and abs(float(first.value) - value) <= _SAME_VALUE * max(abs(value), 1e-6)
+    first = first if has_effect else near
     rising = 1.0 if float(first.slope) > 0.0 else -1.0
-    ends = [_fold(at, first, towards) for towards in (-rising, rising)]
-    branch = [*reversed(ends[0][1]), first, *ends[1][1]]
+    ends = [_fold(at, first, towards, number.spec.bounds) if has_effect else (None, []) for towards in (-rising, rising)]
+    branch, failure = [*reversed(ends[0][1]), first, *ends[1][1]], "not_found" if has_effect else "no_effect"
     return SynchronizationLimit(
-        status=member(LimitStatus, np.array(["not_found" if end is None else "found" for end, _ in ends])),
+        status=member(LimitStatus, np.array([failure if end is None else "found" for end, _ in ends])),
         value=np.array([np.nan if end is None else float(end.value) for end, _ in ends]),
         speed=np.array([np.nan if end is None else float(end.speed) for end, _ in ends]),
         phases=np.stack([np.full_like(first.phases, np.nan) if end is None else end.phases for end, _ in ends]),
         start=np.asarray(value),
+        stable=np.asarray(orbit.stable),
         branch_values=np.array([float(point.value) for point in branch]),
         branch_phases=np.array([float(point.phases[exciter or 0]) for point in branch]),
         branch_speeds=np.array([float(point.speed) for point in branch]),
@@ -204,12 +216,15 @@ class _Point(NamedTuple):
     along: np.ndarray
 
 
-def _fold(at: Callable[[_Point, float], _Point], first: _Point, towards: float) -> tuple[_Point | None, list[_Point]]:
-    """Return the fold in one direction along the branch, or None, and the points of the branch up to it."""
+def _fold(
+    at: Callable[[_Point, float], _Point], first: _Point, towards: float, bounds: Bounds
+) -> tuple[_Point | None, list[_Point]]:
+    """Return the fold in one direction along the branch within the `bounds` of the parameter, or None, and the points of the
+    branch up to it."""
     points, here, step = [], first, _STEP
     while len(points) < _MAX_BRANCH_POINTS and step > 1e-3 * _STEP:
         new = at(here, float(here.along) + towards * step)
-        if not new.is_met:
+        if not (new.is_met and bounds.allow(new.value)):
             step /= 4.0
             continue
         points.append(new)

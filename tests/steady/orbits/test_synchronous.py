@@ -10,6 +10,8 @@ from scipy.optimize import fsolve
 
 import jaxvib as jv
 from jaxvib.results.status import status_names
+from jaxvib.steady.orbits.limit import _fold, _Point
+from jaxvib.units import Bounds
 
 G = 9.81
 
@@ -353,6 +355,28 @@ def test_limit_over_the_speed_of_an_ideal_drive_is_its_fold():
         assert found == ["found", "not_converged"]
     with pytest.raises(jv.InputError, match="the speed of one of several ideal drives"):
         jv.synchronization_limit(scene_at(100.0, jv.ConstantSpeed(100.0)), start, over=over)
+
+
+def test_limit_of_an_unstable_motion_and_without_effect_says_so():
+    """Equal springs across at the height of the centre: neither of them changes the phases of the mirrored motion."""
+    scene = symmetric([(-0.3, 0.0), (0.3, 0.0)], directions=(1, -1))
+    over = "machine.supports[0].damping[0]"
+    limit = jv.synchronization_limit(scene, jv.synchronous_orbit(scene, phases=[0.0, 0.0], points=17), over=over)
+    assert list(status_names(limit.status)) == 2 * ["no_effect"] and np.all(np.isnan(limit.value)) and not limit.stable
+    assert ", not stable)" in limit.summary() and "changes neither the phases nor the speed" in limit.summary()
+
+
+def test_limits_are_allowed_values():
+    """The parameter is cos(phase) - 0.5 along the branch: a fold at 0.5, and one at -1.5."""
+
+    def at(_, along):
+        numbers = (np.cos(along) - 0.5, 1.0, np.zeros(2), -np.sin(along), True, along)
+        return _Point(*map(np.asarray, numbers))
+
+    ends = [_fold(at, at(None, 1.0), towards, Bounds(0.0)) for towards in (-1.0, 1.0)]
+    np.testing.assert_allclose(ends[0][0].value, 0.5, rtol=1e-12)
+    assert ends[1][0] is None and 0.0 <= float(ends[1][1][-1].value) < 1e-3
+    np.testing.assert_allclose(_fold(at, at(None, 1.0), 1.0, Bounds())[0].value, -1.5, rtol=1e-12)
 
 
 def test_limit_needs_a_number_and_a_free_motion(general, orbit):
