@@ -421,13 +421,15 @@ def _table(
     values: np.ndarray,
     other: tuple[list[float], list[float]],
 ) -> tuple[Row, ...]:
-    """Return the rows of free parameters, of further columns of catalogues and of quantities, before and after the search."""
+    """Return the rows of free parameters, of further columns of catalogues, of tied parameters and of quantities, before and
+    after the search."""
     table = []
-    for number in (*space.free, *(column.target for column in space.columns)):
+    changed = [(number, "") for number in (*space.free, *(column.target for column in space.columns))]
+    for number, mark in changed + [(tie.target, " (tied)") for tie in space.ties]:
         start, end = (np.asarray(number.read(each)) for each in (space.scene, scene))
         is_new = number.spec.zero_is_absent & (start == 0.0) & (end != 0.0)
         for word, new, a, b in zip(number.words(space.scene), is_new, start, end, strict=True):
-            table.append(Row(f"{word} (new)" if new else word, number.unit, float(a), float(b), math.nan, math.nan))
+            table.append(Row(f"{word}{' (new)' * bool(new)}{mark}", number.unit, float(a), float(b), math.nan, math.nan))
     if space.counts:
         counts = float(space.scene.loads.count), float(scene.loads.count)
         table.append(Row("number of loads", "", *counts, math.nan, math.nan))

@@ -201,6 +201,14 @@ def test_added_springs_are_marked_new():
     ]
 
 
+def test_tied_parameters_are_in_the_table():
+    ties = {"machine.stiffness[1]": ("machine.stiffness[0]", 0.5)}
+    space = DesignSpace(SCENE, {"machine.stiffness[0]": (1e4, 9e4)}, ties=ties)
+    rows = _table(space, space.at(jnp.array([0.5])), [], np.zeros((2, 0)), ([], []))
+    assert [row.what for row in rows] == ["stiffness of support 1", "stiffness of support 2 (tied)"]
+    assert rows[1].unit == "N/m" and np.isclose(rows[1].after, 0.5 * rows[0].after)
+
+
 def test_the_mode_of_a_search_is_that_of_its_objective():
     force, whose, mass = foundation_force(mode=3), amplitude(mode=4), total_mass()
     assert _motion_of(SPACE, force, [whose < 1.0]) == 3 and _motion_of(SPACE, -force / mass, []) == 3
