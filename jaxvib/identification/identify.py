@@ -24,7 +24,7 @@ from jaxvib.identification.directions import (
 )
 from jaxvib.identification.fit import Fitted, unknown_count
 from jaxvib.identification.jammed.start import first_states, with_first_motion
-from jaxvib.identification.problem import Problem, build_problem, has_supports, natural
+from jaxvib.identification.problem import Problem, build_problem, damped_modes, has_supports
 from jaxvib.identification.profile_likelihood import QUANTILE, profile_intervals
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.identification.start import track_orders
@@ -296,7 +296,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         known.covariance,
         known.undetermined,
         known.errors,
-        lambda scene: np.concatenate(natural(scene)),
+        lambda scene: np.concatenate(damped_modes(scene)),
     )
     logarithmic = known.logarithmic & ~known.vanished
     spreads = np.sqrt(np.maximum(np.diagonal(known.covariance), 0.0))
@@ -319,7 +319,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         notes.append(f"{known.names[i]} is not distinguishable from 0; it is at most {estimates[i].high:.3g} {unit}".rstrip())
     return MachineFit(
         status=status,
-        notes=(*problem.notes, *notes, *untouched_stops(fitted), *coverage_notes(fitted, *natural(fit_scene))),
+        notes=(*problem.notes, *notes, *untouched_stops(fitted), *coverage_notes(fitted, *damped_modes(fit_scene))),
         scene=fit_scene,
         names=known.names,
         units=tuple(find_number(scene, name, "unknown").unit for name in known.names),

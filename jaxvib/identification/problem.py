@@ -249,7 +249,7 @@ def is_of_drive(number: NamedNumber) -> bool:
 
 
 def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs: Sequence[MeasuredRun]) -> None:
-    """Raise if numbers of a drive are unknown that no record determines."""
+    """Raise if no record determines an unknown number of a drive."""
     drive, measured = scene.exciters[0].drive, all(run.of_kind(*ROTOR_KINDS) for run in runs)
     if len(scene.exciters) == 1 and not drive.ideal and not drive.state_units() and measured and not is_nonlinear(scene):
         return
@@ -267,7 +267,7 @@ def _with_reduced_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
     """Return the run with the sampling rate that its highest frequency needs if it is long, otherwise the same run.
 
     The natural frequencies are increased by a margin, because they are computed with the first values of the unknowns. Contacts
-    with a stop change accelerations faster than that.
+    with a stop change accelerations faster than this frequency.
     """
     has_stops = any(isinstance(effect, Stop) for effect in scene.effects)
     if has_stops or max(time.size for time in run.times.values()) < MIN_SAMPLES:
@@ -280,7 +280,7 @@ def _with_reduced_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
         drives = [exciter.drive for exciter in scene.exciters if exciter.drive.ideal]
         speeds = [jax.vmap(lambda t, drive=drive: drive.rotor_speed(t, None))(times) for drive in drives]
         fastest = float(np.max(np.abs(np.asarray(speeds)), initial=0.0))
-    return decimated(run, max(fastest, _FREQUENCY_MARGIN * float(np.max(natural(scene)[0], initial=0.0)), 1e-300))
+    return decimated(run, max(fastest, _FREQUENCY_MARGIN * float(np.max(damped_modes(scene)[0], initial=0.0)), 1e-300))
 
 
 def has_loads(scene: Scene) -> bool:
@@ -326,7 +326,7 @@ def _require_included(scene: Scene, runs: Sequence[MeasuredRun]) -> None:
         kind, terms = f"effects.{effect.kind}", effect.terms()
         is_support = isinstance(effect, Stop) or all(isinstance(term, SupportForce) and term.is_smooth for term in terms)
         if is_support and (has_loads(scene) or not is_alone):
-            raise InputError(kind, "is a nonlinear support; identify needs a scene with one exciter without loads then")
+            raise InputError(kind, "is a nonlinear support; identify includes it only in scenes with one exciter without loads")
         if is_support and any(run.of_kind("force") for run in runs):
             raise InputError(
                 kind,
@@ -395,14 +395,15 @@ def _changed(scene: Scene, run: MeasuredRun) -> Scene:
 
 
 def with_angle_errors(problem: Problem, runs: Sequence[bool]) -> Problem:
-    """Return the problem with the errors of the rotor's angle in the marked `runs` as further unknowns, standard normal."""
+    """Return the problem with the errors of the rotor's angle in the marked `runs` as further unknowns, which have
+    the standard normal distribution."""
     first, samples, left_out = problem.unknowns.count, list(problem.runs), list(problem.angle_errors)
     count = 0
     for k, (of_run, rotors, is_marked) in enumerate(zip(problem.runs, problem.rotors, runs, strict=True)):
         if is_marked:
-            place, errors = first + count, max(rotor.error_count for rotor in rotors)
+            first_error, errors = first + count, max(rotor.error_count for rotor in rotors)
             drives = tuple(rotor.drive for rotor in rotors)
-            samples[k] = dataclasses.replace(of_run, drives=drives, errors=(place, errors))
+            samples[k] = dataclasses.replace(of_run, drives=drives, errors=(first_error, errors))
             left_out[k], count = max(rotor.left_out for rotor in rotors), count + errors
     return problem._replace(
         unknowns=dataclasses.replace(problem.unknowns, errors=count),
@@ -445,9 +446,9 @@ def _samples(
     bounds = np.zeros((count, len(channels)), np.int8)
     for k, channel in enumerate(channels):
         values, clipped = run.values[channel.name], run.clipped[channel.name]
-        place = (run.times[channel.name] - origin) / step - first
-        index = np.rint(place).astype(int)
-        if np.max(np.abs(place - index)) > _MAX_UNEVENNESS:
+        position = (run.times[channel.name] - origin) / step - first
+        index = np.rint(position).astype(int)
+        if np.max(np.abs(position - index)) > _MAX_UNEVENNESS:
             raise InputError(
                 f"{run.source}: channel {channel.name!r}",
                 f"is not sampled on the even grid of the others ({1.0 / step:.6g} Hz); resample it to this grid",
@@ -584,7 +585,7 @@ def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
     return model.mass, model.carrier.damping, model.carrier.stiffness
 
 
-def natural(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def damped_modes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return the natural frequencies (k,) rad/s and damping ratios (k,) of the damped modes with complex eigenvalues."""
     mass, damping, stiffness = (np.asarray(each) for each in _matrices(scene))
     nd = mass.shape[0]

@@ -90,19 +90,19 @@ class _Profile:
         return trial.cost + known_cost - self.floor
 
     def _in_valley(self, problem: Problem, x: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the unknowns of a nonlinear motion after a few steps of the method of Gauss and Newton with the derivatives
+        """Return the unknowns of a nonlinear motion after a few steps of the Gauss-Newton method with the derivatives
         at the fit. The valley of the cost is curved, and the unknowns of the quadratic form are outside it at a large
         distance."""
         assert self.columns is not None
         slopes, p, best, last = self.columns[:, :-1], x.size, (x, linear), math.inf
         for _ in range(_VALLEY_STEPS):
-            left = nonlinear_differences(problem, x, linear)
-            cost = nonlinear_cost(problem, x, linear, left)
+            differences = nonlinear_differences(problem, x, linear)
+            cost = nonlinear_cost(problem, x, linear, differences)
             if not cost < last - _SMALL_REDUCTION:
                 break
             best, last = (x, linear), cost
             prior, gradient = prior_equations(problem, x, linear)
-            step = solved(slopes.T @ slopes + prior, slopes.T @ left + gradient)
+            step = solved(slopes.T @ slopes + prior, slopes.T @ differences + gradient)
             x, linear = x + step[:p], linear + step[p:]
         return best
 
@@ -148,7 +148,7 @@ class _Profile:
 
 
 def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[float, float]]:
-    """Return the distances of the ends of the intervals from the fitted values, by name, for the numbers of which the cost
+    """Return the distances of the ends of the intervals from the fitted values, by name, for the numbers for which the cost
     is not a quadratic function. A distance is a change of the number's entry of x, or of the logarithm of an unbalance.
 
     A number that is not distinguishable from 0 has the lower distance minus infinity. Undetermined numbers are left out.

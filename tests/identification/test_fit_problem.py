@@ -15,7 +15,7 @@ from jaxvib.identification.problem import (
     Problem,
     _delay_taps,
     build_problem,
-    natural,
+    damped_modes,
     read_known,
     with_angle_errors,
     with_noise,
@@ -376,7 +376,7 @@ def test_natural_modes_of_the_damped_machine():
     one, zero = np.eye(2), np.zeros((2, 2))
     poles = eig(np.block([[zero, one], [-stiffness, -damping]]), np.block([[one, zero], [zero, mass]]))[0]
     poles = sorted(poles[poles.imag > 0.0], key=abs)
-    frequency, ratio = natural(scene)
+    frequency, ratio = damped_modes(scene)
     np.testing.assert_allclose(frequency, np.abs(poles), rtol=1e-9)
     np.testing.assert_allclose(ratio, -np.real(poles) / np.abs(poles), rtol=1e-7)
 

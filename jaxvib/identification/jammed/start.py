@@ -31,7 +31,7 @@ from jaxvib.identification.fit import (
     unknown_count,
 )
 from jaxvib.identification.jammed.motion import ShiftedDrive, closed_motion, linearized, weighted_columns
-from jaxvib.identification.problem import Problem, channel_sizes, natural, with_noise
+from jaxvib.identification.problem import Problem, channel_sizes, damped_modes, with_noise
 from jaxvib.identification.response import Unknowns, model_states
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
@@ -120,7 +120,7 @@ def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
 def _stiffnesses_of_jam(problem: Problem, jams: Sequence[_Jam]) -> np.ndarray | None:
     """Return x with the unknown stiffnesses multiplied by one number, such that the natural frequency nearest the speed of the
     loads is slightly above this speed, as in a jam; None if no stiffness is unknown, or if the number is nearly 1."""
-    speed, frequency = float(np.median(np.abs(jams[0].speed))), natural(problem.scene)[0]
+    speed, frequency = float(np.median(np.abs(jams[0].speed))), damped_modes(problem.scene)[0]
     names = [number.name for number in problem.unknowns.numbers]
     own = [k for k in positive_indices(problem) if "stiffness" in names[k] and problem.precisions[k] == 0.0]
     if not own or not frequency.size:

@@ -1,9 +1,9 @@
 """First values of a motion on nonlinear supports: the records guide the motion.
 
 At each sample, the state of the model is changed by a constant matrix times the difference between recorded and computed
-readings, unless a stop presses. The motion then stays near the recorded one, contacts occur when they occurred in the record,
-and the differences are nearly linear functions of errors of the unknowns. The matrix is that of the Kalman filter of the
-machine without nonlinear supports, whose velocities change at random at each sample.
+readings, except during a contact with a stop. The motion then stays near the recorded one, contacts occur when they occurred in
+the record, and the differences are nearly linear functions of errors of the unknowns. The matrix is that of the Kalman filter
+of the machine without nonlinear supports, whose velocities change at random at each sample.
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ from jaxvib.machine.effects.supports import Stop
 from jaxvib.numerics.noise import Noise
 
 _STRENGTH = 0.3
-"""Standard deviation of the random changes of the velocities at a sample, relative to the largest velocities, for readings with
-errors of their own size."""
+"""Standard deviation of the random changes of the velocities at a sample, relative to the largest velocities. The errors of the
+readings are assumed to be as large as the readings."""
 
 _DECAY = 0.999
-"""Factor on the motion in each sample of the filter. Without it the filter does not exist for a free mass between stops, whose
-displacement no accelerometer observes."""
+"""Factor by which the filter reduces the state at each sample. Without it the filter does not exist for a free mass between
+stops, whose displacement no accelerometer observes."""
 
 _OPEN_GAP = 1.1
 """First value of a gap that is not touched, relative to the largest displacement."""
 
 _SAME_COST = 1.1
-"""Cost of a motion without contacts, relative to that of one with contacts, below which it is the better one."""
+"""Cost of a motion without contacts, relative to that of a motion with contacts, below which the motion without contacts is
+chosen."""
 
 
 def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
@@ -98,7 +99,8 @@ def _guide(problem: Problem, r: int, x: np.ndarray, linear: np.ndarray) -> np.nd
 def _with_open_stops(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
     """Return x with unknown gaps that are so large that the linear response does not touch the stops.
 
-    A stop that no run touches could also be a very soft one, and a fit from a gap that is too small would find that.
+    A stop that no run touches has the same effect as a very soft stop. A fit from a gap that is too small would therefore end
+    at a very soft stop.
     """
     x, names = x.copy(), [number.name for number in problem.unknowns.numbers]
     paths, nd = [], len(problem.scene.machine.structure().coordinates)

@@ -13,7 +13,7 @@ from repeated_records.jammed import RADIUS, TIMES, TRUTH, bound, clean, first_st
 import jaxvib as jv
 from jaxvib.identification.jammed.motion import closed_motion, linearized
 from jaxvib.identification.jammed.start import _stiffnesses_of_jam, with_first_motion
-from jaxvib.identification.problem import build_problem, natural, with_noise
+from jaxvib.identification.problem import build_problem, damped_modes, with_noise
 from jaxvib.numerics.noise import Noise
 
 UNKNOWN = ["machine.stiffness", "machine.link_stiffness", "exciters[0].unbalance", "loads.mass", "loads.drag"]
@@ -115,7 +115,7 @@ def test_first_values_agree_with_a_record_without_noise(stiffness):
 def test_stiffnesses_of_a_jam_are_below_the_resonance():
     problem, jams = jammed_problem(1.2), [SimpleNamespace(speed=np.array([62.0, 61.0, 62.0]))]
     x = _stiffnesses_of_jam(problem, jams)
-    second = natural(problem.scene)[0][1]
+    second = damped_modes(problem.scene)[0][1]
     np.testing.assert_allclose(x[:3], 2.0 * np.log(1.04 * 62.0 / second), rtol=1e-12)
     assert not np.any(x[3:])
     assert _stiffnesses_of_jam(problem, [SimpleNamespace(speed=np.array([second / 1.04]))]) is None
