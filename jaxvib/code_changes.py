@@ -1,6 +1,6 @@
 """Comparison of the code of this process with the source files.
 
-The keys of stored programs contain a digest of the source files. The code of a process differs from this digest if a file was
+The keys of stored programs contain a digest of the source files. The code of a process differs from these files if a file was
 edited after the import of jaxvib, or if a function, a constant or a member of a class was replaced (by a mock, a notebook, a
 patch). Such a process must neither store programs nor read stored ones.
 

@@ -75,7 +75,7 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], error_levels: Sequence[
         Line2D([], [], ls=":", lw=1.0, marker="o", ms=11, mfc="none", color="black"),
         Patch(color=_FLOOR),
     ]
-    extra_labels = ["cheapest within " + ", ".join(f"{error:.0e}" for error in error_levels), "error of the reference"]
+    extra_labels = ["fastest within " + ", ".join(f"{error:.0e}" for error in error_levels), "error of the reference"]
     if ax is None:
         labels, place = [*names, *extra_labels], "outside upper left"
         figure.legend(handles, labels, loc=place, ncols=3 * columns, frameon=False, fontsize="small")

@@ -1,4 +1,4 @@
-"""Names and units in the heads of columns and in the descriptions of channels, in the spellings of laboratories."""
+"""Names and units in the headers of columns and in the descriptions of channels, in the spellings of laboratories."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _SPELLINGS: dict[str, dict[str, float]] = {
         **dict.fromkeys(("khz", "ks/s", "ksa/s", "ksps", "ksamples/s"), 1e3),
     },
 }
-"""Units in the heads of columns by the SI unit, in lower case; heads may be in upper or lower case."""
+"""Units in the headers of columns by the SI unit, in lower case; headers may be in upper or lower case."""
 
 _MULTIPLE = re.compile(r"^(\d+\.?\d*(?:[eE][+-]?\d+)?)\s+([^\s\d/].*)$")
 """Pattern of a multiple of a unit, such as "50 kN"."""
@@ -65,7 +65,7 @@ _TAIL = re.compile(r"^(?P<name>.+?)[\s_.:-]+(?P<tail>[^\W_]+|°)$")
 
 
 def unit_factor(unit: str, si: str) -> float | None:
-    """Return the factor from a unit in the head of a column, or from a multiple of a unit, to an SI unit.
+    """Return the factor from a unit in the header of a column, or from a multiple of a unit, to an SI unit.
 
     The result is None for a unit of another dimension and for an unknown unit.
 

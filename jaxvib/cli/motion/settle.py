@@ -90,7 +90,7 @@ def _modes_of(run: jv.Run) -> list[int] | None:
     if not run.scene.is_plain:
         return None
     if not (mode := int(run.regime.mode)):
-        raise InputError("--tolerance", f"is for jams; these loads are {run.regime.label.replace('_', ' ')}, leave it out")
+        raise InputError("--tolerance", f"is for jams; these loads are {run.regime.label.replace('_', ' ')}; leave it out")
     return [mode]
 
 

@@ -33,9 +33,8 @@ class Rotor(Machine):
         A psi'' - C w theta' + b2 z' + b3 psi' + c2 z + c3 psi = m_z
 
     w is the rotor speed; f_y and f_z are the forces, m_y and m_z the moments that increase theta and psi. If the supports have
-    other values vertically, the equations of z and psi have other coefficients b
-    and c. A point at the distance s along the axis moves by (y + s theta, z + s psi). A load acts at its station s_j. z is the
-    displacement from static equilibrium.
+    other values vertically, the equations of z and psi have other coefficients b and c. A point at the distance s along the
+    axis moves by (y + s theta, z + s psi). A load acts at its station s_j. z is the displacement from static equilibrium.
 
     **Attributes**
 
@@ -98,10 +97,10 @@ class Rotor(Machine):
         return dataclasses.replace(carrier, **changed) if changed else carrier
 
     def mount(self, at: Place = None) -> Mount:
-        """Return the motion of the exciter's station.
+        """Return the mount at the exciter's station.
 
-        If each load has a separate station, return the motion of the centre of mass and the tilt of the axis, with the station
-        of each load as its lever.
+        If each load has a separate station, the rows are those of the centre of mass and of the tilt of the axis, and the
+        station of each load is its lever.
         """
         skew = np.zeros((4, 4))
         skew[2, 3], skew[3, 2] = 1.0, -1.0

@@ -37,7 +37,7 @@ class HarmonicConvergence(Result):
     - `omega` (jams,): load speeds, rad/s
     - `error` (n, jams): relative error of the rotor speed, by comparison with the jam that is computed with twice the
       largest number of collocation points
-    - `estimate` (n, jams): estimate of this error, which needs no more accurate jam
+    - `estimate` (n, jams): estimate of this error, computed without a more accurate jam
     """
 
     status = Computed.done
@@ -80,7 +80,7 @@ def harmonic_convergence(
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                         rho=1.0, eps=0.05, beta=1.0, speed=3.0)
     >>> found = harmonic_convergence(form.scene(), [0.97], points=(4, 8))
-    >>> [bool(error < most) for error, most in zip(found.error[:, 0], (1e-4, 1e-10))]
+    >>> [bool(error < limit) for error, limit in zip(found.error[:, 0], (1e-4, 1e-10))]
     [True, True]
 
     Source: this package; the jams are those of `jam_orbit`.
