@@ -1,4 +1,4 @@
-"""jaxvib animate, sketch."""
+"""Commands `animate` and `sketch` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib new, simulate."""
+"""Commands `new` and `simulate` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib criterion, balance."""
+"""Commands `criterion` and `balance` of jaxvib."""
 
 from __future__ import annotations
 

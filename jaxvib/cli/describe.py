@@ -1,4 +1,4 @@
-"""jaxvib describe."""
+"""Command `describe` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib explore."""
+"""Command `explore` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib export."""
+"""Command `export` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib modes."""
+"""Command `modes` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib optimize."""
+"""Command `optimize` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib whirl."""
+"""Command `whirl` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib regimes."""
+"""Command `regimes` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib response."""
+"""Command `response` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib run-up, run-up-map."""
+"""Commands `run-up` and `run-up-map` of jaxvib."""
 
 from __future__ import annotations
 

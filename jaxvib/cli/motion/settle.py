@@ -1,4 +1,4 @@
-"""jaxvib settle, envelope, growth."""
+"""Commands `settle`, `envelope` and `growth` of jaxvib."""
 
 from __future__ import annotations
 

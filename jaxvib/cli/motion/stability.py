@@ -1,4 +1,4 @@
-"""jaxvib stability-map, onset."""
+"""Commands `stability-map` and `onset` of jaxvib."""
 
 from __future__ import annotations
 

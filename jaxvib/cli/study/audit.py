@@ -1,4 +1,4 @@
-"""jaxvib audit."""
+"""Command `audit` of jaxvib."""
 
 from __future__ import annotations
 

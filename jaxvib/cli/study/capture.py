@@ -1,4 +1,4 @@
-"""jaxvib capture."""
+"""Command `capture` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib cost."""
+"""Command `cost` of jaxvib."""
 
 from __future__ import annotations
 

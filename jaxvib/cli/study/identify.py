@@ -1,4 +1,4 @@
-"""jaxvib identify."""
+"""Command `identify` of jaxvib."""
 
 from __future__ import annotations
 

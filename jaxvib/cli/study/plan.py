@@ -1,4 +1,4 @@
-"""jaxvib plan."""
+"""Command `plan` of jaxvib."""
 
 from __future__ import annotations
 

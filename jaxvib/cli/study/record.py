@@ -1,4 +1,4 @@
-"""jaxvib record."""
+"""Command `record` of jaxvib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""jaxvib sweep, show."""
+"""Commands `sweep` and `show` of jaxvib."""
 
 from __future__ import annotations
 
