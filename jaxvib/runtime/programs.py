@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.code_changes import code_state
-from jaxvib.runtime.compat import inner_value, traced
+from jaxvib.runtime.compat import evaluating, inner_value, traced
 from jaxvib.runtime.devices import arrays_on_device
 from jaxvib.runtime.operations import pruned
 from jaxvib.runtime.primitive import CAN_DEFINE_PRIMITIVES, is_zero, primitive, zero_of
@@ -308,6 +308,8 @@ def _evaluate(*arrays: Array, call: _CallSignature) -> list[Array]:
 
 
 def _differentiate(arrays: Sequence[Array], tangents: Sequence[Any], *, call: _CallSignature) -> tuple[list[Array], list[Any]]:
+    with evaluating():  # JAX passes a Python number as an object that is no array, and a result may contain it unchanged
+        arrays = [x if eqx.is_array(x) else jnp.asarray(x) for x in arrays]
     active = tuple(not is_zero(tangent) for tangent in tangents)
     nonzero = [tangent for is_active, tangent in zip(active, tangents, strict=True) if is_active]
     if all(not traced(tangent) or _is_simple(tangent) for tangent in nonzero):

@@ -161,6 +161,17 @@ def test_whole_numbers_have_no_tangent(asked):
     assert slopes.turns.dtype == jax.dtypes.float0
 
 
+@programs.cached
+def with_argument(x, factor):
+    return x, factor * x
+
+
+def test_a_number_that_is_returned_unchanged_has_a_derivative():
+    for derivative in (jax.grad, jax.jacfwd):
+        assert derivative(lambda x: with_argument(x, 3.0)[1])(2.0) == 3.0
+        assert derivative(lambda x: with_argument(x, 3.0)[0])(2.0) == 1.0
+
+
 def test_a_reverse_derivative_that_was_not_asked_for_before(asked):
     """The forward half is on disk, the backward half is not: it is traced from the function again, or from its result."""
     function, forget = asked
