@@ -87,7 +87,7 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
     return PIController(tolerance=tolerance, unit=units, relative=motion.pack(spread(relative)), max_steps=control.max_steps)  # pyright: ignore[reportCallIssue]
 
 
-def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
+def with_jump_times(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
     """Return a controller whose steps end at the jumps of the drives' accelerations; a controller of given steps is
     unchanged."""
     jump_ts = [t for exciter in scene.exciters for t in exciter.drive.jump_ts()]
@@ -124,8 +124,8 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
 
 
 def angle_wrapping(scene: Scene, dtype: np.dtype) -> tuple[bool, bool]:
-    """Return two flags: True if the integration keeps angles within one turn (single precision); True if the same number of
-    turns is subtracted from a coordinate of all loads of an exciter (loads in contact)."""
+    """Return two flags. The first is True if the integration keeps angles within one turn (single precision), the second if it
+    then subtracts the same number of turns from the angles of all loads of an exciter (loads in contact)."""
     return dtype.itemsize < 8, has_term(scene.all_effects, LoadInteraction)
 
 
@@ -177,7 +177,7 @@ def integrate(
         y0=motion.pack(state),
         args=motion.args,
         saveat=diffrax.SaveAt(subs=saves),
-        controller=on_jumps(scene, controller),
+        controller=with_jump_times(scene, controller),
         adjoint=plan.adjoint,
         max_steps=plan.max_steps,
         progress=plan.progress_meter,

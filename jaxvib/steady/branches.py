@@ -20,7 +20,7 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.branch_plot import branch_summary, plot_branch
-from jaxvib.steady.jams.folds import Folds, fold_points, spread_points
+from jaxvib.steady.jams.folds import Folds, grid_near_poles, resampled_grid
 from jaxvib.steady.jams.jam import STABILITY_CRITERION, AbstractJam, Jam, branch_points
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, count, number
@@ -146,7 +146,7 @@ def branches(
     """
     scene = validate_scene(scene)
     if exact:
-        from jaxvib.steady.orbits.diagram import exact_branches  # imports the time integrator, which others do not need
+        from jaxvib.steady.orbits.diagram import exact_branches  # imports the time integrator, which only exact branches need
 
         return exact_branches(scene, points=points, least=least, most=most, accuracy=accuracy)
     if least is not None:
@@ -163,7 +163,7 @@ def branches(
 @cached
 def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
     model = jammed_model(scene).decomposed()
-    crowded, resonances = fold_points(model, per_side, top)
-    jams, folds = branch_points(model, spread_points(crowded, points, top))
+    grid, resonances = grid_near_poles(model, per_side, top)
+    jams, folds = branch_points(model, resampled_grid(grid, points, top))
     fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
     return Branches(**fields, resonances=resonances, folds=folds, scene=scene)

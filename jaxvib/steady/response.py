@@ -27,7 +27,7 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.readable import Readable
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.folds import Pieces, branch_pieces, branch_root, fold_points, scanned_speed, spread_points
+from jaxvib.steady.jams.folds import Pieces, branch_pieces, branch_root, grid_near_poles, resampled_grid, scanned_speed
 from jaxvib.steady.measures import Vibration, acceleration_of, rms_velocity_of
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.regimes.local import decays, regime_growth
@@ -320,8 +320,8 @@ def _common_torques(scene: Scene) -> tuple[Array, Array]:
 @cached
 def _default_speeds(scene: Scene, top: Array, points: int) -> Array:
     model = unbalanced_model(scene, jnp.zeros(len(scene.exciters), top.dtype)).decomposed()
-    crowded, _ = fold_points(model, _POINTS_PER_SIDE, top)
-    return spread_points(crowded, points, top)
+    grid, _ = grid_near_poles(model, _POINTS_PER_SIDE, top)
+    return resampled_grid(grid, points, top)
 
 
 @cached

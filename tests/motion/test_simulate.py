@@ -14,7 +14,7 @@ from scenes import published, scene, some_state
 from small_machine import small_machine, small_run, small_start
 
 import jaxvib as jv
-from jaxvib.motion.integrate import StepControl, effects_rate, frequency_bounds, integrate, on_jumps
+from jaxvib.motion.integrate import StepControl, effects_rate, frequency_bounds, integrate, with_jump_times
 from jaxvib.motion.plan import _enough_samples, _sample_size, _step_control, enough_steps
 from jaxvib.motion.simulate import _error_share
 from jaxvib.ode.dopri8_loop import LoopDopri8
@@ -147,8 +147,8 @@ def test_estimate_assumes_less_than_order_8():
 def test_given_steps_are_not_moved_to_jumps():
     run_up = eqx.tree_at(lambda s: s.exciters[0].drive, scene(), jv.RunUp(60.0, acceleration=40.0))
     for given in (diffrax.StepTo(jnp.asarray([0.0, 1.0])), diffrax.ConstantStepSize()):
-        assert on_jumps(run_up, given) is given
-    assert isinstance(on_jumps(run_up, diffrax.PIDController(1e-6, 1e-6)), diffrax.ClipStepSizeController)
+        assert with_jump_times(run_up, given) is given
+    assert isinstance(with_jump_times(run_up, diffrax.PIDController(1e-6, 1e-6)), diffrax.ClipStepSizeController)
 
 
 def test_a_comparison_run_is_not_measured(monkeypatch):

@@ -39,7 +39,7 @@ from jaxvib.motion.analysis.measure import MIN_CHANGE_SCALE, Measured, turning_d
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.analysis.separation import MIN_SEPARATION_GROWTH, nearly_coincident_pairs
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
-from jaxvib.motion.integrate import is_finite, on_jumps
+from jaxvib.motion.integrate import is_finite, with_jump_times
 from jaxvib.motion.plan import Tolerance, require, require_error_estimate
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.motion.start import Start, initial_state, start_state, with_spin_up_drive
@@ -291,7 +291,7 @@ def _run(
         y0=units.pack(begin),
         args=args,
         saveat=diffrax.SaveAt(subs=saves),
-        controller=on_jumps(scene, _Tolerance(controller, (2 * nd, 2 * nd, *begin.rate.shape, *begin.phase.shape))),
+        controller=with_jump_times(scene, _Tolerance(controller, (2 * nd, 2 * nd, *begin.rate.shape, *begin.phase.shape))),
         adjoint=adjoint,
         max_steps=max_steps,
     )

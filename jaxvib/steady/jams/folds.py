@@ -214,7 +214,7 @@ class Pieces(NamedTuple):
 def branch_pieces(model: ExcitedModel) -> Pieces:
     """Divide the branch at its folds into monotone pieces with mode numbers; empty pieces have low = high."""
     frozen = jax.lax.stop_gradient(model)
-    grid, resonances = fold_points(model, _GRID_POINTS)
+    grid, resonances = grid_near_poles(model, _GRID_POINTS)
     highest = frozen.highest_speed
     grid = grid if highest is None else jnp.minimum(grid, highest)
     fold_count = 2 * (resonances.shape[0] + model.extra_peaks)
@@ -296,7 +296,7 @@ def without_ripples(speeds: Array, count: Array, count_left: int) -> Array:
     return jax.lax.fori_loop(0, count_left // 2, without_smallest, (index, count))[0][:count_left]
 
 
-def fold_points(model: LinearModel, per_side: int, highest: Array | None = None) -> tuple[Array, Array]:
+def grid_near_poles(model: LinearModel, per_side: int, highest: Array | None = None) -> tuple[Array, Array]:
     """Return a grid of load speeds for the search for folds, and the resonances; only the resonances have derivatives.
 
     The grid has `per_side` points on each side of each pole s of det(K + s^2 M + s C) = 0, with a density that follows the
@@ -314,23 +314,23 @@ def fold_points(model: LinearModel, per_side: int, highest: Array | None = None)
     low = 1e-3 * jnp.min(jnp.where(fixed > 0.0, fixed, top))
     s = np.linspace(0.0, 1.0, per_side, dtype=width.dtype)[None, :]
 
-    def crowded(reach: Array) -> Array:
+    def distances(reach: Array) -> Array:
         return width * jnp.sinh(s * jnp.arcsinh(reach / width))
 
     # One pole of a conjugate pair gets the points above, the other the points below; a real pole has no points below.
     centre = jnp.abs(poles.imag)[:, None]
-    below, above = centre - crowded(jnp.maximum(centre - low, 0.0)), centre + crowded(jnp.full_like(width, beyond))
+    below, above = centre - distances(jnp.maximum(centre - low, 0.0)), centre + distances(jnp.full_like(width, beyond))
     points = jnp.where(poles.imag[:, None] >= 0.0, above, below)
     return jnp.sort(jnp.maximum(points.ravel(), low)), resonances
 
 
-def spread_points(crowded: Array, points: int, top: Array) -> Array:
-    """Return a number of `points`, ascending load speeds up to `top`, with the density of the grid `crowded`.
+def resampled_grid(grid: Array, points: int, top: Array) -> Array:
+    """Return a number of `points`, ascending load speeds up to `top`, with the density of `grid`.
 
     They are equally spaced in the index of this grid. Points that would lie above `top` are replaced by evenly spaced ones
     below it.
     """
-    inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)
+    inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, grid.shape[0]), grid)
     share = jnp.linspace(0.0, 1.0, points)
     return jnp.sort(jnp.where(inside < top, inside, top * (0.001 + 0.999 * share)))
 

@@ -26,7 +26,7 @@ from jaxvib.results.result import Result
 from jaxvib.runtime.parallel import in_background, in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.branch_plot import branch_summary, plot_branch
-from jaxvib.steady.jams.folds import fold_points, light_rotor_speed
+from jaxvib.steady.jams.folds import grid_near_poles, light_rotor_speed
 from jaxvib.steady.orbits.describe import OrbitStatus, orbits
 from jaxvib.steady.orbits.jam_orbit import collocation_points
 from jaxvib.steady.orbits.stability import Floquet, is_stiff, steps_for
@@ -222,7 +222,7 @@ def _replaced_rows(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.nd
 @cached
 def _search_grid(scene: Scene, highest: Array) -> tuple[Array, Array]:
     """Return the grid of load speeds for the search for folds, up to at least the speed `highest`, and the resonances."""
-    return fold_points(jammed_model(scene), 64, highest)
+    return grid_near_poles(jammed_model(scene), 64, highest)
 
 
 @cached

@@ -12,7 +12,7 @@ from jaxvib.equations.linear import jammed_model
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.folds import fold_points, light_rotor_speed, sampled_modes
+from jaxvib.steady.jams.folds import grid_near_poles, light_rotor_speed, sampled_modes
 from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 
 _BRANCH_POINTS, _POINTS_PER_BATCH = 800, 100
@@ -27,7 +27,7 @@ _NEAR_FOLD_DISTANCE = 1e-6
 
 @cached
 def _search_grid(scene: Scene) -> tuple[Array, Array]:
-    return fold_points(jammed_model(scene), _BRANCH_POINTS)
+    return grid_near_poles(jammed_model(scene), _BRANCH_POINTS)
 
 
 def exact_mode_speeds(scene: Scene) -> dict[int, float]:
@@ -35,10 +35,10 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
 
     The exact branch n(Omega) is computed point by point and cut at its folds; its pieces are numbered as in `jam_modes`.
     """
-    crowded, resonances = _search_grid(scene)
-    crowded, resonances, target = np.asarray(crowded), np.asarray(resonances), float(scene.drive.speed)
-    crowded = np.unique(np.append(crowded, target))  # a duplicate point would look like a fold
-    omega = np.interp(np.linspace(0.0, 1.0, _BRANCH_POINTS), np.linspace(0.0, 1.0, crowded.size), crowded)
+    grid, resonances = _search_grid(scene)
+    grid, resonances, target = np.asarray(grid), np.asarray(resonances), float(scene.drive.speed)
+    grid = np.unique(np.append(grid, target))  # a duplicate point would look like a fold
+    omega = np.interp(np.linspace(0.0, 1.0, _BRANCH_POINTS), np.linspace(0.0, 1.0, grid.size), grid)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
     known = np.isfinite(speed)
     omega, speed = _interpolated(omega[known], speed[known], slope[known])

@@ -209,7 +209,7 @@ def test_folds_are_looked_for_on_both_sides_of_every_pole():
     awaited = np.concatenate([sign * 1j * np.sqrt(w2 - decay**2) - decay for sign in (1.0, -1.0)])
     poles = np.asarray(folds._poles(model.mass, model.damping(s.drive.speed), model.carrier.stiffness))
     np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(awaited), rtol=1e-12)
-    grid, resonances = folds.fold_points(model, 40)
+    grid, resonances = folds.grid_near_poles(model, 40)
     np.testing.assert_allclose(resonances, np.sort(np.sqrt(w2)), rtol=1e-12)
     grid = np.asarray(grid)
     assert grid.shape == (160,) and np.all(np.diff(grid) >= 0.0)
@@ -226,7 +226,7 @@ def test_folds_are_looked_for_on_both_sides_of_every_pole():
 def test_folds_are_looked_for_beyond_poles_that_only_decay():
     """A strong damper's pole, at c/m, is far above all resonances."""
     model = linear_model(two((2.0, 1.0), (8.0, 9.0), (0.04, 600.0), 0.0, 0.0, 1e-6, 0.7))
-    grid, resonances = folds.fold_points(model, 40)
+    grid, resonances = folds.grid_near_poles(model, 40)
     assert float(resonances[-1]) < 4.0 and float(grid[-1]) > 600.0
 
 
