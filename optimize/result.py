@@ -26,7 +26,7 @@ _MAX_SHOWN_PERCENT = 1000.0
 _MAX_LINEAR_PERCENT = 10.0
 """Largest change of the objective, per cent, for which a prediction from its slope is shown."""
 
-_EQUAL_VALUE = 1e-4
+_MAX_EQUAL_DIFFERENCE = 1e-4
 """Relative difference of the objectives of two machines below which they count as equally good."""
 
 _MIN_LIMIT_CHANGE = 1e-6
@@ -91,7 +91,7 @@ class Limit(NamedTuple):
     **Attributes**
 
     - `what`: the condition as text; `value` of its quantity and its `limit`, in the SI `unit`
-    - `violation`: its relative violation (0: met; infinite: the machine has no such value)
+    - `violation`: relative violation of the condition (0: met; infinite: the machine does not have the quantity)
     - `active`: True if it limits the design
     - `multiplier`: derivative of the objective with respect to the limit, in the direction that relaxes the limit (for held
       quantities: an increase of the held value), times the modulus of the limit; in the unit of the objective
@@ -164,8 +164,9 @@ class Synthesis(Result):
     - `influences` of `Influence`: the influence of each free parameter
     - `machines` of `Machine`: the distinct final designs, with the number of starts that ended at each
     - `kkt`: relative residual of the Karush-Kuhn-Tucker conditions at the best design
-    - `starts`: number of searches, from `drawn` random designs; `converged`: number of searches that ended at a design that no
-      change of a free parameter improves; `same`: number of searches that ended at the best design
+    - `starts`: number of searches; `drawn`: number of random designs from which their starts were chosen; `converged`: number
+      of searches that ended at a design that no change of a free parameter improves; `same`: number of searches that ended at
+      the best design
     - `designs` (starts, d) in [0, 1]: the final design of each search; `values` (starts,): its objective, infinite for a design
       that does not meet all demands; `done` (starts,): True if the search converged
     - `history` (steps, starts): the objective after each step of the descent and of the polishing
@@ -223,10 +224,10 @@ class Synthesis(Result):
 
         def change_text(*percent: float) -> str:
             if math.isnan(best) or not max(map(abs, percent)) > _MAX_SHOWN_PERCENT:
-                return " / ".join(f"{influence + 0.0:+.3g} %" for influence in percent) + " of the objective"
-            changes = [max(abs(best), 1e-300) * influence / 100.0 for influence in percent]  # for an objective near 0
+                return " / ".join(f"{change + 0.0:+.3g} %" for change in percent) + " of the objective"
+            changes = [max(abs(best), 1e-300) * change / 100.0 for change in percent]  # for an objective near 0
             unit, factor = shown_unit(self.unit, max(map(abs, changes)))
-            return " / ".join(f"{influence * factor:+.3g} {unit}".rstrip() for influence in changes)
+            return " / ".join(f"{change * factor:+.3g} {unit}".rstrip() for change in changes)
 
         for limit in self.limits:
             values = limit.value_text()
@@ -239,7 +240,7 @@ class Synthesis(Result):
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
         for influence in ranked[:5]:
             lines.append(f"  1 % less / more {influence.what}: {change_text(sign * influence.less, sign * influence.more)}")
-        equal = [m for m in self.machines if abs(m.value - best) <= _EQUAL_VALUE * abs(best)]
+        equal = [m for m in self.machines if abs(m.value - best) <= _MAX_EQUAL_DIFFERENCE * abs(best)]
         unit, factor = shown_unit(self.unit, abs(best))
         factor *= sign
         if len(equal) > 1 and len(equal) == len(self.machines):

@@ -26,9 +26,9 @@ _SHORT_NAMES = {
     "drag": re.compile(r"(exciters\[\d+\]\.)?loads\.drag"),
     "unbalance": re.compile(r"exciters\[\d+\]\.unbalance"),
 }
-"""Patterns of the names of those parameters that each short name stands for."""
+"""Patterns of parameter names, by the short name that stands for them."""
 
-_SHARE_PATTERN = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*%")
+_PERCENT = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*%")
 _RANGE = re.compile(r"(.+?)\.\.(.+)")
 _MATERIAL = re.compile(r"material(?:\[(\d+)\])?")
 
@@ -80,9 +80,9 @@ def tolerance_ranges(
 
     - `scene` of the design
     - `quantities`, or demands of quantities; typical: 1 to 5
-    - `tolerances`: texts of one of two forms. NAME=SHARE, such as "stiffness=5%": 95 of 100 machines are within the tolerance,
-      and the deviations of all numbers are independent. NAME=LOW..HIGH, such as "machine.mass[0]=100kg..130kg": all values of
-      the range are equally likely. Short names are stiffness and damping (of all springs and dampers), mass, drag and
+    - `tolerances`: texts of one of two forms. NAME=PERCENT, such as "stiffness=5%": 95 of 100 machines are within the
+      tolerance, and the deviations of all numbers are independent. NAME=LOW..HIGH, such as "machine.mass[0]=100kg..130kg": all
+      values of the range are equally likely. Short names are stiffness and damping (of all springs and dampers), mass, drag and
       unbalance. "material=0..20kg" is material on platform or body 1, at its centre of mass, "material[2]=..." on platform or
       body 2
     - `samples`: number of machines; typical: 64 to 1000 (default 128)
@@ -147,21 +147,21 @@ def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
     for text in tolerances:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals:
-            raise InputError("tolerances", f"is {quoted(text)}; write NAME=SHARE or NAME=LOW..HIGH, such as stiffness=5%")
+            raise InputError("tolerances", f"is {quoted(text)}; write NAME=PERCENT or NAME=LOW..HIGH, such as stiffness=5%")
         if "." not in name and name not in _SHORT_NAMES and not _MATERIAL.fullmatch(name):
             known = suggest_name(name, [*_SHORT_NAMES, "material"])
             raise InputError(f"tolerances.{name}", f"is no short name; {known}, and parameters such as machine.mass")
-        if share := _SHARE_PATTERN.fullmatch(value):
-            size = float(share[1]) / 100.0
+        if percent := _PERCENT.fullmatch(value):
+            size = float(percent[1]) / 100.0
             if not 0.0 < size < 1.0:
-                raise InputError("tolerances", f"is {quoted(text)}; the share must be greater than 0 % and less than 100 %")
+                raise InputError("tolerances", f"is {quoted(text)}; the tolerance must be greater than 0 % and less than 100 %")
             pattern = _SHORT_NAMES.get(name)
             matching = [parameter for parameter in present if pattern is not None and pattern.fullmatch(parameter)]
             errors += [(parameter, size) for parameter in matching or [find_number(scene, name, "tolerances").name]]
         elif ends := _RANGE.fullmatch(value):
             ranges.append(_range(scene, name, ends[1], ends[2]))
         else:
-            raise InputError("tolerances", f"is {quoted(text)}; write NAME=SHARE or NAME=LOW..HIGH, such as stiffness=5%")
+            raise InputError("tolerances", f"is {quoted(text)}; write NAME=PERCENT or NAME=LOW..HIGH, such as stiffness=5%")
     # Material is added to a mass, which may have a tolerance of its own.
     changed = (each.number for each in ranges if not each.is_added)
     require_single_tolerances([*(find_number(scene, name, "tolerances") for name, _ in errors), *changed])
@@ -173,11 +173,11 @@ def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) 
     errors, ranges = read_tolerances(scene, tolerances)
     random = np.random.default_rng((count(seed, "seed", low=0), 1))  # independent of the numbers of `Sampled`
     batch = Sampled(errors, samples, seed).scenes(scene) if errors else None
-    shares = [random.permutation((np.arange(samples) + 0.5) / samples) for _ in ranges]
+    fractions = [random.permutation((np.arange(samples) + 0.5) / samples) for _ in ranges]
     for k in range(samples):
         machine = scene if batch is None else jax.tree.map(lambda leaf, k=k: leaf[k], batch)
-        for entry, share in zip(ranges, shares, strict=True):
-            value = entry.low + (entry.high - entry.low) * share[k]
+        for entry, fraction in zip(ranges, fractions, strict=True):
+            value = entry.low + (entry.high - entry.low) * fraction[k]
             if entry.is_added:
                 machine = put_numbers(machine, (entry.number,), entry.number.read(machine) + value)
             else:

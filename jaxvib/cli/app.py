@@ -114,7 +114,7 @@ TOLERANCE = click.option(
     "--tolerance",
     "tolerances",
     multiple=True,
-    metavar="NAME=SHARE",
+    metavar="NAME=PERCENT",
     help="Show the ranges of the results for machines within tolerances, repeatable: stiffness=5%, damping=30%, "
     "material=0..20kg (on platform or body 1).",
 )

@@ -135,10 +135,10 @@ def stability_chart(
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw a band for each `value` (n,) of the varied parameter, shaded at those of its P load speeds `omega` (n, P) that are
-    `stable` (n, P).
+    """Draw a band for each `value` (n,) of the varied parameter. A band is shaded at the load speeds `omega` (n, P) of `stable`
+    (n, P) jams.
 
-    `marks` are points (k, 2) of load speed and value by kind. Speeds are in rad/s and drawn in `unit`.
+    `marks` contains points (k, 2), each with a load speed and a value, by their kind. Speeds are in rad/s and drawn in `unit`.
     """
     unit, scale = speed_unit(unit)
     figure, (axes,) = panels(1, size=(7.5, 5.0), ax=ax)
@@ -193,8 +193,8 @@ def audit_chart(
     shown = np.concatenate([100.0 * values for values in changes.values()] or [np.zeros(0)])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
     low = max(min([accuracy, *shown]) / 3.0, 1e-8)
-    unknown = np.maximum(100.0 * np.nan_to_num(uncertainty), low)
-    left.hlines(place, low, unknown, color=_FLOOR, lw=14, label="not resolved")
+    unresolved = np.maximum(100.0 * np.nan_to_num(uncertainty), low)
+    left.hlines(place, low, unresolved, color=_FLOOR, lw=14, label="not resolved")
     for color, mark, (name, values) in zip(COLORS, "os^D", changes.items(), strict=False):
         if not np.any(np.isfinite(values)):
             continue

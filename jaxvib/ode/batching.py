@@ -66,7 +66,8 @@ def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents],
 
 
 def batch_last(function: Callable[[X], Out], batched: Callable[[X, Batched], Out]) -> Callable[[X], Out]:
-    """Return `function`, which under `vmap` is computed by `batched`. JAX batches its derivatives of any kind as usual.
+    """Return a function that computes `function`, by `batched` under `vmap`. JAX batches its derivatives of any kind as
+    usual.
 
     JAX makes the batch the first axis of the state of a loop. `batched` may make the batch the last axis: every number of the
     program is then a vector over the batch, contiguous in memory.

@@ -89,7 +89,7 @@ def test_settle_shows_ranges_within_tolerances(typed, tmp_path):
     shown = ["jam frequency", "stroke of platform 1", "force on support 1", "foundation force", "shaft torque"]
     assert [entry["words"] for entry in ranges] == [f"{name}, mode 1" for name in shown]
     assert "machines with stiffness=5%" in typed(*words)[1]
-    assert "--tolerance is 'stiffness'; write NAME=SHARE" in typed(*words[:-1], "stiffness")[2]
+    assert "--tolerance is 'stiffness'; write NAME=PERCENT" in typed(*words[:-1], "stiffness")[2]
     assert "--step-tolerance is -1" in typed(*words[:-2], "--step-tolerance", "-1")[2]
 
 

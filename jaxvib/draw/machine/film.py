@@ -129,5 +129,5 @@ class Film(FuncAnimation):
                 each.save(memory, "PNG", optimize=False)
                 coded.append('"' + base64.b64encode(memory.getvalue()).decode("ascii") + '"')
         width = int(self.figure.bbox.width)
-        words = {"title": html.escape(title, quote=True), "width": width, "last": self.count - 1}
-        return _PAGE.format(pictures=",".join(coded), pause=round(1000.0 / self.fps), **words)
+        settings = {"title": html.escape(title, quote=True), "width": width, "last": self.count - 1}
+        return _PAGE.format(pictures=",".join(coded), pause=round(1000.0 / self.fps), **settings)

@@ -139,8 +139,8 @@ class Effect(Part):
 
 
 class Gravity(Effect):
-    """Gravity on loads, unbalances and static imbalances: V = m g p_up(u), the torque - m g R cos phi on a load on a circle,
-    - S g cos theta on the rotor of an unbalance.
+    """Gravity on loads, unbalances and static imbalances: V = m g p_up(u), that is the torque -m g R cos phi on a load on a
+    circle and -S g cos theta on the rotor of an unbalance.
 
     Displacements of platforms are measured from static equilibrium under the weight of platforms and loads. Gravity therefore
     adds no force on the platforms.

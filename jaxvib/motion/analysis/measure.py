@@ -76,17 +76,17 @@ class AbstractMeasured(Readable):
     - `load_speed` (count,), rad/s: mean speed of each load over whole turns, negative if it turns clockwise; for an exciter
       without loads, that of its rotor
     - `omega`, rad/s: mean of these speeds, each positive in the direction of rotation of its exciter
-    - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, that is half of peak to peak; for a force
-      with two directions the root of the sum of both squares; typical: 0.5 to 10 mm, 10 N to 10 kN
+    - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, that is half of the peak-to-peak
+      value; for a force with two directions the root of the sum of the squares of both; typical: 0.5 to 10 mm, 10 N to 10 kN
     - `drift`: the largest of three relative changes within the window
     - `settled`: True if the drift is below 1e-3
 
     The three changes are
 
     - the change of an amplitude from the first to the second half of the window, relative to the largest amplitude, or to 1e-4
-      of the unbalance radius S/M if that is more (the amplitude of a balanced rotor is almost zero)
+      of the unbalance radius S/M if that is larger (the amplitude of a balanced rotor is almost zero)
     - the change of the foundation force from the first to the second half, relative to the largest force, or to 1e-4 of S n^2
-      (n: rotor speed) if that is more
+      (n: rotor speed) if that is larger
     - the difference between the mean speeds of a load in the second half and in the whole window, relative to `omega`
     """
 
@@ -117,9 +117,10 @@ class AbstractMeasured(Readable):
         return f"amplitude, zero to peak: {amplitude}; foundation force {force}"
 
     def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array]) -> str:
-        """Return the speeds of the turning masses, and the last `rotor_speeds` of loads, as a line of text.
+        """Return a line of text with the speeds of the turning masses, and the last of the `rotor_speeds` of exciters with
+        loads.
 
-        The speed of a rotor without loads is that of its exciter.
+        The turning mass of an exciter without loads is its rotor.
         """
         exciters = zip(scene.exciters, rotor_speeds, strict=True)
         rotors = [speeds[-1] for exciter, speeds in exciters if exciter.loads is not None]
@@ -216,8 +217,8 @@ def unmeasured(model: Model, states: State) -> Measured:
 
 @eqx.filter_custom_jvp
 def _spans(model: Model, field: Field, times: Array, states: State) -> Array:
-    """Return half of peak to peak of displacements and foundation forces, over the first half of the samples, the second half
-    and all of them, (3, outputs).
+    """Return half of the peak-to-peak values of displacements and foundation forces, (3, outputs): over the first half of the
+    samples, over the second half, and over all of them.
 
     Derivatives of any order cost little: the equations are evaluated again at the few samples next to the extrema, and only
     these evaluations are differentiated.
@@ -267,8 +268,8 @@ class Peaks(NamedTuple):
 def locate_peaks(model: Model, field: Field, times: Array, states: State) -> Peaks:
     """Return the largest values of an evenly sampled part of a motion, for arguments as in `measure`.
 
-    Values between the samples are those of the polynomials of `locate_extrema`. The largest magnitude of the force is that at
-    the largest square of the force.
+    Values between the samples are those of the polynomials of `locate_extrema`. The magnitude of the force is largest where
+    the square of the force is largest.
     """
     nd = states.displacement.shape[1]
     values, slopes = _sampled_outputs(model, field, times, states)

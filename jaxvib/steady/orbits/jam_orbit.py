@@ -71,8 +71,9 @@ def jam_orbit(
     are solved by trigonometric collocation of psi. The carrier is eliminated harmonic by harmonic, and Newton's method starts
     from the leading order.
 
-    - Loads that have equal parameters are at one point, or side by side if they have a `ball_radius` (S is then m R sin(N
-      arcsin(r/R)) / (r/R); if their mean contact force over a period would be tensile, the status is `would_separate`)
+    - Loads that have equal parameters are at one point. If they have a `ball_radius`, they are side by side, with the unbalance
+      S = m R sin(N arcsin(r/R)) / (r/R); if their mean contact force over a period would be tensile, the status is
+      `would_separate`
     - Different loads have a deviation psi_j each. Its mean over a period is the phase of the load. The phases follow from the
       torque balance of each load, and their sum is 0
     - The torque is that of drag, gravity and dry friction; the normal force of the friction depends on the acceleration a of
@@ -113,8 +114,8 @@ def jam_orbit(
     """
     scene = validate_scene(scene)
     if mode is not None and not jams_of.is_ready(scene):
-        # Compile the program of the orbit in the background while the jam modes are computed. Its arguments matter only by
-        # their shapes; therefore the start may be the rotor speed.
+        # Compile the program of the orbit in the background while the jam modes are computed. Only the shapes of its
+        # arguments matter; therefore the start may be the rotor speed.
         rough = plan_orbit(scene, mode=None, omega=None, near=scene.drive.speed, accuracy=accuracy, points=points)
         problem = rough.problem._replace(direction=np.ones_like(rough.problem.value))
         in_background(partial(_solve_program.prepare, problem, rough.points[0], None))
@@ -246,7 +247,7 @@ def _solve_accurately(plan: OrbitPlan) -> Orbit:
 
 
 def _from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
-    """Return the plan that starts from the mode in a search of the whole branch."""
+    """Return the plan that starts at the load speed of the mode that a search of the whole exact branch finds."""
     speed, start = exact_mode_speeds(plan.problem.scene).get(mode), plan.problem.start
     start = start if speed is None else jnp.asarray(speed, dtype=start.dtype)
     return plan._replace(
@@ -265,7 +266,8 @@ def _outputs(orbit: Orbit, problem: JamProblem, points: int, max_steps: int | No
 def _solve_program(problem: JamProblem, points: int, max_steps: int | None) -> Orbit:
     """Solve for one exact jam.
 
-    **Arguments**: `max_steps`: limit of the steps for the multipliers, with which they have reverse derivatives.
+    **Arguments**: `max_steps`: limit of the number of steps for the multipliers; without a limit they have no reverse
+    derivatives.
     """
     scene, given, value, start, exists, direction, accuracy, implicit, is_start_solved = problem
     model, deviation = jammed_bodies(jammed_model(scene)), None
