@@ -39,6 +39,10 @@ _MAX_GROWTH_RATIO_OF_QUARTERS = 0.85
 """Largest ratio of the growth rate in the last quarter of a run to that in the quarter before, for growth that is not
 exponential. The ratio is 0.71 for growth proportional to time, and 1 for exponential growth."""
 
+_UNSEPARATED_LOG_GROWTH = 0.1
+"""Largest error of the logarithm of the growth over the later half if two equal disturbances with nearly equal rates grow. With
+the difference of the rates times the whole time x the error is ln((1 + e^-x)/(1 + e^-2x))/2, at most 0.094."""
+
 _RETURN_DISTANCE = 1e-2
 """Distance from a previous state below which a motion has returned to it, relative to the largest distance in between."""
 
@@ -64,8 +68,9 @@ class Growth(Result):
     **Attributes**
 
     - `status`: a `GrowthStatus`
-    - `exponent`: the largest Lyapunov exponent, 1/s, over the later half of the stretches, and its `uncertainty`: the standard
-      error, or half of the change of the rate between the quarters of this half if that is larger
+    - `exponent`: the largest Lyapunov exponent, 1/s, over the later half of the stretches, and its `uncertainty`: the largest
+      of the standard error, half of the change of the rate between the quarters of this half, and 0.1 divided by the length of
+      this half (exponents that are closer to each other cannot be separated)
     - `horizon`: the time, s, after which rounding errors have grown to the size of the motion itself, ln(1/eps)/exponent. A
       derivative with respect to a parameter has then grown by 1/eps, and predicts nothing about a change that is larger than
       rounding. The horizon is infinite for a regular motion; for an undecided one it is a lower bound,
@@ -182,8 +187,7 @@ def growth(
         state, difference = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, neighbour_end)
         neighbour = _at_distance(state, jax.tree.map(jnp.add, state, difference), scale, separation)
     late = np.array(rates[stretches // 2 :])
-    exponent, (first, last) = float(np.mean(late)), np.split(late, [late.size // 2])
-    uncertainty = max(_sum_error(late) / late.size, 0.5 * abs(float(np.mean(last) - np.mean(first))))
+    exponent, uncertainty = float(np.mean(late)), _uncertainty(late, stretch)
     name = _classify_growth(late * stretch)
     if name == "chaotic" and all(_has_returned(scene, quarter, steps) for quarter in quarters):
         name = "unstable"
@@ -207,6 +211,16 @@ def _classify_growth(late: np.ndarray) -> str:
     decreases = total < _LINEAR_LOG_GROWTH and float(np.mean(last)) < _MAX_GROWTH_RATIO_OF_QUARTERS * float(np.mean(first))
     is_resolved = total > max(2.0 * error, _MAX_LOG_GROWTH_OF_ERRORS)
     return "regular" if total + 3.0 * error < _EXPONENTIAL_LOG_GROWTH and (decreases or not is_resolved) else "undecided"
+
+
+def _uncertainty(late: np.ndarray, stretch: float) -> float:
+    """Return the uncertainty of the mean of the rates `late` (n,), 1/s, in the stretches of the later half.
+
+    `stretch`: length of each stretch, s.
+    """
+    first, last = np.split(late, [late.size // 2])
+    change = abs(float(np.mean(last) - np.mean(first)))
+    return max(_sum_error(late) / late.size, 0.5 * change, _UNSEPARATED_LOG_GROWTH / (late.size * stretch))
 
 
 def _sum_error(values: np.ndarray) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.motion.growth import _classify_growth
+from jaxvib.motion.growth import _classify_growth, _uncertainty
 
 
 def forced(cubic, stiffness):
@@ -117,6 +117,15 @@ def test_growth_in_proportion_to_time_is_regular():
 )
 def test_the_later_half_decides(late, name):
     assert _classify_growth(late) == name
+
+
+@pytest.mark.parametrize("difference", [1e-3, 0.01, 0.1, 1.0])
+def test_uncertainty_includes_nearly_equal_rates(difference):
+    """Two equal disturbances grow at the rates 0.5 and 0.5 - difference for 10 s."""
+    time = np.linspace(0.0, 10.0, 41)
+    logs = np.logaddexp(2.0 * 0.5 * time, 2.0 * (0.5 - difference) * time) / 2.0
+    late = np.diff(logs)[20:] / 0.25
+    assert 0.0 < 0.5 - np.mean(late) < _uncertainty(late, 0.25) < 0.05
 
 
 def test_wrapped_angles_are_compared_across_a_turn(monkeypatch):
