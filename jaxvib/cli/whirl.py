@@ -32,7 +32,7 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: 
     from jaxvib.units import number
 
     loaded = loaded_scene(scene)
-    rotor_speed = float(loaded.drive.speed) if speed is None else float(number(speed, "rad/s", "--speed", low=0.0))
+    rotor_speed = float(loaded.exciter.drive.speed) if speed is None else float(number(speed, "rad/s", "--speed", low=0.0))
     result = jv.whirl(loaded, [rotor_speed], loads=loads)
     critical_speeds = zip(result.critical.speed, result.critical.forward, result.critical.straight, strict=True)
     critical = [{"speed": float(w), "forward": bool(f), "straight": bool(s)} for w, f, s in critical_speeds if np.isfinite(w)]

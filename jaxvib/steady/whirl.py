@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Literal
 
 import equinox as eqx
@@ -177,7 +178,11 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: LoadMasses
     Source: Artyunin 2013, section IV; free motion of equation (1).
     """
     model = _two_directions(scene)
-    speeds = scene.drive.speed[None] if rotor_speed is None else numbers(rotor_speed, "rad/s", "rotor_speed", None, low=0.0)
+    speeds = (
+        model.scene.exciter.drive.speed[None]
+        if rotor_speed is None
+        else numbers(rotor_speed, "rad/s", "rotor_speed", None, low=0.0)
+    )
     return outcome(_whirl(model, jnp.atleast_1d(speeds), loads), scene)
 
 
@@ -321,7 +326,16 @@ def _two_directions(scene: Scene) -> LinearModel:
             "whirl needs a rotor such as rotor(...)",
         )
     when_known(_require_springs, carrier.stiffness)
-    return model
+    return model if scene.exciter.direction == 1 else _mirrored(model)
+
+
+def _mirrored(model: LinearModel) -> LinearModel:
+    """Return the model of a clockwise rotor with the second direction of its mount reversed: the rotor then turns from the
+    first direction to the second, as an anticlockwise rotor does."""
+    mount = model.mount
+    rows = tuple(row * np.array([[1.0], [-1.0]], row.dtype) for row in mount.rows)
+    gyroscopic = None if mount.gyroscopic is None else -mount.gyroscopic
+    return dataclasses.replace(model, mounts=(dataclasses.replace(mount, rows=rows, gyroscopic=gyroscopic),))
 
 
 def _require_springs(stiffness: np.ndarray) -> None:

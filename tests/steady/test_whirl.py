@@ -204,3 +204,17 @@ def test_machines_from_matrices_have_the_same_sense_of_whirls():
             jv.planar_rotor(mass=37.0, stiffness=1e6, damping=100.0, **other),
         ):
             assert jv.critical_speeds(jv.Scene(machine, loads, drive)).sense.tolist() == sense
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_clockwise_rotors_whirl_at_their_own_speed(direction):
+    """Damping that couples both directions acts in one sense only, the gyroscopic moments in that of the rotor."""
+    stiffness, damping = np.diag([4e4, 5e4]), np.array([[20.0, 60.0], [-60.0, 30.0]])
+    gyroscopic = np.array([[0.0, 2.0], [-2.0, 0.0]])
+    machine = jv.from_matrices(10.0 * np.eye(2), damping, stiffness, gyroscopic, places=[np.eye(2)])
+    exciter = jv.Exciter(jv.balls(count=1, mass=0.05, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0), direction=direction)
+    found, mass = jv.whirl(jv.Scene(machine, exciters=[exciter])), 10.05
+    flow = np.block([[np.zeros((2, 2)), np.eye(2)], [-stiffness / mass, -(damping + direction * 60.0 * gyroscopic) / mass]])
+    right = sorted((s for s in np.linalg.eigvals(flow) if s.imag > 0.0), key=lambda s: s.imag)
+    np.testing.assert_allclose(found.speed[0] * 1j - found.decay[0], right, rtol=1e-9)
+    assert found.sense[0].tolist() == ["backward", "forward"]
