@@ -33,7 +33,8 @@ def campbell_diagram(
 
     - `rotor_speed` (ns,), `speed` (ns, nd): rotor speed and whirl speeds, rad/s, drawn in `unit`
     - `sense` (ns, nd): "forward", "backward" or "straight"
-    - `critical`: critical speeds (k,), rad/s, and their senses (k,), marked on the line w = n with their values
+    - `critical`: critical speeds (k,), rad/s, and their senses (k,), marked with their values on the line whirl speed = rotor
+      speed
     - `at`: operating speed, rad/s; default: the rotor speed if there is only one, otherwise none
 
     >>> import numpy as np
@@ -64,7 +65,7 @@ def campbell_diagram(
 
 
 def _critical_marks(axis: Axes, speed: np.ndarray, sense: np.ndarray, right: float, top: float) -> None:
-    """Draw critical speeds as points on the line w = n, with their values beside vertical lines to the axis.
+    """Draw critical speeds as points on the line whirl speed = rotor speed, with their values beside vertical lines.
 
     Close critical speeds share a text.
     """

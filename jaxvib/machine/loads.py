@@ -381,8 +381,8 @@ def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radi
 
     Balls with a `ball_radius` are in one track and cannot all be at one point:
 
-    - In jams and in the criterion gathered balls lie side by side, with the unbalance m R sin(N arcsin(r/R)) / (r/R) instead of
-      N m R
+    - In jams and in the criterion, gathered balls lie side by side, with the unbalance m R sin(N arcsin(r/R)) / (r/R) instead
+      of N m R
     - In time integration only the effect `LoadContact` uses the `ball_radius`. Without this effect loads pass through each
       other, and a run in which they end inside each other has the status `overlapping`
 

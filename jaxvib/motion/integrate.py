@@ -38,7 +38,7 @@ MIN_SAMPLES_PER_TURN = 16
 """Smallest number of samples in a turn of the rotor; the interpolant between samples then has a relative error of 1e-7."""
 
 _UNBOUNDED_FACTOR = 1e8
-"""Displacement, in units of the initial displacement or of the natural unit, beyond which a motion counts as unbounded."""
+"""Displacement or velocity, in units of its initial value or of its natural unit, beyond which a motion counts as unbounded."""
 
 
 class StepControl(eqx.Module):
@@ -132,10 +132,15 @@ def angle_wrapping(scene: Scene, dtype: np.dtype) -> tuple[bool, bool]:
 class IntegrationPlan(NamedTuple):
     """Choices for one time integration: method, steps, and stored states.
 
-    **Attributes**: `solver` of diffrax, None for the method of order 8 in its fastest form; `control` of the steps; `adjoint`
-    of diffrax, None for step replay; `samples`: number of stored states of the whole run, 0 for none; `periods`: length of the
-    measuring window in periods of the slowest motion; `bounds`, see `frequency_bounds`; `max_steps`; `progress_meter` of
-    diffrax.
+    **Attributes**
+
+    - `solver` of diffrax, None for the method of order 8 in its fastest form
+    - `control` of the steps; `max_steps`
+    - `adjoint` of diffrax, None for step replay
+    - `samples`: number of stored states of the whole run, 0 for none
+    - `periods`: length of the measuring window in periods of the slowest motion
+    - `bounds`, see `frequency_bounds`
+    - `progress_meter` of diffrax
     """
 
     solver: diffrax.AbstractSolver | None

@@ -53,7 +53,7 @@ class Channel(Readable):
       with 100 mV/g; default: the unit stated in the file, otherwise the SI unit
     - `gain_error`: relative standard uncertainty of the gain; default: 0.01 for acceleration, 0 for other kinds; typical: 0.01
       to 0.05
-    - `delay`, s, of the readings behind the motion; typical: 0 to 1e-3
+    - `delay`, s, of the readings relative to the motion; typical: 0 to 1e-3
     - `high_pass`, Hz, corner frequency of the sensor's first-order high-pass filter, 0 for none; typical: 0.1 to 1 for IEPE
       accelerometers
     - `range`: largest absolute reading of the sensor, as a number in `unit` or a string with a unit, such as "50 g"; readings

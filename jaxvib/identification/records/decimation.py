@@ -30,7 +30,8 @@ _MIN_FACTOR, _MIN_LEFT = 4, 1024
 """Smallest ratio of the old to the new rate, and smallest number of samples after the filter."""
 
 _HALF_LENGTH, _KAISER = 8, 10.06
-"""Half of the length of the filter, in new steps, and the parameter beta of its Kaiser window (100 dB attenuation)."""
+"""Half of the length of the filter, in steps of the new rate, and the parameter beta of its Kaiser window (100 dB
+attenuation)."""
 
 _PASSES, _OUTLIER_DISTANCE, _RIPPLE = 4, 6.0, 1e-3
 """Largest number of filter passes for a record with outliers or missing readings. The distance of an outlier from the filtered
@@ -85,7 +86,7 @@ def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
 
 
 def filter_readings(value: np.ndarray, factor: int) -> tuple[np.ndarray, int]:
-    """Return every `factor`-th filtered reading, without 8 `factor` readings at each end, and the number of outliers.
+    """Return every `factor`-th filtered reading, without 8 x `factor` readings at each end, and the number of outliers.
 
     Results near gaps of more than `factor` / 2 readings are NaN.
 
@@ -97,8 +98,8 @@ def filter_readings(value: np.ndarray, factor: int) -> tuple[np.ndarray, int]:
     (True, 1)
     """
     half = _HALF_LENGTH * factor
-    place = np.arange(-half, half + 1)
-    taps = np.sinc(place / factor) * np.kaiser(place.size, _KAISER)
+    shift = np.arange(-half, half + 1)
+    taps = np.sinc(shift / factor) * np.kaiser(shift.size, _KAISER)
     taps /= np.sum(taps)
     is_missing = ~np.isfinite(value)
     is_bad, inside = is_missing.copy(), slice(half, value.size - half)

@@ -21,9 +21,9 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
     """Solve for the jam mode with number `mode` and a load speed near `near` (scalar, rad/s), at the scene's rotor speed n.
 
     Newton's method solves (n(w) - w)^(-1/2) = (n - w)^(-1/2), see `rotor_speed_at`. Near a resonance w_r the left side is
-    almost proportional to |w - w_r|, therefore a few steps converge from far away. `jam_modes` computes the whole branch,
-    which takes a hundred times as long, and determines the number of the mode. This function keeps the number, and does not
-    detect that modes exchange their numbers.
+    almost proportional to |w - w_r|; a few steps are therefore sufficient even from a distant start. `jam_modes` computes the
+    whole branch, which takes a hundred times as long, and determines the number of the mode. This function keeps the number,
+    and does not detect that modes exchange their numbers.
 
     **Returns** `Jam`, with NaN if the iteration has not converged or ended on a piece of the branch with the wrong sign of the
     slope. First derivatives are exact.
@@ -41,8 +41,8 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
     target = jax.lax.stop_gradient(speed)
 
     def gap(w: Array) -> Array:
-        slip = rotor_speed_at(frozen, w) - w
-        return jax.lax.rsqrt(jnp.maximum(slip, 1e-300)) - jax.lax.rsqrt(target - w)
+        difference = rotor_speed_at(frozen, w) - w
+        return jax.lax.rsqrt(jnp.maximum(difference, 1e-300)) - jax.lax.rsqrt(target - w)
 
     omega = _newton(gap, near, target)
     reached, slope = jax.jvp(lambda w: rotor_speed_at(frozen, w), (omega,), (jnp.ones_like(omega),))
