@@ -49,6 +49,9 @@ MARKERS = "osD^vPX*"
 STROKES = ("-", (0, (6, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
 """Line styles of series; with `MARKERS` they distinguish series without colours."""
 
+WHITE_OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
+"""Effect of texts over curves."""
+
 UNSTABLE = (0, (3, 2))
 """Dash pattern of unstable parts."""
 
@@ -209,7 +212,7 @@ def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str
             fontsize="small",
             fontweight="bold",
             zorder=5,
-            path_effects=[withStroke(linewidth=2.5, foreground="white")],
+            path_effects=WHITE_OUTLINE,
         )
 
 

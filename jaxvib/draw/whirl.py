@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import Drawn, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, OPERATING, legend_above, panels
+from jaxvib.draw.style import COLORS, GUIDE, OPERATING, WHITE_OUTLINE, legend_above, panels
 
 _SENSES = {
     "forward": (COLORS[0], "-", "forward whirl"),
@@ -75,7 +75,9 @@ def _critical_marks(axis: Axes, speed: np.ndarray, sense: np.ndarray, right: flo
             axis.plot([speed[k]], [speed[k]], "o" if sense[k] == "forward" else "s", ms=6.0, **look)
             axis.vlines(float(speed[k]), 0.0, float(speed[k]), color=GUIDE, lw=0.7, zorder=1.2)
         at = (speed[group[-1]], 0.02 * top)
-        axis.annotate(word, at, xytext=(3, 0), textcoords="offset points", rotation=90, va="bottom", fontsize="small")
+        look = {"rotation": 90, "va": "bottom", "fontsize": "small", "linespacing": 1.0, "path_effects": WHITE_OUTLINE}
+        lines = word.replace(", ", "\n")  # one long line would reach the curves
+        axis.annotate(lines, at, xytext=(3, 0), textcoords="offset points", **look)
 
 
 def whirl_lines(speed: np.ndarray, has_sense: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from jaxvib.draw.motion.spectra import path_chart
 from jaxvib.draw.results import draw_circle, growth_chart, phase_circles, shapes_chart, speeds_chart
 from jaxvib.draw.style import panels
 from jaxvib.draw.sweeps import label_map
+from jaxvib.draw.whirl import campbell_diagram
 
 
 def branches(**options):
@@ -133,7 +134,18 @@ def test_the_rotor_is_drawn_beside_loads_at_its_speed(rotor, lines):
     t = np.linspace(0.0, 1.0, 401)
     wave = np.sin(80.0 * np.pi * t)[:, None]
     arrays = (t, wave, 100.0 + 1e-6 * wave, np.full_like(wave, rotor), wave)
-    assert len(time_histories(arrays, arrays, names=("y",), directions=("up",)).axes[3].lines) == lines
+    axis = time_histories(arrays, arrays, names=("y",), directions=("up",), unit="rad/s").axes[3]
+    assert len(axis.lines) == lines
+    assert [text.get_text() for text in axis.texts] == ["rotor outside the axis: 100.02 rad/s"][: 2 - lines]
+
+
+def test_labels_of_close_critical_speeds_are_below_their_curves():
+    n = np.linspace(0.0, 300.0, 7)
+    critical = np.array([150.0, 151.0]), np.array(["backward", "forward"])
+    axis = campbell_diagram(n, np.full((7, 1), 150.0), np.full((7, 1), "forward"), critical=critical, unit="rad/s").axes[0]
+    axis.figure.draw_without_rendering()
+    box = axis.texts[0].get_window_extent().transformed(axis.transData.inverted())
+    assert axis.texts[0].get_text() == "150 backward\n151 forward" and box.y1 < 0.8 * 150.0
 
 
 def test_small_motions_at_the_end_have_their_own_unit():
