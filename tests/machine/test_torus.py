@@ -188,6 +188,27 @@ def test_zero_friction_equals_no_friction():
     assert np.isfinite(slope) and float(slope) != 0.0
 
 
+def test_rolling_friction_has_its_slope_at_no_slip():
+    """Without slip the levers are 0; their derivatives are those at a slip of 1e-4 widths."""
+    loads, friction = balls(2), jv.RollingFriction(1e-4, width=0.1)
+    u, speed = (jnp.asarray([0.1, 2.0]), jnp.asarray([1.0, 0.5])), jnp.asarray(30.0)
+
+    def levers(slip):
+        found = friction.friction(loads, u, (speed + slip[0] * jnp.ones(2), slip[1] * jnp.ones(2)), speed, {})
+        return jnp.concatenate([found.lever, *found.others])
+
+    slopes = jax.jit(jax.jacfwd(levers))
+    np.testing.assert_allclose(levers(jnp.zeros(2)), 0.0)
+    np.testing.assert_allclose(slopes(jnp.zeros(2)), slopes(jnp.full(2, 1e-5 / RADIUS)), rtol=1e-6, atol=1e-13)
+    assert np.all(np.diagonal(np.asarray(slopes(jnp.zeros(2)))[::2]) < 0.0)
+
+
+def test_balls_side_by_side_on_the_outer_equator_touch():
+    loads = jv.torus_balls(count=3, mass=0.05, radius=0.1, tube=0.05, ball_radius=0.02)
+    x, y, _ = loads.position(loads.offsets(), jnp.full(3, 0.5 * jnp.pi))
+    np.testing.assert_allclose(np.hypot(np.diff(x), np.diff(y)), 2.0 * 0.02, rtol=1e-12)
+
+
 @pytest.mark.parametrize("along", ["axis", "up"])
 def test_rolling_friction_holds_a_ball_on_a_slope(along):
     """Up the wall of a tube that lies level, and along the outer equator of a ring that stands upright."""

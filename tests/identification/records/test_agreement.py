@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.identification.records.agreement import rotor_speed
+from jaxvib.identification.records.agreement import _factor, _Signal, rotor_speed
 
 T = np.arange(0.0, 20.0, 1e-3)
 SPEED = 20.0 + 4.0 * T + 3.0 * np.sin(0.7 * T)
@@ -51,6 +51,14 @@ TACHO = jv.Channel("tacho", "pulses"), None
 
 def speed(unit=None):
     return jv.Channel("n", "speed", unit=unit)
+
+
+def test_the_time_at_which_records_begin_changes_no_factor():
+    def factor(begin):
+        pairs = (("velocity", FIRST[1]), ("acceleration", FIRST[2]))
+        return _factor(*(_Signal(sensor(kind), T + begin, value) for kind, value in pairs))
+
+    assert factor(0.0) == pytest.approx(1.0, abs=0.01) and factor(64.0) == pytest.approx(factor(0.0), rel=1e-9)
 
 
 def test_agreeing_channels_have_no_notes():
