@@ -22,6 +22,9 @@ from jaxvib.units.known import require_known, when_known
 _MAX_ASYMMETRY = 1e-9
 """Largest asymmetry of a matrix, relative to its largest entry, in double precision."""
 
+_EQUAL_SQUARES = 1e-6
+"""Relative difference of squared natural frequencies that are equal, in addition to rounding."""
+
 _REDUCTION_ERROR = 1e-6
 """Largest error of the eigenvalues of a reduced matrix, relative to its largest entry: rounding at omitted high frequencies."""
 
@@ -120,7 +123,8 @@ def from_matrices(
       displacement from q; all places have the same number of directions
     - `foundation`: (T_K, T_C), two arrays (nb, nd): the force on the foundation is T_K q + T_C q', up (nb = 1) or horizontal
       and up (nb = 2); default: the force is unknown, and results that depend on it are NaN
-    - `reduce`: largest number of coordinates; typical: 6 to 20 (default: 12); None keeps all
+    - `reduce`: largest number of coordinates; typical: 6 to 20 (default: 12); None keeps all. If the last mode has the same
+      natural frequency as omitted ones, such as the other direction of a round shaft, these modes are kept as well
 
     **Returns** `MatrixMachine`.
 
@@ -155,9 +159,17 @@ def from_matrices(
 
 
 def _lowest_modes(mass: Array, stiffness: Array, number: int) -> Array:
-    """Return the lowest real normal modes (nd, number), with the modal masses 1."""
+    """Return the lowest real normal modes (nd, number or more), with the modal masses 1: all of equal natural frequencies."""
     square, inverse = relative_to(mass, stiffness)
-    return inverse.T @ hermitian_modes(square)[1][:, :number]
+    squares, modes = hermitian_modes(square)
+    equal = when_known(lambda values: _number_of_equal(values, number), squares)
+    return inverse.T @ modes[:, : equal or number]
+
+
+def _number_of_equal(squares: np.ndarray, number: int) -> int:
+    """Return how many of the ascending `squares` of natural frequencies are below or equal to the one with this number."""
+    rounding = 64.0 * squares.size * float(np.finfo(squares.dtype).eps) * squares[-1]
+    return int(np.sum(squares <= (1.0 + _EQUAL_SQUARES) * squares[number - 1] + rounding))
 
 
 def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:

@@ -150,6 +150,15 @@ def test_reduced_model_has_the_lowest_frequencies():
     np.testing.assert_allclose(np.abs(machine.rows_at(1))[0], shape, rtol=1e-9)
 
 
+@pytest.mark.parametrize(("kept", "size"), [(4, 4), (5, 6), (6, 6)])
+def test_reduced_models_keep_both_modes_of_equal_frequencies(kept, size):
+    chain = np.kron(4e4 * (2 * np.eye(8) - np.eye(8, k=1) - np.eye(8, k=-1)), np.eye(2))
+    machine = jv.from_matrices(2.0 * np.eye(16), 1e-4 * chain, chain, places=[[6, 7]], reduce=kept)
+    across = machine.places_rows[0] @ machine.places_rows[0].T
+    assert machine.mass.shape == (size, size)
+    np.testing.assert_allclose(across, across[0, 0] * np.eye(2), atol=1e-12)
+
+
 def test_gradients_of_reduced_models_with_equal_frequencies():
     """Two equal planes; all squares of the frequencies are proportional to the factor of the stiffness."""
     chain = np.kron(np.eye(2), 4e4 * (2 * np.eye(8) - np.eye(8, k=1) - np.eye(8, k=-1)))
