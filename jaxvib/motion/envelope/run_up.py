@@ -107,12 +107,12 @@ class MotorRunUp(Result):
             lines.append(f"  all pass with torques of at least {float(self.least_torque):.3g} times those of the motors")
             lifting = _lifting_factor(self.scene)
             if abs(float(self.least_torque) - lifting) < _LIFTING_SHARE * lifting:
-                lines.append(f"  (with {lifting:.3g} times a motor just lifts its unbalance)")
+                lines.append(f"  (with {lifting:.3g} times its torque a motor just lifts its unbalance)")
         return "\n".join(lines)
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
-        """Plot the histories of the run-up with the natural frequencies. **Arguments**: `unit` and `ax` as `Run.plot`."""
+        """Plot the histories of the run-up with the natural frequencies. **Arguments**: `unit` and `ax` as in `Run.plot`."""
         return plot_histories(self.run, resonances=self.resonances.tolist(), unit=unit, ax=ax)
 
 
@@ -158,14 +158,14 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     ideal drive. The peaks of a single run can be half as large. Compared with the full equations from the same angles without
     gravity, the peaks have errors of 2 % for a screen that passes its resonances within two turns.
 
-    **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between capture and
-    passage use `simulate`. The torque of a motor with currents is its steady torque here. This changes neither the speed at
-    which a resonance holds the motor nor the fold at which the resonance releases it. It can change the outcome of a run-up if
-    the time constant of the currents (L/R of a DC motor) is longer than the decay time of the vibration: the motor may then
-    pass a resonance that catches it in the averaged equations. Use `simulate` for such motors.
+    **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between passing a
+    resonance and being caught use `simulate`. The torque of a motor with currents is its steady torque here. This changes
+    neither the speed at which a resonance holds the motor nor the fold at which the resonance releases it. It can change the
+    outcome of a run-up if the time constant of the currents (L/R of a DC motor) is longer than the decay time of the vibration:
+    the motor may then pass a resonance that catches it in the averaged equations. Use `simulate` for such motors.
 
-    **Raises** `InputError` for a scene without a motor, for a motor that is switched off before the end, and as `envelope`. A
-    run that fails has a status.
+    **Raises** `InputError` for a scene without a motor, for a motor that is switched off before the end, and for the reasons of
+    `envelope`. A run that fails has a status.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -176,7 +176,7 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     >>> found.status_name, found.caught_at.tolist(), round(float(found.resonances[0]), 1), round(float(found.speed[0]))
     ('caught', [1], 14.1, 14)
 
-    Source: I. I. Blekhman, Vibrational Mechanics, 2000; the criterion of capture is derived here.
+    Source: I. I. Blekhman, Vibrational Mechanics, 2000; the criterion for being caught is derived here.
     """
     scene = validate_scene(scene)
     if all(exciter.drive.ideal for exciter in scene.exciters):
@@ -205,7 +205,8 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
 
 
 def _require_switched_on(scene: Scene, end: Array) -> None:
-    """**Raises** `InputError` for a motor that is switched off before the end of the run: its speed shows no capture."""
+    """**Raises** `InputError` for a motor that is switched off before the end of the run: its speed does not show
+    whether a resonance catches it."""
     for k, exciter in enumerate(scene.exciters):
         if isinstance(off := exciter.drive, SwitchedOff) and float(off.at) < float(end):
             problem = f"switches the motor off at {float(off.at):g} s, before the end of the run-up at {float(end):g} s"

@@ -70,7 +70,7 @@ def test_motor_too_weak_for_gravity_has_a_status():
         in found.summary()
     )
     least = dataclasses.replace(found, least_torque=jnp.asarray(0.7246 * S * 9.80665 / 2.8 * 1.005))
-    assert "with 1.02 times a motor just lifts its unbalance" in least.summary()
+    assert "with 1.02 times its torque a motor just lifts its unbalance" in least.summary()
     assert "just lifts" not in dataclasses.replace(least, least_torque=jnp.asarray(2.0)).summary()
 
 
