@@ -122,7 +122,7 @@ def jammed_bodies(linear: JammedModel) -> JammedBodies:
 def require_periodic_jams(scene: Scene) -> CircularLoads:
     """Return the loads of a scene whose jams are periodic.
 
-    **Raises** `InputError` for an unbalanced rotor, and as `jammed_loads`.
+    **Raises** `InputError` for an unbalanced rotor, and for the reasons of `jammed_loads`.
     """
     loads = jammed_loads(scene)
     _require_balance(scene.all_effects)

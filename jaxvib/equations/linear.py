@@ -255,7 +255,7 @@ class JammedModel(ExcitedModel):
 
 
 def jammed_model(scene: Scene) -> JammedModel:
-    """Return the carrier of a scene with its jammed loads, see `JammedModel`. **Raises** `InputError` as `jammed_loads`."""
+    """Return the carrier of a scene with its jammed loads, see `JammedModel`. **Raises** `InputError` like `jammed_loads`."""
     loads, model = jammed_loads(scene), linear_model(scene)
     linear = model.scene, model.carrier, model.mounts, model.supports, model.mass
     return JammedModel(*linear, loads.unbalance(), loads.drag_sum(), model.direction)

@@ -26,7 +26,7 @@ _FREQUENCIES = 2**14
 """Number of frequencies at which a spectral density is evaluated."""
 
 _EXPECTATIONS = 40
-"""Number of iterations of expectation and maximization for the distribution of outliers."""
+"""Number of iterations of the expectation-maximization algorithm for the distribution of outliers."""
 
 _MAX_COMPARED = 100_000
 """Largest number of residuals from which the distribution of outliers is estimated."""

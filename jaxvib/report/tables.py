@@ -91,8 +91,8 @@ def _map_numbers(
     convert: Callable[[str, float, tuple[int, int]], float | str],
     place: tuple[int, int] = (0, 0),
 ) -> Plain:
-    """Apply `convert`, a function of the name, the number, and its place in and the length of its list ((0, 0) outside lists),
-    to all numbers of a plain value except Booleans."""
+    """Apply `convert` to all numbers of a plain value except Booleans. Its arguments are the name, the number, and a pair: the
+    index of the number in its list and the length of the list, (0, 0) outside lists."""
     if isinstance(value, Mapping):
         return {key: _map_numbers(entry, key, convert) for key, entry in value.items()}
     if isinstance(value, list):

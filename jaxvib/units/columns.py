@@ -1,4 +1,4 @@
-"""Names and units in the headers of columns and in the descriptions of channels, in the spellings of laboratories."""
+"""Names and units in the headers of columns and in descriptions of channels, with the spellings common in laboratories."""
 
 from __future__ import annotations
 
@@ -84,7 +84,8 @@ def unit_factor(unit: str, si: str) -> float | None:
 
 
 def split_head(head: str, si: str) -> tuple[str, str]:
-    """Return the name and the unit of a column's head: `name (unit)`, `name / unit`; `name_unit` for a usual unit of `si`.
+    """Return the name and the unit of the header of a column: `name (unit)`, `name / unit`, or `name_unit` for a unit in the
+    dimension of `si`.
 
     >>> split_head("frame [mm/s]", "m/s"), split_head("ANGLE_DEG", "rad"), split_head("acc_1", "m/s^2")
     (('frame', 'mm/s'), ('ANGLE', 'DEG'), ('acc_1', ''))

@@ -87,8 +87,8 @@ _AMBIGUOUS = (
     (re.compile(r"(?<![^\W\d])tons?(?!\w)"), "1000 kg or 907 kg; write t or short_ton"),
     (re.compile(r"(?<![^\W\d])gr(?!\w)"), "grams or grains; write g or grain"),
 )
-"""Names with several meanings: Grad are degrees in German, gon in mathematics and on calculators; pint would read `gigaradian`,
-the ton of the United States, and grains."""
+"""Names with several meanings: Grad means degrees in German, gon in mathematics and on calculators; pint would read
+`gigaradian`, the ton of the United States, and grains."""
 
 _FACTORS = {
     "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3},
@@ -165,8 +165,8 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
 
 
 def require_real(value: object, unit: str, field: str) -> None:
-    """Check that a value is a real number or an array of real numbers. Every number that is neither text nor a quantity of
-    another library than pint is checked by this function.
+    """Check that a value is a real number or an array of real numbers. All arguments are checked by this function, except texts
+    and quantities of libraries other than pint.
 
     **Raises** `InputError` for Booleans, complex numbers, dates, masked values, bytes, lists, None and objects that are not
     numbers.

@@ -102,8 +102,8 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
     S is the common unbalance of the loads, r the displacement of the exciter's axis that it causes, A the receptance of the
     mount and e the rotating direction of the force. For a mount with two directions e^H A e is the trace of A plus a term of
     the gyroscopic coupling. If f < 0, the displacement of the axis is on average opposite to the loads, and they spread until
-    they balance; if f > 0, they gather. The paper states this for two or more loads, as an approximation; `balanced_stability`
-    has the exact result.
+    they balance; if f > 0, they gather. The paper states this for two or more loads, as an approximation;
+    `balanced_states(scene).stability()` has the exact result.
 
     **Arguments**: `unbalance` S kg m; default: that of all loads at one point.
 

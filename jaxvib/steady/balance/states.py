@@ -339,7 +339,7 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
 
     **Raises** `InputError` for angles at which the loads do not cancel, for a machine that can drift, for effects that disturb
     the balanced motion (gravity), for a rotor so slow that the steps of a turn cannot resolve the vibration of a weakly damped
-    carrier, and as `balanced_states`; `ComputationError` with its status if the loads cannot cancel.
+    carrier, and for the reasons of `balanced_states`; `ComputationError` with its status if the loads cannot cancel.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -373,7 +373,7 @@ def balanced_growth(scene: Scene, speeds: Numbers, angles: ArrayLike | None = No
     - `speeds`, rad/s, an array of any shape; or a list, also of strings with a unit
     - `angles` and `steps`: as for `balanced_stability`
 
-    **Returns** an array of the shape of `speeds`. **Raises** as `balanced_stability`.
+    **Returns** an array of the shape of `speeds`. **Raises** the errors of `balanced_stability`.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -402,11 +402,11 @@ def balanced_intervals(
     stable.
 
     The intervals are searched for on `points` speeds (typical: 200, the default), and their ends are refined by bisection to
-    1e-7 of the speed. An interval narrower than the spacing of the points can be missed. The intervals of the criterion for
-    the same range are `criterion(scene).balancing`. `angles` and `steps`: as for `balanced_stability`.
+    1e-7 of the speed. An interval narrower than the spacing of the points can be missed. The intervals of the criterion for the
+    same range are `criterion(scene).balancing`. `angles` and `steps`: as for `balanced_stability`.
 
-    **Returns** a list of pairs, rad/s, which is printed in the unit of `display_units`. **Raises** as `balanced_stability`, and
-    `InputError` for an empty range.
+    **Returns** a list of pairs, rad/s, which is printed in the unit of `display_units`. **Raises** the errors of
+    `balanced_stability`, and `InputError` for an empty range.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)

@@ -99,7 +99,8 @@ def drag_limits(scene: Scene, *, phases: bool = False) -> DragLimits:
 
     **Returns** `DragLimits`. Its derivatives are exact without `phases`; with `phases` there are none.
 
-    **Raises** `InputError` as `jam_modes` or `phase_jams`, and for dry friction, which is not multiplied with the drag.
+    **Raises** `InputError` for the reasons of `jam_modes` or `phase_jams`, and for dry friction, which is not multiplied with
+    the drag.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

@@ -77,19 +77,20 @@ class CriterionMap(Result):
 def criterion_map(
     scene: Scene, *, speeds: Sequence[float], mass: Sequence[float], drag: Sequence[float], steps: int | None = None
 ) -> CriterionMap:
-    """Compare `criterion` with `balanced_growth` over rotor speed, load mass and drag.
+    """Compare `criterion` with the exact stability of the balanced motion over rotor speed, load mass and drag.
 
     **Arguments**
 
     - `scene` with loads on a circle; exact stability is that of the first arrangement of `balanced_states`
     - `speeds`, rad/s, ascending; typical: 50 to 200 from half the lowest to twice the highest resonance
     - `mass` and `drag`: factors greater than 0, times the mass and the drag of the scene's loads; typical: 0.1 to 10
-    - `steps`: as for `balanced_stability`; default: the number that the natural frequencies need. The time is proportional to
-      it
+    - `steps`: as for `balanced_states(scene).stability`; default: the number that the natural frequencies need. The time is
+      proportional to it
 
     **Returns** `CriterionMap`.
 
-    **Raises** `InputError` for values that are not positive or not ascending, and the errors of `balanced_stability`.
+    **Raises** `InputError` for values that are not positive or not ascending, and the errors of
+    `balanced_states(scene).stability`.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
