@@ -150,13 +150,17 @@ class Regime(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the loads on a circle at their `phase`, relative to the first load or to the rotor."""
+        """Plot the loads on a circle at their `phase`, relative to the first load or to the rotor.
+
+        There is no arrow of the loads' mean if they turn with the rotor: its imbalance, and the planes of the loads, also
+        contribute to the remaining unbalance, which the title states.
+        """
         from jaxvib.draw.results import phase_circles  # slow import
 
-        title = self.label
-        if self.label in ("balanced", "unbalanced"):
+        title, is_relative_to_rotor = self.label, self.label in ("balanced", "unbalanced")
+        if is_relative_to_rotor:
             title += f"\n{100.0 * float(self.unbalance):.2g} % of the loads' unbalance left"
-        return phase_circles([(title, np.asarray(self.phase))], ax=ax)
+        return phase_circles([(title, np.asarray(self.phase))], resultant=not is_relative_to_rotor, ax=ax)
 
 
 @validated

@@ -4,6 +4,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from papers.machines import published_rotor
@@ -68,6 +69,14 @@ def test_regimes_of_prescribed_motions(name):
     assert pattern is None or found.pattern_label == pattern
     assert int(found.mode) == mode
     assert str(jv.RegimeName[found.name]) in found.summary()
+
+
+@pytest.mark.parametrize("name", ["together", "imbalance is balanced"])
+def test_figures_show_a_mean_of_jammed_loads_only(name):
+    """The mean of loads that balance an imbalance is not the unbalance that is left."""
+    (axis,) = jv.regime(*made(**CASES[name][0])).plot().axes
+    assert ("resultant" in axis.get_title()) == (name == "together")
+    plt.close("all")
 
 
 @pytest.mark.parametrize(("effects", "label"), [((), "balanced"), ((jv.MomentImbalance(2e-3),), "unbalanced")])
