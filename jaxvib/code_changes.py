@@ -158,7 +158,7 @@ def code_state(*, look: bool = False) -> CodeState:
     return _code.state
 
 
-def clear_derived() -> None:
+def clear_function_caches() -> None:
     """Clear the caches (`functools.cache`) of all functions of both packages, except in `jaxvib.runtime` and this module."""
     for module in [module for module in list(sys.modules.values()) if isinstance(module, _WatchedModule)]:
         for value in list(vars(module).values()):

@@ -34,7 +34,7 @@ def _(load_scene, mo, served_path, sliders_of):
 
 @app.cell
 def _(InputError, current, html, mo, path, scene, set_problem, set_starts, sliders, typed_value):
-    def put(typed):
+    def set_slider(typed):
         try:
             slider = sliders[typed["name"]]
             set_starts({**current, slider.name: typed_value(scene, slider, typed["value"])})
@@ -47,7 +47,9 @@ def _(InputError, current, html, mo, path, scene, set_problem, set_starts, slide
     )
     value = mo.ui.text(placeholder="number", full_width=True)
     field = (
-        mo.md("{name}\n\n{value}").batch(name=names, value=value).form(submit_button_label="Set", bordered=False, on_change=put)
+        mo.md("{name}\n\n{value}")
+        .batch(name=names, value=value)
+        .form(submit_button_label="Set", bordered=False, on_change=set_slider)
     )
     # The file name is escaped because it may contain HTML.
     mo.sidebar([mo.Html(f"<b>{html.escape(path.name)}</b>"), field], width="22rem")

@@ -29,7 +29,7 @@ import numpy as np
 from jax import Array, export
 from jax.sharding import Sharding, SingleDeviceSharding
 
-from jaxvib.code_changes import CodeState, clear_derived, code_state, digest_of_sources
+from jaxvib.code_changes import CodeState, clear_function_caches, code_state, digest_of_sources
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import evaluating, no_host_checks, without_source_locations
 from jaxvib.runtime.cpu import processor
@@ -376,7 +376,7 @@ def _current_code(*, look: bool = False) -> CodeState:
     if state != _traced_code[0]:
         with _clearing:
             if state != _traced_code[0]:
-                clear_derived()
+                clear_function_caches()
                 eqx.clear_caches()
                 jax.clear_caches()
                 _traced_code[0] = state

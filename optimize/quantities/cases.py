@@ -110,7 +110,7 @@ class Under(_DerivedQuantity):
         return self._value_of_cases(evaluation, lambda inner: self.parts[0].pieces(inner, sign))
 
     def _value_of_cases(self, evaluation: Evaluation, compute: Callable[[Evaluation], Array]) -> Array:
-        scene, path = evaluation.under(self.case)
+        scene, path = evaluation.in_case(self.case)
         inner = Evaluation(scene, evaluation.near_speeds, path)
         value = compute(inner)
         evaluation.speeds.update(inner.speeds)
@@ -141,7 +141,7 @@ class Robust(_DerivedQuantity):
 
     def _sampled(self, evaluation: Evaluation, compute: Callable[[Evaluation], Array]) -> Array:
         """Return the values of all samples, (samples, ...)."""
-        scenes, path = evaluation.under(self.case)
+        scenes, path = evaluation.in_case(self.case)
         near_speeds, keys = evaluation.near_speeds, []
         near: tuple[Array, ...] | None = None
         if not isinstance(near_speeds, TargetRecorder) and near_speeds is not None:

@@ -29,8 +29,7 @@ from jaxvib.steady.regimes.working import working_regime
 from jaxvib.units.known import is_known
 
 _NO_FOLD = 10.0
-"""Rotor speed that stands for a missing fold at the end of a mode toward higher rotor speeds, divided by the rotor speed of
-the scene."""
+"""Rotor speed that stands for a missing fold at the upper end of a mode, in multiples of the rotor speed of the scene."""
 
 _RUN_UP_SAMPLES = 4000
 """Number of stored states of a run-up."""
@@ -138,7 +137,7 @@ class Evaluation:
         rotor_speeds = []
         for side in ("below", "above"):
             key: Key = (self.path, (side, mode))
-            near = guesses(self.modes, (side, mode)) if self.near_speeds is None else self.near_speeds[key]
+            near = speed_of_target(self.modes, (side, mode)) if self.near_speeds is None else self.near_speeds[key]
             exists = jnp.isfinite(near)
             omega, speed = follow_fold(self.jammed, jnp.where(exists, near, 1.0))
             self.speeds[key] = jnp.where(exists, omega, near)
@@ -201,8 +200,8 @@ class Evaluation:
         return 60.0 * 2.0 * np.pi / numpy_of(frequencies).where(frequencies > 0.0, frequencies, speed).min()
 
     def keep_run(self, motion: int | Literal["working"], run: Run) -> None:
-        """Store a run that has settled in a jam mode or in the working regime; quantities then use it and integrate no
-        other."""
+        """Store a run that has settled in a jam mode or in the working regime; quantities then use it in place of a
+        new run."""
         self._runs["working" if motion == "working" else ("jam", motion)] = run
 
     def start_up(self, until: float, spin_up: float | None) -> Run:
@@ -221,7 +220,7 @@ class Evaluation:
             self._runs[key] = integrate(estimate=False, adjoint=adjoint, throw=False)
         return self._runs[key]
 
-    def under(self, case: Case) -> tuple[Scene, tuple[Case, ...]]:
+    def in_case(self, case: Case) -> tuple[Scene, tuple[Case, ...]]:
         """Return the scene of a case (several: arrays with a leading axis), and its `path`."""
         return case.scenes(self.scene), (*self.path, case)
 
@@ -233,8 +232,8 @@ def require_foundation(scene: Scene) -> None:
         raise InputError("machine.foundation", problem)
 
 
-def guesses(modes: JamModes, target: Target) -> Array:
-    """Return the load speed, rad/s, of a target from the jam modes of a scene.
+def speed_of_target(modes: JamModes, target: Target) -> Array:
+    """Return the load speed of a target, rad/s, which is contained in the jam modes of a scene.
 
     The value is NaN for a jam that does not exist, and -inf ("below") or inf ("above") for a fold that does not exist.
     """

@@ -29,7 +29,7 @@ from jaxvib.runtime.operations import program_digest
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import JamModes, jam_modes
-from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, guesses
+from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, speed_of_target
 from optimize.quantities.quantity import BuiltinQuantity, Demand, Quantity, walk
 from optimize.space import DesignSpace, HeldQuantity
 
@@ -255,7 +255,11 @@ def _speeds_of_branches(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ..
 
         def guess(path: tuple, target: tuple[str, int]) -> Array:
             modes = paths[path]
-            return jax.vmap(lambda m: guesses(m, target))(modes) if modes.omega.ndim > 1 else guesses(modes, target)
+            return (
+                jax.vmap(lambda m: speed_of_target(m, target))(modes)
+                if modes.omega.ndim > 1
+                else speed_of_target(modes, target)
+            )
 
         return tuple(guess(path, target) for path, target in keys)
 

@@ -200,11 +200,11 @@ def test_the_page_sets_a_slider_to_a_typed_number(one_mass, tmp_path, monkeypatc
 
     _, found = app.run()
     before = found["starts"]()
-    found["put"]({"name": "stiffness of the support, N/mm", "value": "9000"})
+    found["set_slider"]({"name": "stiffness of the support, N/mm", "value": "9000"})
     assert found["problem"]() == "stiffness of the support is 9000 N/mm; the slider is from 5 to 500 N/mm"
     assert found["starts"]() == before
     found["current"]["loads.mass"] = 1000.0  # a slider that was moved keeps its place
-    found["put"]({"name": "stiffness of the support, N/mm", "value": "43.7"})
+    found["set_slider"]({"name": "stiffness of the support, N/mm", "value": "43.7"})
     assert found["problem"]() == ""
     assert found["starts"]() == {**before, "machine.stiffness[0]": 43.7, "loads.mass": 1000.0}
 

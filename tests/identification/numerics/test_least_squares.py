@@ -331,7 +331,7 @@ def test_largest_change_of_the_noise():
     heavy = [[Noise(np.ones(1), 1.0, 0.1, 5.0)]]
     clipped = problem_with()._replace(bounds=(np.zeros((N, 2)), np.ones((N, 2))))
     cases = [(problem_with(), noise(1.0)), (problem_with(), heavy), (clipped, noise(1.0))]
-    assert [fit._has_scores(*case) for case in cases] == [False, True, True]
+    assert [fit._has_changing_weights(*case) for case in cases] == [False, True, True]
 
 
 def test_corrected_steps_follow_a_curved_valley():

@@ -11,7 +11,7 @@ from scenes import scene
 import jaxvib as jv
 from optimize import amplitude, fold_margin, foundation_force, phase, total
 from optimize.quantities import evaluation as answers_module
-from optimize.quantities.evaluation import Evaluation, TargetRecorder, guesses
+from optimize.quantities.evaluation import Evaluation, TargetRecorder, speed_of_target
 from optimize.quantities.jams import between
 from optimize.quantities.user_inputs import count_required_arguments, same_unit
 
@@ -70,10 +70,10 @@ def test_guesses_are_the_jam_and_the_folds_beside_it(modes):
     folds = np.sort(np.asarray(modes.folds.omega)[np.asarray(modes.folds.exists)])
     for mode in (3, 4):
         omega = float(modes.select(mode).omega)
-        assert float(guesses(modes, ("jam", mode))) == omega
-        np.testing.assert_allclose(guesses(modes, ("below", mode)), folds[folds < omega].max())
-        np.testing.assert_allclose(guesses(modes, ("above", mode)), folds[folds > omega].min())
-    assert not np.isfinite(guesses(modes, ("above", 5))) and np.isfinite(guesses(modes, ("below", 5)))
+        assert float(speed_of_target(modes, ("jam", mode))) == omega
+        np.testing.assert_allclose(speed_of_target(modes, ("below", mode)), folds[folds < omega].max())
+        np.testing.assert_allclose(speed_of_target(modes, ("above", mode)), folds[folds > omega].min())
+    assert not np.isfinite(speed_of_target(modes, ("above", 5))) and np.isfinite(speed_of_target(modes, ("below", 5)))
 
 
 def test_margins_are_to_the_nearer_fold(modes):

@@ -34,7 +34,7 @@ from optimize import (
     worst,
 )
 from optimize.quantities import evaluation
-from optimize.quantities.evaluation import Evaluation, guesses
+from optimize.quantities.evaluation import Evaluation, speed_of_target
 from optimize.search.problem import find_targets
 
 OFF = {"machine.stiffness": 0.05}
@@ -97,7 +97,7 @@ class Routes:
 
         def of(scene, path, asked):
             if not path:
-                return guesses(jv.jam_modes(scene), asked)
+                return speed_of_target(jv.jam_modes(scene), asked)
             at = path[0].scenes(scene)
             return jax.vmap(lambda s: of(s, path[1:], asked))(at) if path[0].several else of(at, path[1:], asked)
 
