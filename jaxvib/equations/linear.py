@@ -301,14 +301,17 @@ def estimated_frequencies(scene: Scene) -> Array:
 
 @cached
 def _natural_frequencies(scene: Scene) -> tuple[Array, Array]:
-    """Return the natural frequencies (nd,) rad/s, and for each True if it is lost in rounding errors."""
+    """Return the natural frequencies (nd,) rad/s, and flags (nd,) that are True for those lost in rounding errors."""
     model = linear_model(scene)
     frequencies, shapes = model.modes()
     return frequencies, lost_frequencies(model, frequencies, shapes)
 
 
 def lost_frequencies(model: LinearModel, frequencies: Array, shapes: Array) -> Array:
-    """Return True for each of the natural frequencies (nd,) that is lost in rounding errors; `shapes` (nd, nd) has columns."""
+    """Return True for each of the natural frequencies (nd,) that is lost in rounding errors.
+
+    **Arguments**: `shapes` (nd, nd): the mode shapes, one in each column.
+    """
     w, x, mass, carrier = jax.lax.stop_gradient((frequencies, shapes, model.mass, model.carrier))
     lost = hermitian_error((carrier.stiffness, mass), w**2, x) > 2.0 * MAX_EIGENVALUE_ERROR
     # A motion of frequency 0 is free to drift unless a spring to the foundation resists it.

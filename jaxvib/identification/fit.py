@@ -1,9 +1,9 @@
 """Least-squares fit of a machine to recorded runs by the method of Levenberg and Marquardt with projected linear unknowns.
 
-At every trial the linear unknowns (first states, unbalances, offsets) are those of least squares. Only the other unknowns are
-damped. The noise of each channel follows from its residuals, and the fit is repeated with residuals filtered to white noise.
-Outliers among the residuals have little influence; a clipped reading is a bound of the true value. If the error of a rotor's
-angle is not small compared with the noise, the angle is fitted together with the machine.
+At every trial the linear unknowns (first states, unbalances, offsets) are computed by linear least squares. Only the steps of
+the other unknowns are damped. The noise of each channel follows from its residuals, and the fit is repeated with residuals
+filtered to white noise. Outliers among the residuals have little influence; a clipped reading is a bound of the true value. If
+the error of a rotor's angle is not small compared with the noise, the angle is fitted together with the machine.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _NEAR_REDUCTION = 0.1
 """Expected relative reduction of the cost below which undamped steps are tried first."""
 
 _VALLEY_STEPS = 3
-"""Number of undamped steps after the first one."""
+"""Largest number of undamped steps that follow the first one along a curved valley of the cost."""
 
 _PROBE, _LONGEST_CORRECTION = 0.1, 0.75
-"""Share of a step for the difference that gives the second derivative of the model, and the largest length of the correction
-relative to the step."""
+"""Fraction of a step after which a difference gives the second derivative of the model along the step, and largest length of
+the correction by this derivative, relative to the step."""
 
 _CONVERGED = 1e-2
 """Length of the next undamped step, in standard errors, below which the fit has converged."""
@@ -49,7 +49,8 @@ _STEADY_VALUES = 0.05
 
 _MAX_GROWTH = 1.2
 """Standard deviation of residuals, relative to that of a fit with white noise, above which the coloured noise contains a part
-of the motion. The noise then has the frequencies of the machine: a free decay can be noise or motion."""
+of the motion. The noise then has the frequencies of the machine, because a free decay of its vibration can be attributed
+to noise or to motion."""
 
 _ANGLE_MATTERS = 0.03
 """Share of the noise due to the error of the rotor's angle above which the angle is fitted with the machine."""
@@ -159,7 +160,7 @@ def project(problem: Problem, x: np.ndarray) -> _Trial:
     matrix, right, square = total[:-1, :-1], total[:-1, -1], total[-1, -1]
     if not np.all(np.isfinite(total)):
         return _Trial(x, np.zeros(len(right)), np.inf)
-    damping = np.zeros(len(right))  # of the steps of known unbalances, whose angles may be undetermined
+    damping = np.zeros(len(right))  # limits the steps of known unbalances, whose angles may be undetermined
     for k, known in enumerate(problem.unbalances):
         damping[2 * k : 2 * k + 2] = 0.0 if known is None else 1.0 / known.value**2
     linear = solved(matrix + np.diag(damping), right)
@@ -176,15 +177,15 @@ def _nonlinear_trial(problem: Problem, x: np.ndarray, linear: np.ndarray) -> _Tr
     return _Trial(x, linear, nonlinear_cost(problem, x, linear, nonlinear_differences(problem, x, linear)))
 
 
-def nonlinear_cost(problem: Problem, x: np.ndarray, linear: np.ndarray, left: np.ndarray) -> float:
-    """Return the cost of the differences `left` and of the known values; infinite for a motion that diverges."""
+def nonlinear_cost(problem: Problem, x: np.ndarray, linear: np.ndarray, differences: np.ndarray) -> float:
+    """Return the cost of the `differences` and of the known values; infinite for a motion that diverges."""
     with np.errstate(over="ignore", invalid="ignore"):
-        cost = known_cost(problem, x, linear) + float(np.sum(left**2))
+        cost = known_cost(problem, x, linear) + float(np.sum(differences**2))
     return cost if np.isfinite(cost) else np.inf
 
 
 def nonlinear_differences(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """Return the weighted differences, readings minus model, of a nonlinear motion, those of all runs in one array."""
+    """Return the weighted differences, readings minus model, of a nonlinear motion; one array contains those of all runs."""
     pairs = zip(problem.runs, linear_indices(problem), strict=True)
     return np.concatenate(
         [motion_differences(problem.unknowns, each, problem.scene, x, linear[indices]) for each, indices in pairs]
@@ -208,7 +209,7 @@ def _linear_equations(problem: Problem, x: np.ndarray) -> np.ndarray:
 
 
 def linear_at(problem: Problem, x: np.ndarray, unbalance: np.ndarray | None) -> np.ndarray:
-    """Return the best linear unknowns at `x`, with the components (a, b) of each unbalance if they are not None."""
+    """Return the best linear unknowns at `x`, with the components (a, b) of each unbalance as given, if not None."""
     if unbalance is None:
         return project(problem, x).linear
     total, n = _linear_equations(problem, x), unbalance.size
@@ -363,8 +364,8 @@ def descend(
 def _damped_step(
     best: Any, damped: np.ndarray, gradient: np.ndarray, bend: Callable[[Any, np.ndarray], np.ndarray] | None
 ) -> np.ndarray | None:
-    """Return a damped step with its second-order correction; None if the correction is longer than three quarters of the step,
-    in multiples of the scale of each unknown."""
+    """Return a damped step with its second-order correction; None if the correction is longer than three quarters of the step
+    (each unknown is measured in its own scale)."""
     step = solved(damped, gradient)
     if bend is None:
         return step
@@ -461,7 +462,7 @@ def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
             return with_white_noise._replace(is_absorbed=True)
         matrix = fitted.information + fitted.prior
         change = np.concatenate([fitted.x - before, np.zeros(fitted.linear.size)])
-        is_final = bool(change @ matrix @ change < _STEADY_VALUES**2) or not _has_scores(problem, noise)
+        is_final = bool(change @ matrix @ change < _STEADY_VALUES**2) or not _has_changing_weights(problem, noise)
     return fitted
 
 
@@ -475,7 +476,7 @@ def _is_absorbed(noise: Sequence[Sequence[Noise]], before: Fitted, after: Fitted
     )
 
 
-def _has_scores(problem: Problem, noise: Sequence[Sequence[Noise]]) -> bool:
+def _has_changing_weights(problem: Problem, noise: Sequence[Sequence[Noise]]) -> bool:
     """Return True if the weights of the readings depend on the last fit, as they do with outliers and clipped readings."""
     heavy = any(each.outliers for of_run in noise for each in of_run)
     return heavy or any(np.any(each) for each in problem.bounds)

@@ -50,11 +50,17 @@ _MAX_DISTANCE = 20.0
 class _Profile:
     """Profile of one number of a fit.
 
-    **Attributes**: the `fitted` problem; `index` of the number in x, or of the exciter if `is_unbalance`; `center` and standard
-    error `spread` of the coordinate of the number (its entry of x, or the logarithm of the unbalance); `slopes` (p + L,):
-    change of all unknowns per change of the coordinate, of the unbalances as (logarithm of the size, angle); `floor`: the least
-    cost; `is_vanished`: True if the number is not distinguishable from 0; distances are then multiples of the standard error of
-    the number itself, not of its logarithm; `columns` (n, p + L + 1) of a nonlinear motion, see `nonlinear_columns`.
+    The coordinate of the number is its entry of x, or the logarithm of the unbalance.
+
+    **Attributes**
+
+    - `fitted`: the fit; `index` of the number in x, or of its exciter if `is_unbalance`
+    - `center` and `spread`: value and standard error of the coordinate
+    - `slopes` (p + L,): change of all unknowns per change of the coordinate; an unbalance is (logarithm of its size, angle)
+    - `floor`: the least cost
+    - `is_vanished`: True if the number is not distinguishable from 0; distances are then multiples of the standard error of the
+      number itself, not of its logarithm
+    - `columns` (n, p + L + 1) of a nonlinear motion, see `nonlinear_columns`
     """
 
     fitted: Fitted
@@ -148,10 +154,10 @@ class _Profile:
 
 
 def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[float, float]]:
-    """Return the distances of the ends of the intervals from the fitted values, by name, for the numbers for which the cost
-    is not a quadratic function. A distance is a change of the number's entry of x, or of the logarithm of an unbalance.
+    """Return, for each number for which the cost is not a quadratic function, the distances of both ends of its interval from
+    the fitted value, by name. A distance is a change of the number's entry of x, or of the logarithm of an unbalance.
 
-    A number that is not distinguishable from 0 has the lower distance minus infinity. Undetermined numbers are left out.
+    The lower distance of a number that is not distinguishable from 0 is minus infinity. Undetermined numbers are left out.
 
     **Arguments**: `fitted`, and `known`: the `Information` about its numbers.
     """
@@ -171,7 +177,7 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
         index = free_exciters[i - number_count] if is_unbalance else i
         center = math.log(sizes[index]) if is_unbalance else float(fitted.x[i])
         slopes, variance = elimination(data + prior, indices[[entry]])[:, 0], covariance[entry, entry]
-        if is_vanished:  # its information may be below the accuracy of the pseudoinverse
+        if is_vanished:  # the information about it may be below the accuracy of the pseudoinverse
             slopes, variance = np.zeros(len(data)), known.covariance[i, i]
         spread = math.sqrt(variance)
         profile = _Profile(fitted, index, is_unbalance, center, spread, slopes, floor, is_vanished, columns)

@@ -247,7 +247,8 @@ class Scene(Part):
         rotating = tuple(effect for effect in effects if not _acts_on_machine(effect))
         if exciters is None:
             if not isinstance(loads, Loads):
-                field, start = ("exciters", "are missing") if loads is None else ("loads", f"is {quoted(loads)}, no Loads")
+                problem = f"is {quoted(loads)}, which is not of the type Loads"
+                field, start = ("exciters", "are missing") if loads is None else ("loads", problem)
                 example = 'exciters=[Exciter(drive=ConstantSpeed("1500 rpm"), unbalance="1 kg m")]'
                 raise InputError(field, f"{start}; give {example}, or loads and a drive")
             exciters = (Exciter(loads, drive, effects=rotating),)

@@ -44,7 +44,7 @@ def solve_penalized(
     box: tuple[np.ndarray, np.ndarray],
     penalty: np.ndarray,
 ) -> Solved:
-    """Solve quadratic programs with penalized constraints, which are never infeasible:
+    """Solve quadratic programs whose constraints are penalized. A solution therefore always exists:
 
         min p.B p/2 + g.p + penalty (sum |A p + a| + sum max(0, C p + c)),     low <= p <= high
 
@@ -131,7 +131,7 @@ def _interior_point(program: _Program, x: np.ndarray, slack: np.ndarray, dual: n
     quadratic, linear, rows, right = program
     s, m = right.shape
     scale = 1.0 + np.abs(linear).max(axis=1)
-    best, least_residual, mark, improved = (x, dual), np.full(s, np.inf), np.full(s, np.inf), np.zeros(s, int)
+    best, least_residual, halved_residual, halved_at = (x, dual), np.full(s, np.inf), np.full(s, np.inf), np.zeros(s, int)
     for k in range(_MAX_NEWTON_STEPS):
         stationary = _times(quadratic, x) + linear + _times(np.swapaxes(rows, 1, 2), dual)
         primal = _times(rows, x) + slack - right
@@ -139,16 +139,17 @@ def _interior_point(program: _Program, x: np.ndarray, slack: np.ndarray, dual: n
         # The best point is stored, because rounding errors may make later points worse.
         residual = np.maximum(np.maximum(gap, np.abs(stationary).max(axis=1)) / scale, np.abs(primal).max(axis=1))
         better = residual < least_residual
-        improved, mark = np.where(residual < 0.5 * mark, k, improved), np.where(residual < 0.5 * mark, residual, mark)
+        is_halved = residual < 0.5 * halved_residual
+        halved_at, halved_residual = np.where(is_halved, k, halved_at), np.where(is_halved, residual, halved_residual)
         least_residual = np.where(better, residual, least_residual)
         best = np.where(better[:, None], x, best[0]), np.where(better[:, None], dual, best[1])
-        done = (least_residual < 1e-11) | ((least_residual < _NEAR_OPTIMUM) & (k - improved >= _STEPS_WITHOUT_PROGRESS))
+        done = (least_residual < 1e-11) | ((least_residual < _NEAR_OPTIMUM) & (k - halved_at >= _STEPS_WITHOUT_PROGRESS))
         if np.all(done):
             break
         dx, ds, dl = _predicted_and_corrected(program, stationary, primal, gap, slack, dual)
-        keep = np.where(done, 0.0, 0.995)
+        fraction = np.where(done, 0.0, 0.995)
         # One step length for x and the duals, because the stationarity condition contains both: Q x + q + rows^T dual = 0.
-        length = keep * np.minimum(_longest(slack, ds), _longest(dual, dl))
+        length = fraction * np.minimum(_longest(slack, ds), _longest(dual, dl))
         x = x + length[:, None] * dx
         slack = np.maximum(slack + length[:, None] * ds, 1e-300)
         dual = np.maximum(dual + length[:, None] * dl, 1e-300)
@@ -159,7 +160,7 @@ def _predicted_and_corrected(
     program: _Program, stationary: np.ndarray, primal: np.ndarray, gap: np.ndarray, slack: np.ndarray, dual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Mehrotra's step of x, slacks and duals: a predictor step determines how far the products of slacks and duals can
-    decrease, and the corrector step has this target."""
+    decrease, and the corrector step aims at these smaller products."""
     rows, transposed = program.rows, np.swapaxes(program.rows, 1, 2)
     (m, n), weight = rows.shape[1:], dual / slack
     matrix = program.quadratic + (transposed * weight[:, None, :]) @ rows

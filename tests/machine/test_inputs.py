@@ -71,7 +71,10 @@ WRONG = {
     "no machine": (lambda: jv.Scene(3, balls(), jv.ConstantSpeed(1.0)), "machine is 3; it must be a Machine, for example"),
     "no drive": (lambda: jv.Scene(machine(), balls(), 5.0), "drive is 5.0; it must be a Drive, for example ConstantSpeed("),
     "no exciters": (lambda: jv.Scene(machine()), "exciters are missing; give exciters=[Exciter(drive=Const"),
-    "exciters as loads": (lambda: jv.Scene(machine(), []), "loads is [], no Loads; give exciters=[Exciter(drive="),
+    "exciters as loads": (
+        lambda: jv.Scene(machine(), []),
+        "loads is [], which is not of the type Loads; give exciters=[Exciter(drive=",
+    ),
     "a regime as vibration": (
         lambda: jv.vibration_measures(scene(), 3),
         "motion is 3; it must be a Jam or a PhaseJam or an Orbit or a Vibration, for example regime.vibration()",

@@ -69,7 +69,7 @@ def inscribed_polygon(sides: np.ndarray) -> np.ndarray:
         return turns.sum() - 2.0 * np.pi if inside else turns[largest] - turns[others].sum()
 
     if not inside:
-        low = 1e-9  # both sides of the equation are 0 at 0
+        low = 1e-9  # at x = 0 all angles are 0, which is not the solution
     for _ in range(200):
         middle = (low + high) / 2.0
         if excess(middle) > 0.0:
@@ -84,8 +84,8 @@ def inscribed_polygon(sides: np.ndarray) -> np.ndarray:
 
 
 def neutral_directions(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np.ndarray:
-    """Return orthonormal changes of the angles (N, d) that keep the sum to first order; the common rotation is the first one,
-    if it is free."""
+    """Return orthonormal changes of the angles (N, d) that keep the vector sum of the `sides` (N,) to first order. If the loads
+    may turn together (`turns`), this common rotation is the first change."""
     n = sides.size
     change = np.stack([-sides * np.sin(angles), sides * np.cos(angles)]) / sides.max()
     _, values, right = np.linalg.svd(change)
