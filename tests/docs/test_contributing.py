@@ -113,6 +113,40 @@ def test_named_paths_and_constants_exist():
     assert [(block[:40], faults) for block in (*rows, *items) if (faults := faults_of(block))] == []
 
 
+IDEAS = [
+    ("motion", "jaxvib/equations", "dynamics.py"),
+    ("averaged", "jaxvib/equations", "averaged.py"),
+    ("sizes", "jaxvib/ode", "control.py"),
+    ("Floquet", "jaxvib/steady", "orbits/stability.py"),
+    ("synchronous exciters", "jaxvib/steady", "regimes/synchronous.py"),
+    ("synchronous exciters", "jaxvib/steady", "orbits/synchronous.py"),
+    ("whirl", "jaxvib/steady", "whirl.py"),
+    ("empirical criterion", "jaxvib/steady", "balance/criterion.py"),
+    ("metadata", "jaxvib/machine", "numbers/__init__.py"),
+    ("effects", "jaxvib/machine", "effects/rolling.py"),
+    ("effects", "jaxvib/machine", "effects/sliding.py"),
+    ("currents", "jaxvib/machine", "drives/electrical.py"),
+    ("1500 rpm", "jaxvib/units", "reading.py"),
+    ("cache", "jaxvib/runtime", "stored.py"),
+    ("store", "jaxvib/sweeps", "store.py"),
+    ("starts and local search", "optimize", "search/polish.py"),
+    ("Pareto", "optimize", "pareto.py"),
+    ("foundation force", "optimize", "quantities/jams.py"),
+    ("profile likelihood", "jaxvib/identification", "profile_likelihood.py"),
+    ("UFF", "jaxvib/exchange", "uff.py"),
+    ("", "jaxvib/exchange", "state_space.py"),
+    ("HTML", "jaxvib/report", "page.py"),
+    ("server", "jaxvib/explore", "server.py"),
+]
+"""Ideas that a reader looks for, with the package and the file that implement them."""
+
+
+@pytest.mark.parametrize(("idea", "package", "file"), IDEAS)
+def test_ideas_lead_to_their_files(idea, package, file):
+    (row,) = re.findall(rf"^\| .*`{package}`.*$", PAGE, flags=re.M)
+    assert idea.lower() in row.lower() and f"`{file}`" in row and (ROOT / package / file).exists()
+
+
 @pytest.mark.parametrize(("part", "base"), [*((name, base) for name, (base, _) in PARTS.items()), ("drive", jv.IdealDrive)])
 def test_recipe_names_all_that_a_part_must_define(part, base):
     annotated = {name: str(kind) for each in base.__mro__ for name, kind in inspect.get_annotations(each).items()}
