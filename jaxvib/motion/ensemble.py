@@ -27,6 +27,7 @@ from jaxvib.motion.batch import advance, batch_size, divide_run, pack_batch
 from jaxvib.motion.integrate import angle_wrapping, is_finite
 from jaxvib.motion.plan import ENSEMBLE_PARTS, EqualSteps, plan_ensemble
 from jaxvib.motion.stiffness import is_unresolved
+from jaxvib.ode.replay import forward_only
 from jaxvib.ode.types import Y
 from jaxvib.results.estimate import Share, estimate_share
 from jaxvib.results.fields import in_unit, part
@@ -233,7 +234,7 @@ def ensemble(
         )
     )
     if not plan.is_known:
-        return result
+        return forward_only(result, "ensemble", "supports forward derivatives only; use jax.jacfwd or jax.jvp")
     jax.block_until_ready(result)
     return dataclasses.replace(result, seconds=on_device(np.asarray(time.perf_counter() - begun, plan.end.dtype)))
 

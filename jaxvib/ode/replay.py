@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple, NoReturn, TypeAlias
+from typing import Any, NamedTuple, NoReturn, TypeAlias, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -17,8 +17,10 @@ from jaxtyping import PyTree
 from jaxvib.errors import InputError
 from jaxvib.ode.batching import flat_tangents
 from jaxvib.ode.types import Args, Y
-from jaxvib.runtime.compat import fast_diffrax_loop_end, no_host_checks
+from jaxvib.runtime.compat import fast_diffrax_loop_end, no_host_checks, traced
 from jaxvib.runtime.primitive import CAN_DEFINE_PRIMITIVES, primitive
+
+T = TypeVar("T")
 
 _Inputs: TypeAlias = tuple[Array, Array | None, Y, Args, diffrax.SaveAt, diffrax.ODETerm, Array | None]
 """Differentiated arguments: the end, the first step, the initial state, the arguments, the saved times, the equations, and the
@@ -140,6 +142,39 @@ _reverse_tangents = primitive(
     abstract_eval=lambda *types: types,
 )
 """Primitive that returns tangents and can only be transposed."""
+
+
+def forward_only(outputs: T, field: str, problem: str) -> T:
+    """Return the outputs; their reverse derivatives raise `InputError`, where JAX would raise an error about its loops.
+
+    The values must be the last ones of a computation that has no reverse derivative, because JAX transposes these first.
+    """
+    if not CAN_DEFINE_PRIMITIVES or not any(map(traced, jax.tree.leaves(outputs))):
+        return outputs
+    numbers, others = eqx.partition(outputs, eqx.is_inexact_array)
+
+    @jax.custom_jvp
+    def unchanged(leaves: list[Array]) -> list[Array]:
+        return leaves
+
+    unchanged.defjvp(lambda primals, slopes: (primals[0], _forward_tangents(*slopes[0], field=field, problem=problem)))
+    leaves, structure = jax.tree.flatten(numbers)
+    return eqx.combine(jax.tree.unflatten(structure, unchanged(leaves)), others)
+
+
+def _refuse_reverse(*_: object, field: str, problem: str) -> NoReturn:
+    raise InputError(field, problem)
+
+
+_forward_tangents = primitive(
+    "forward_tangents",
+    impl=lambda *tangents, **_: list(tangents),
+    batching_rule=lambda tangents, axes, **_: (list(tangents), list(axes)),
+    transpose=_refuse_reverse,
+    lowering=lambda *tangents, **_: list(tangents),
+    abstract_eval=lambda *types, **_: types,
+)
+"""Primitive that returns tangents and cannot be transposed."""
 
 
 @eqx.filter_custom_vjp

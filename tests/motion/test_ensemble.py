@@ -86,6 +86,16 @@ def test_error_of_a_run_is_independent_of_the_batch():
         assert 0.0 < error_of(loud, k, beside, exact) <= float(beside.error[k])
 
 
+def test_reverse_derivatives_of_an_ensemble_are_refused():
+    def number(speed):
+        many = jv.ensemble(make, values() | {"speed": speed * jnp.arange(2.0, 5.0)}, 1.0, estimate=False)
+        return jnp.sum(many.state.displacement)
+
+    assert jax.eval_shape(jax.jacfwd(number), 1.0).shape == ()
+    with pytest.raises(jv.InputError, match=r"^ensemble supports forward derivatives only; use jax.jacfwd or jax.jvp"):
+        jax.eval_shape(jax.grad(number), 1.0)
+
+
 def test_loads_that_start_fast_have_short_steps():
     scene = published(speed=3.0, eps=0.05).scene()
     still = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(1),), (jnp.zeros(1),))
