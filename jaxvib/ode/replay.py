@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 from jaxvib.errors import InputError
 from jaxvib.ode.batching import flat_tangents
 from jaxvib.ode.types import Args, Y
-from jaxvib.runtime.compat import fast_diffrax_loop_end, no_host_checks, traced
+from jaxvib.runtime.compat import fast_diffrax_loop_end, no_host_checks
 from jaxvib.runtime.primitive import CAN_DEFINE_PRIMITIVES, primitive
 
 T = TypeVar("T")
@@ -149,7 +149,7 @@ def forward_only(outputs: T, field: str, problem: str) -> T:
 
     The values must be the last ones of a computation that has no reverse derivative, because JAX transposes these first.
     """
-    if not CAN_DEFINE_PRIMITIVES or not any(map(traced, jax.tree.leaves(outputs))):
+    if not CAN_DEFINE_PRIMITIVES:
         return outputs
     numbers, others = eqx.partition(outputs, eqx.is_inexact_array)
 

@@ -87,8 +87,10 @@ def test_error_of_a_run_is_independent_of_the_batch():
 
 
 def test_reverse_derivatives_of_an_ensemble_are_refused():
+    steps = jv.EqualSteps(64)
+
     def number(speed):
-        many = jv.ensemble(make, values() | {"speed": speed * jnp.arange(2.0, 5.0)}, 1.0, estimate=False)
+        many = jv.ensemble(make, values() | {"speed": speed * jnp.arange(2.0, 5.0)}, 1.0, stepsize_controller=steps)
         return jnp.sum(many.state.displacement)
 
     assert jax.eval_shape(jax.jacfwd(number), 1.0).shape == ()
