@@ -59,6 +59,26 @@ def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[
     return bounds
 
 
+def _positive(value: Number, unit: str, name: str) -> float:
+    """Return a number in `unit`. **Raises** `InputError` if it is not greater than 0."""
+    positive = number_in(value, unit, name)
+    if not positive > 0.0:
+        raise InputError(name, f"is {quoted(value)}; it must be greater than 0")
+    return positive
+
+
+def _stroke(stroke: Number | None) -> float | None:
+    return None if stroke is None else _positive(stroke, "m", "stroke")
+
+
+def _throw_angle(angle: Number) -> float:
+    """Return the angle of throw, rad. **Raises** `InputError` for 0 and beyond a right angle: the line has no direction."""
+    radians = number_in(angle, "rad", "angle")
+    if not 0.0 < abs(radians) < np.pi / 2.0:
+        raise InputError("angle", f"is {quoted(angle)}; it must be between 0 and 90 deg, or between -90 deg and 0")
+    return radians
+
+
 def _factor(range_: Number) -> float:
     """Return the factor by which springs may differ. **Raises** `InputError` if it is not greater than 1."""
     factor = number_in(range_, "", "range_")
@@ -144,8 +164,10 @@ def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[
     mass = np.asarray(scene.loads.mass)
     if mass.ndim:
         raise InputError("loads.mass", "differs from load to load; this recipe needs equal loads")
+    amplitude_of_mode = amplitude(mode=mode, of=of)
+    amplitude_of_mode(scene)  # refuses a mode and a platform that the machine does not have
     space = DesignSpace(scene, {"loads.mass": (float(mass) / 10.0, float(mass) * 10.0)})
-    return Design(space, total_mass(), subject_to=(amplitude(mode=mode, of=of) > least,))
+    return Design(space, total_mass(), subject_to=(amplitude_of_mode > _positive(least, "m", "least"),))
 
 
 def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[int, int] | None = None) -> Design:
@@ -203,7 +225,7 @@ def linear_screen(
     """
     free, ties = _exciters(scene, 2, reach)
     middle = _middle(points)
-    held = [hold(throw_angle(at=middle), angle), hold(throw_stroke(at=middle), stroke)]
+    held = [hold(throw_angle(at=middle), _throw_angle(angle)), hold(throw_stroke(at=middle), _stroke(stroke))]
     return Design(DesignSpace(scene, free, held, ties=ties), motion_spread(points), {"starts": _STARTS})
 
 
@@ -222,7 +244,7 @@ def circular_screen(
     """
     free, ties = _exciters(scene, 1, reach)
     middle = _middle(points)
-    space = DesignSpace(scene, free, [hold(throw_stroke(at=middle), stroke)], ties=ties)
+    space = DesignSpace(scene, free, [hold(throw_stroke(at=middle), _stroke(stroke))], ties=ties)
     return Design(space, motion_spread(points), {"starts": _STARTS}, (roundness(at=middle) > _LEAST_ROUNDNESS,))
 
 
@@ -252,15 +274,15 @@ def feeder(
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine.
     """
     free, ties = _exciters(scene, 2, reach)
-    factor = _factor(range_)
+    factor, largest_spread = _factor(range_), _positive(spread, "", "spread")
     for k, support in enumerate(scene.machine.supports):  # pyright: ignore[reportAttributeAccessIssue]
         for j, value in enumerate(np.asarray(support.stiffness).tolist()):
             if value > 0.0:
                 free[f"machine.supports[{k}].stiffness[{j}]"] = (value / factor, value * factor)
     middle = _middle(points)
-    held = [hold(throw_angle(at=middle), angle), hold(throw_stroke(at=middle), stroke)]
+    held = [hold(throw_angle(at=middle), _throw_angle(angle)), hold(throw_stroke(at=middle), _stroke(stroke))]
     space = DesignSpace(scene, free, held, ties=ties)
-    return Design(space, force_per_throw(at=middle), {"starts": _STARTS}, (motion_spread(points) < spread,))
+    return Design(space, force_per_throw(at=middle), {"starts": _STARTS}, (motion_spread(points) < largest_spread,))
 
 
 def _exciters(scene: Scene, least: int, reach: Number) -> tuple[dict[str, Bounds], dict[str, Source]]:
@@ -270,7 +292,7 @@ def _exciters(scene: Scene, least: int, reach: Number) -> tuple[dict[str, Bounds
     if len(scene.exciters) < least:
         raise InputError("scene", f"has {len(scene.exciters)} exciter; this recipe needs at least {least}")
     free: dict[str, Bounds] = {}
-    distance = number_in(reach, "m", "reach")
+    distance = _positive(reach, "m", "reach")
     for k, exciter in enumerate(scene.exciters):
         if exciter.unbalance is None or exciter.position is None:
             raise InputError(f"scene.exciters[{k}]", "needs an unbalance and a position `at` for this recipe")
@@ -289,5 +311,8 @@ def _middle(points: Sequence[Sequence[Number]]) -> tuple[float, float]:
     is_list = isinstance(points, (list, tuple)) and len(points) > 1
     if not is_list or not all(isinstance(p, (list, tuple)) and len(p) == 2 for p in points):
         raise InputError("points", f"is {quoted(points)}; it must be a list of at least two points (x, y)")
-    x, y = np.mean([[number_in(v, "m", f"points[{k}]") for v in p] for k, p in enumerate(points)], axis=0).tolist()
+    places = np.array([[number_in(v, "m", f"points[{k}]") for v in p] for k, p in enumerate(points)])
+    if not np.any(np.ptp(places, axis=0)):
+        raise InputError("points", f"is {quoted(points)}, one point several times; give at least two different points")
+    x, y = np.mean(places, axis=0).tolist()
     return x, y

@@ -25,6 +25,7 @@ from optimize.recipes import (
 
 SCENE = scene("two_mass", speed=120.0)
 SCREEN = jv.scene_from_toml(SCREENS["linear_screen"])
+DECK = [(0.0, 0.0), (1.0, 0.0)]
 
 
 def test_front_contains_machines_between_its_ends():
@@ -201,7 +202,15 @@ def test_the_widest_range_is_that_of_the_whole_branch():
         (lambda: widest_range(scene("two_mass", speed=1e-3), mode=5), "mode is 5; this jam mode does not exist"),
         (lambda: antiphase(SCENE, range_=0.0), "range_ is 0.0; it must be greater than 1"),
         (lambda: antiphase(SCENE, range_="wide"), "range_ is 'wide'"),
-        (lambda: feeder(SCREEN, points=[(0.0, 0.0), (1.0, 0.0)], range_=0), "range_ is 0; it must be greater than 1"),
+        (lambda: feeder(SCREEN, points=DECK, range_=0), "range_ is 0; it must be greater than 1"),
+        (lambda: feeder(SCREEN, points=DECK, spread=-1), "^spread is -1; it must be greater than 0"),
+        (lambda: feeder(SCREEN, points=DECK, angle="100 deg"), "^angle is '100 deg'; it must be between 0 and 90 deg"),
+        (lambda: linear_screen(SCREEN, points=DECK, stroke="-8 mm"), "^stroke is '-8 mm'; it must be greater than 0"),
+        (lambda: circular_screen(SCREEN, points=DECK, stroke=0.0), "^stroke is 0.0; it must be greater than 0"),
+        (lambda: circular_screen(SCREEN, points=DECK, reach=-0.1), "^reach is -0.1; it must be greater than 0"),
+        (lambda: circular_screen(SCREEN, points=DECK[:1] * 2), "one point several times; give at least two different points"),
+        (lambda: lightest_exciter(SCENE, "-1 mm", mode=3), "^least is '-1 mm'; it must be greater than 0"),
+        (lambda: lightest_exciter(SCENE, "1 mm", mode=99), "^mode is 99; this machine's jam modes are numbered 1 to 5"),
         (lambda: linear_screen(SCREEN, points=[]), "must be a list of at least two points"),
         (lambda: pareto(None, None, None, points=1), "space is None; it must be a DesignSpace"),
     ],
