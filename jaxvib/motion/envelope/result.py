@@ -86,10 +86,23 @@ class Envelopes(Readable):
         return only_exciter_value(self.rotor_speeds, "rotor_speeds")
 
 
+_OFFSET = "no spring returns the machine to its place: amplitudes include its displacement from the start"
+"""Sentence of the summary of machines without supports."""
+
+
+def _moves_without_spring(scene: Scene) -> bool:
+    """Return True if a machine can move without a spring."""
+    eigenvalues = np.linalg.eigvalsh(np.asarray(scene.machine.carrier().stiffness))
+    return bool(eigenvalues[0] <= np.finfo(eigenvalues.dtype).eps ** 0.75 * max(eigenvalues[-1], 0.0))
+
+
 class Envelope(AbstractMeasured, PathsOfPoints, Result):
     """Averaged run of a scene: the quantities of `AbstractMeasured` over the last turns, and the averaged motion.
 
     Returned by `envelope`. `ellipse` and `deck` describe the motion of points by the mean of the amplitudes over the window.
+
+    The amplitude is the largest |q|. If a machine can move without a spring, it includes the displacement from the start, which
+    remains; the amplitude of `simulate` is half of the range of q.
 
     **Attributes**: those of `AbstractMeasured`, and
 
@@ -180,6 +193,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  {self.speeds_text(self.scene, self.window.rotor_speeds)}",
                 f"  {self.amplitude_text(self.scene)}",
+                *([f"  {_OFFSET}"] if moves and _moves_without_spring(self.scene) else []),
                 *(f"  {line}" for line in measured),
                 f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
             ]

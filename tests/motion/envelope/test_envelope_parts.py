@@ -361,6 +361,14 @@ def test_summary_of_a_run():
     assert bool(run_of().settled) and not bool(run_of(drift=1e-3).settled)
 
 
+@pytest.mark.parametrize("stiffness", [0.0, 4e4])
+def test_summary_names_displacements_that_no_spring_returns(stiffness):
+    run = run_of()
+    machine = jv.one_mass(mass=50.0, stiffness=stiffness, damping=100.0)
+    free = eqx.tree_at(lambda run: run.scene, run, jv.Scene(machine, run.scene.loads, run.scene.drive))
+    assert ("amplitudes include its displacement from the start" in free.summary()) == (stiffness == 0.0)
+
+
 def test_plot_of_a_run_shows_its_histories():
     run = run_of(trajectory=window_at(9.0))
     axes = plot_histories(run, resonances=[28.0, 99.0], unit="rad/s").axes
