@@ -141,10 +141,11 @@ def test_directions_spread_across_the_vertical():
     np.testing.assert_allclose(np.rad2deg(deck.direction_spread), 20.0, rtol=1e-10)
 
 
-def test_harmonic_is_found_beside_others_and_an_offset():
-    t = jnp.linspace(0.0, 1.3, 4000)
+@pytest.mark.parametrize("begin", [0.0, 3.0])
+def test_harmonic_is_found_beside_others_and_an_offset(begin):
+    t = jnp.linspace(begin, begin + 1.3, 4000)
     first, second = np.array([1.0 - 2.0j, 0.5j]), np.array([0.2 + 0.1j, -0.3])
-    phase = SPEED * (t - 0.65)
+    phase = SPEED * (t - begin - 0.65)
     q = 0.7 + np.real(np.exp(1j * phase)[:, None] * first) + np.real(np.exp(2j * phase)[:, None] * second)
     amplitude, rest = fit_harmonic(t, jnp.asarray(q), jnp.asarray(SPEED))
     np.testing.assert_allclose(amplitude, first, atol=1e-10)
