@@ -279,10 +279,7 @@ def fit_spline(
     from scipy.interpolate import BSpline  # slow to import
 
     weights = np.ones(time.size) if rates is None else np.mean(rates) / rates
-    offsets = np.zeros((time.size, 0))
-    if marks is not None:
-        indicators = np.eye(int(np.max(marks)) + 1)[marks]
-        offsets = (indicators[:, 1:] - indicators[:, :1]) * weights[:, None]
+    offsets = _mark_offsets(np.zeros(time.size, int) if marks is None else marks, weights)
     fits = []
     intervals = 1
     while intervals <= min(_MAX_INTERVALS, time.size // 4):
@@ -298,6 +295,27 @@ def fit_spline(
     grid = BSpline.design_matrix(np.linspace(time[0], time[-1], 4 * len(best.coefficients)), best.knots, _DEGREE)
     errors = root @ np.linalg.svd(grid @ root, full_matrices=False)[2].T
     return BSpline(best.knots, np.concatenate([best.coefficients[:, None], errors], axis=1), _DEGREE), scatter
+
+
+class _Offsets(NamedTuple):
+    """Offsets of all marks but the first, whose offset is minus their sum.
+
+    **Attributes**: `columns` (n, o): sparse matrix of the weighted values by the offsets; `gram` (o, o): its normal equations.
+    """
+
+    columns: Any
+    gram: np.ndarray
+
+
+def _mark_offsets(marks: np.ndarray, weights: np.ndarray) -> _Offsets:
+    from scipy.sparse import csr_matrix  # slow to import
+
+    count, first, others = int(np.max(marks)), np.flatnonzero(marks == 0), np.flatnonzero(marks)
+    rows = np.concatenate([others, np.repeat(first, count)])
+    columns = np.concatenate([marks[others] - 1, np.tile(np.arange(count), first.size)])
+    entries = np.concatenate([weights[others], -np.repeat(weights[first], count)])
+    squares = np.bincount(marks, weights**2)
+    return _Offsets(csr_matrix((entries, (rows, columns)), shape=(marks.size, count)), np.diag(squares[1:]) + squares[0])
 
 
 class _KnotsFit(NamedTuple):
@@ -335,7 +353,7 @@ def _derivative(spline_fit: _KnotsFit) -> np.ndarray:
     return np.linalg.solve(basis, BSpline(spline_fit.knots, spline_fit.coefficients, _DEGREE)(places, 1))
 
 
-def _fit_knots(time: np.ndarray, value: np.ndarray, weights: np.ndarray, offsets: np.ndarray, intervals: int) -> _KnotsFit:
+def _fit_knots(time: np.ndarray, value: np.ndarray, weights: np.ndarray, offsets: _Offsets, intervals: int) -> _KnotsFit:
     """Return the fit of weighted values by a spline with equal intervals."""
     from scipy.interpolate import BSpline  # slow to import
     from scipy.linalg import solveh_banded
@@ -345,17 +363,18 @@ def _fit_knots(time: np.ndarray, value: np.ndarray, weights: np.ndarray, offsets
     knots = np.concatenate([[time[0]] * _DEGREE, np.linspace(time[0], time[-1], intervals + 1), [time[-1]] * _DEGREE])
     basis: Any = diags(weights) @ BSpline.design_matrix(time, knots, _DEGREE)
     gram = basis.T @ basis
-    size, count = gram.shape[0], gram.shape[0] + offsets.shape[1]
+    size, count = gram.shape[0], gram.shape[0] + len(offsets.gram)
     band = np.stack([np.pad(gram.diagonal(k), (0, k)) for k in range(_DEGREE + 1)])
     band[0] += 1e-12 * np.mean(band[0])  # otherwise the matrix is singular for intervals without a value
-    offset_changes = solveh_banded(band, basis.T @ offsets, lower=True) if offsets.size else np.zeros((size, 0))
-    offset_covariance = np.linalg.inv(offsets.T @ offsets - (basis.T @ offsets).T @ offset_changes)
-    coefficients, offset_values, residuals = np.zeros(size), np.zeros(offsets.shape[1]), value
+    coupling = (basis.T @ offsets.columns).toarray()
+    offset_changes = solveh_banded(band, coupling, lower=True) if coupling.size else coupling
+    offset_covariance = np.linalg.inv(offsets.gram - coupling.T @ offset_changes)
+    coefficients, offset_values, residuals = np.zeros(size), np.zeros(len(offsets.gram)), value
     for _ in range(2):  # the second solution corrects rounding errors of the first
         without_offsets = solveh_banded(band, basis.T @ residuals, lower=True)
-        step = offset_covariance @ (offsets.T @ (residuals - basis @ without_offsets))
+        step = offset_covariance @ (offsets.columns.T @ (residuals - basis @ without_offsets))
         coefficients, offset_values = coefficients + without_offsets - offset_changes @ step, offset_values + step
-        residuals = value - basis @ coefficients - offsets @ offset_values
+        residuals = value - basis @ coefficients - offsets.columns @ offset_values
     square_sum = float(residuals @ residuals)
     criterion = n * math.log(max(square_sum / n, 1e-26)) + count * math.log(n)
     return _KnotsFit(knots, coefficients, criterion, square_sum / max(n - count, 1), band, offset_changes, offset_covariance)

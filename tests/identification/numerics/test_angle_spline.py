@@ -10,6 +10,7 @@ from jaxvib.identification.angle import (
     RecordedDrive,
     RotorAngle,
     _fit_knots,
+    _mark_offsets,
     _measured,
     fit_spline,
     recorded_drive,
@@ -39,7 +40,9 @@ def test_fit_is_the_weighted_least_squares(marks):
         value = value + np.array([0.02, 0.03, -0.05])[marks]
     weights, intervals = np.mean(spread) / spread, 4
     _, basis = basis_of(T, intervals)
-    fit = _fit_knots(T, value * weights, weights, offsets * weights[:, None], intervals)
+    of_marks = _mark_offsets(np.zeros(T.size, int) if marks is None else marks, weights)
+    np.testing.assert_allclose(of_marks.columns.toarray(), offsets * weights[:, None], rtol=1e-14)
+    fit = _fit_knots(T, value * weights, weights, of_marks, intervals)
     columns = np.concatenate([basis, offsets], axis=1) * weights[:, None]
     found = np.linalg.lstsq(columns, value * weights, rcond=None)[0]
     size = basis.shape[1]
@@ -50,10 +53,10 @@ def test_fit_is_the_weighted_least_squares(marks):
     covariance = square / (n - k) * np.linalg.inv(columns.T @ columns)[:size, :size]
     np.testing.assert_allclose(fit.covariance(), covariance, rtol=1e-5, atol=1e-7 * np.max(covariance))
     spline, scatter = fit_spline(T, value, marks, spread)
-    counts = [len(_fit_knots(T, value * weights, weights, offsets * weights[:, None], each).coefficients) for each in (1, 2)]
+    counts = [len(_fit_knots(T, value * weights, weights, of_marks, each).coefficients) for each in (1, 2)]
     assert spline.c.shape[0] in counts  # a parabola needs one interval, or few
     best = min(
-        (_fit_knots(T, value * weights, weights, offsets * weights[:, None], each) for each in (1, 2, 3, 4, 5, 7, 9, 12)),
+        (_fit_knots(T, value * weights, weights, of_marks, each) for each in (1, 2, 3, 4, 5, 7, 9, 12)),
         key=lambda each: each.criterion,
     )
     np.testing.assert_allclose(spline.c[:, 0], best.coefficients)
@@ -71,6 +74,13 @@ def test_fit_is_the_weighted_least_squares(marks):
     products = grid.T @ grid
     np.testing.assert_allclose(products, np.diag(np.diagonal(products)), atol=1e-9 * products[0, 0])
     assert np.all(np.diff(np.diagonal(products)) <= 1e-9 * products[0, 0])
+
+
+def test_offsets_of_many_marks_take_little_memory():
+    marks, weights = np.arange(20_000) % 256, np.linspace(1.0, 2.0, 20_000)
+    offsets = _mark_offsets(marks, weights)
+    assert offsets.columns.nnz < 2 * marks.size
+    np.testing.assert_allclose(offsets.gram, (offsets.columns.T @ offsets.columns).toarray(), rtol=1e-12)
 
 
 def test_intervals_follow_from_the_information_criterion():
