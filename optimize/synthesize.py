@@ -241,7 +241,7 @@ def _validate_demands(space: DesignSpace, objective: Quantity, subject_to: Deman
     require_double(space.scene, "a search")
     between(space.scene, objective.of)
     if space.scene.is_plain and not space.scene.drive.constant:
-        raise InputError("drive", f"is {quoted(space.scene.drive.kind)}; a search needs a constant speed, use ConstantSpeed")
+        raise InputError("drive", f"is {quoted(space.scene.drive.kind)}; a search needs a constant speed; use ConstantSpeed")
     return demands
 
 

@@ -114,7 +114,7 @@ def panels(
         if not isinstance(given, list) or not all(isinstance(each, Axes) for each in given):
             raise InputError("ax", f"is {quoted(ax)}; give matplotlib's Axes, such as those of matplotlib.pyplot.subplots()")
         if len(given) != rows * columns:
-            raise InputError("ax", f"has {len(given)} axes; this figure has {rows * columns} panels, give as many")
+            raise InputError("ax", f"has {len(given)} axes; this figure has {rows * columns} panels; give as many")
         return given[0].figure.figure, given
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(size[0] * columns, size[1] * rows))

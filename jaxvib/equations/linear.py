@@ -380,7 +380,7 @@ def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
 
     def check(drag: np.ndarray | float) -> None:
         if not (np.all if each else np.any)(np.asarray(drag) > 0.0):
-            raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, use a drag greater than 0")
+            raise InputError("loads.drag", "is 0; loads without drag never follow the rotor; use a drag greater than 0")
 
     when_known(check, loads.drag)
 

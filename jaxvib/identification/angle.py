@@ -187,7 +187,7 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
     field = f"{run.source}: channel {channel.name!r}"
     if time.size < _MIN_PULSES:
         what = "pulses" if channel.kind == "pulses" else "readings"
-        raise InputError(field, f"has {time.size} {what}; at least {_MIN_PULSES} are needed, record more turns")
+        raise InputError(field, f"has {time.size} {what}; at least {_MIN_PULSES} are needed; record more turns")
     time = time - channel.delay
     notes: list[str] = []
     marks, spread, marked = np.zeros(time.size, int), np.ones(time.size), channel.kind == "angle"

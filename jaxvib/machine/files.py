@@ -289,7 +289,7 @@ def scene_from_tables(tables: Tables) -> Scene:
 
 def _build_exciter(table: object, k: int) -> Exciter:
     if not isinstance(table, Mapping):
-        raise InputError(f"exciters[{k}]", f"is {quoted(table)}; it must be a table, write [[exciters]]")
+        raise InputError(f"exciters[{k}]", f"is {quoted(table)}; it must be a table; write [[exciters]]")
     with within(f"exciters[{k}]."):
         values = {name: value for name, value in table.items() if name not in ("loads", "drive", "effects")}
         parts = {name: build_kind(table[name], name, SECTIONS[name]) for name in ("loads", "drive") if name in table}
@@ -321,7 +321,7 @@ def _build_effects(chosen: object) -> tuple[Effect, ...]:
 def build_kind(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -> T:
     """Return the part of a table with its `kind`, one of `kinds`. **Raises** `InputError` for an unknown or missing name."""
     if not isinstance(table, Mapping):
-        raise InputError(section, f"is {quoted(table)}; it must be a table, write [{section}]")
+        raise InputError(section, f"is {quoted(table)}; it must be a table; write [{section}]")
     if "kind" not in table:
         raise InputError(f"{section}.kind", f"is missing; allowed: {', '.join(kinds)}")
     kind = table["kind"]

@@ -348,7 +348,7 @@ def _require_anticlockwise(exciter: Exciter) -> Exciter:
     # A method of an Equinox module costs 30 us a call, and each analysis reads this several times.
     if exciter.direction != 1:
         raise InputError(
-            "scene.exciters[0].direction", "is -1; this function needs an anticlockwise rotor, use simulate for others"
+            "scene.exciters[0].direction", "is -1; this function needs an anticlockwise rotor; use simulate for others"
         )
     return exciter
 

@@ -326,4 +326,4 @@ def _number(name: str, leaf: object) -> Array:
 def _require_finite(name: str, value: np.ndarray | float) -> None:
     if not np.all(np.isfinite(value)):
         wrong = np.asarray(value)[~np.isfinite(value)].ravel()[0]
-        raise InputError(name, f"is {wrong}; it must be finite, check how it was computed")
+        raise InputError(name, f"is {wrong}; it must be finite; check how it was computed")

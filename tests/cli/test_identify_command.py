@@ -78,7 +78,7 @@ def test_wrong_commands(typed, words, code, says):
         (("mass =", "masses ="), "pendulum.masses is not a field here; did you mean 'mass'"),
         (("dry = false", "dry = 1"), "identify.dry is 1; write true or false"),
         (('file = "swing.csv"', "file = 3"), "record.file is 3; write the path of a CSV file"),
-        (("[identify]", "[[identify]]"), "it must be a table, write [identify]"),
+        (("[identify]", "[[identify]]"), "it must be a table; write [identify]"),
     ],
 )
 def test_wrong_measurement_files(typed, tmp_path, change, says):

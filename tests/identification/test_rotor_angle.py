@@ -99,5 +99,5 @@ def test_noise_of_an_angle_becomes_its_error():
 
 @pytest.mark.parametrize(("kind", "what"), [("pulses", "pulses"), ("speed", "readings"), ("angle", "readings")])
 def test_too_few_readings_are_refused(kind, what):
-    with pytest.raises(jv.InputError, match=f"has 3 {what}; at least .* are needed, record more turns"):
+    with pytest.raises(jv.InputError, match=f"has 3 {what}; at least .* are needed; record more turns"):
         measured(kind, np.array([0.0, 1.0, 2.0]), np.arange(3.0))

@@ -45,7 +45,7 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
     selected = [result.select(k) for k in range(result.speed.shape[0])]
     measures = [measures_of(loaded, regime.vibration()) if regime.stable else None for regime in selected]
     if tolerances and not any(regime.stable for regime in selected):
-        raise InputError("--tolerance", "is for stable regimes; this scene has none, leave it out")
+        raise InputError("--tolerance", "is for stable regimes; this scene has none; leave it out")
     ranges = ranges_within(loaded, None, tolerances)
     output.picture("regimes.png", result.plot)
     output.csv(csv, result, "regime")

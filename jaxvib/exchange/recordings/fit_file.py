@@ -73,7 +73,7 @@ def fit_from_tables(tables: Tables, folder: Path) -> FitInput:
 
 def _table(value: object, name: str) -> Mapping[str, object]:
     if not isinstance(value, Mapping):
-        raise InputError(name, f"is {quoted(value)}; it must be a table, write [{name}]")
+        raise InputError(name, f"is {quoted(value)}; it must be a table; write [{name}]")
     return value
 
 

@@ -34,7 +34,7 @@ signal the ratio is below 2."""
 def require_ascending(time: np.ndarray, where: str) -> None:
     """**Raises** `InputError` for fewer than 16 times, and for times that are not finite or do not ascend."""
     if time.size < MIN_SAMPLES:
-        raise InputError(where, f"has {time.size} samples; at least {MIN_SAMPLES} are needed, record more")
+        raise InputError(where, f"has {time.size} samples; at least {MIN_SAMPLES} are needed; record more")
     invalid = np.flatnonzero(~np.isfinite(time))
     if invalid.size:
         raise InputError(where, f"has the time {time[invalid[0]]} at sample {invalid[0] + 1}; times must be finite numbers")
@@ -93,7 +93,7 @@ def even_samples(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.nd
         first = f"the first at {time[np.argmax(is_missing)]:g} s"
         if count > _MAX_MISSING * value.size:
             share = f"has {count} of {value.size} readings that are not numbers, {first}"
-            raise InputError(where, f"{share}; at most {_MAX_MISSING:.0%} may be missing, use another part of the record")
+            raise InputError(where, f"{share}; at most {_MAX_MISSING:.0%} may be missing; use another part of the record")
         readings = "reading that is not a number" if count == 1 else "readings that are not numbers"
         notes.append(f"{where} has {count} {readings}, {first}; left out")
     is_dropout = dropouts(value)
@@ -115,7 +115,7 @@ def _reduced_to_own_rate(time: np.ndarray, value: np.ndarray, where: str) -> tup
         return time, value, []
     with_reading = np.flatnonzero(~np.isnan(value))
     if with_reading.size < MIN_SAMPLES:
-        raise InputError(where, f"has {with_reading.size} readings; at least {MIN_SAMPLES} are needed, record more")
+        raise InputError(where, f"has {with_reading.size} readings; at least {MIN_SAMPLES} are needed; record more")
     stride = int(np.median(np.diff(with_reading)))
     if stride == 1 or np.mean(np.diff(with_reading) % stride == 0) < 1.0:
         return time, value, []

@@ -131,7 +131,7 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     size = time.size if parts == 1 else 2 * time.size // (parts + 1)
     if size < 64:
         raise InputError(
-            "parts", f"is {parts}, which leaves {size} samples for each segment; at least 64 are needed, give fewer parts"
+            "parts", f"is {parts}, which leaves {size} samples for each segment; at least 64 are needed; give fewer parts"
         )
     starts = np.linspace(0, time.size - size, parts).astype(int)
     step = float(np.ptp(time)) / (time.size - 1)  # the mean, because single precision rounds each time

@@ -301,7 +301,7 @@ def _planes(scene: Scene) -> list[_Plane]:
     static, moment, distances = _imbalances(scene)
     places = np.unique(distances)
     if places.size > 2:
-        problem = f"are in {places.size} planes; this function needs loads in one plane or two, use simulate for others"
+        problem = f"are in {places.size} planes; this function needs loads in one plane or two; use simulate for others"
         raise InputError("machine.stations", problem)
     if places.size == 1:
         tilting = moment - places[0] * static
@@ -456,7 +456,7 @@ def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, in
     sides = _sides(turning_loads(scene))
     if not np.min(np.asarray(natural_frequencies(scene))) > 0.0:
         problem = (
-            "lets the machine drift; this neutral motion hides the growth or decay of deviations of the loads, add a support"
+            "lets the machine drift; this neutral motion hides the growth or decay of deviations of the loads; add a support"
         )
         raise InputError("machine.stiffness", problem)
     if angles is None:

@@ -330,7 +330,7 @@ def _require_one_body(exciter: Exciter, place: str) -> None:
         raise InputError(f"{place}loads", problem)
     if not drive.ideal:
         raise InputError(
-            f"{place}drive", f"is {quoted(drive.kind)}; loads need a drive of prescribed speed here, use ConstantSpeed"
+            f"{place}drive", f"is {quoted(drive.kind)}; loads need a drive of prescribed speed here; use ConstantSpeed"
         )
     if not loads.circular:
         raise InputError(

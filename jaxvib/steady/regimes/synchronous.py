@@ -162,7 +162,7 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
         count = mass_owners(self.scene).size
         if self.phases.size != count:
             problem = f"has {self.phases.size} of the scene's {count} rotating masses"
-            raise InputError("masses", f"{problem}; the others add vibrations of other frequencies, use simulate or envelope")
+            raise InputError("masses", f"{problem}; the others add vibrations of other frequencies; use simulate or envelope")
         return _vibration_of(self)
 
     def summary(self) -> str:

@@ -87,7 +87,7 @@ def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
     for k, exciter in enumerate(scene.exciters):
         if exciter.loads is not None:
             with within(scene.prefix_of(k)):
-                raise InputError("loads", "are given; a working regime needs unbalances alone, use jam_modes for loads")
+                raise InputError("loads", "are given; a working regime needs unbalances alone; use jam_modes for loads")
     require_one_speed(scene)
     return outcome(_working(scene), scene, throw=throw, failures=("none_stable",))
 

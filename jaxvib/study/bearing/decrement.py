@@ -112,7 +112,7 @@ def turning_points(record: Record) -> TurningPoints:
     noise = float(np.median(np.abs(np.diff(f, 4)))) / 0.6745 / np.sqrt(70.0)
     peaks = _longest_regular_sequence(t, _alternating_extrema(f, max(8.0 * noise, 1e-3 * float(np.ptp(f)))))
     if len(peaks) < 3:
-        raise InputError(record.name, f"has {len(peaks)} turning points; at least 3 are needed, record more of the swing")
+        raise InputError(record.name, f"has {len(peaks)} turning points; at least 3 are needed; record more of the swing")
     frequency = np.pi / float(np.median(np.diff(t[peaks])))
     ends = f[peaks]
     middle = float(np.mean((ends[:-2] + 2.0 * ends[1:-1] + ends[2:]) / 4.0))
@@ -150,7 +150,7 @@ def turning_points(record: Record) -> TurningPoints:
         raise InputError(
             record.name,
             f"has {len(times)} turning points that are far enough from both ends; at least 3 are "
-            "needed, record more of the swing",
+            "needed; record more of the swing",
         )
     noise = np.sqrt(squares / degrees_of_freedom)
     return TurningPoints(np.array(times), np.array(angles), noise * np.sqrt(gains), float(noise))

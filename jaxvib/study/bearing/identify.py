@@ -274,7 +274,7 @@ def _notes(result: Identified, *, is_patterned: bool) -> Iterator[str]:
         yield "the swing decays more slowly at small amplitudes, as with air drag: mu1 is too large"
     if abs(frequency / small - 1.0) > 0.02:
         differs = f"the swing's frequency is {frequency:.4g} rad/s, the pendulum's length and inertia give {small:.4g}"
-        yield f"{differs}: mu1 is proportional to the moment of inertia, check these values"
+        yield f"{differs}: mu1 is proportional to the moment of inertia; check these values"
     for name, estimate in (("mu1", result.viscous), ("mu2", result.dry), ("the drag of the air", result.air)):
         if estimate is not None and estimate.low <= 0.0:
             is_below = estimate.high < 0.0

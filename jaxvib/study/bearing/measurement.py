@@ -45,7 +45,7 @@ def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
         if name not in names:
             raise misplaced_name(name, tables, "measurement", names)
         if not isinstance(table, Mapping):
-            raise InputError(name, f"is {quoted(table)}; it must be a table, write [{name}]")
+            raise InputError(name, f"is {quoted(table)}; it must be a table; write [{name}]")
     pendulum = build_part(BearingPendulum, tables.get("pendulum", {}), "pendulum")
     options = build_part(_options, tables.get("identify", {}), "identify")
     record_table = tables.get("record", {})

@@ -85,7 +85,7 @@ class BearingPendulum(Readable):
     def diameter(self) -> Array:
         """Diameter at which dry friction acts, m. **Raises** `InputError` if it is missing."""
         if self.bearing is None:
-            raise InputError("pendulum.bearing", "is missing; dry friction acts at the bearing's diameter, give it in m")
+            raise InputError("pendulum.bearing", "is missing; dry friction acts at the bearing's diameter; give it in m")
         return self.bearing
 
     def radial_load(self, angle: Array, rate: Array) -> Array:

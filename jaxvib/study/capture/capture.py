@@ -267,7 +267,7 @@ def _scene_for_capture(scene: Scene, rotation: Rotation) -> Scene:
     scene = validate_scene(scene)
     require_torus_balls(scene.loads, "capture")
     if not scene.drive.constant:
-        raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; capture needs a prescribed speed, use ConstantSpeed")
+        raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; capture needs a prescribed speed; use ConstantSpeed")
     if rotation not in get_args(Rotation):
         raise InputError("rotation", f"is {quoted(rotation)}; it must be 'rolling' or 'none'")
     if rotation == "none" and not has_term(scene.all_effects, SlipRelease):

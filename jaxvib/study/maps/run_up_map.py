@@ -214,7 +214,7 @@ def _sets_of_angles(
     if starts is not None and angles is not None:
         raise InputError("starts", "cannot be combined with angles; give a number of random starts or the angles")
     if separation is not None and not (starts is None and angles is None):
-        raise InputError("separation", f"is {quoted(separation)}; it is only for a single start, leave out starts and angles")
+        raise InputError("separation", f"is {quoted(separation)}; it is only for a single start; leave out starts and angles")
     if angles is not None:
         sets = np.asarray(angles, dtype=float)
         if sets.ndim != 2 or sets.shape[1] != n or not np.all(np.isfinite(sets)):

@@ -104,7 +104,7 @@ def test_narrow_pulses_and_falling_edges_are_found():
 @pytest.mark.parametrize(
     ("times", "says"),
     [
-        (np.arange(5.0), "has 5 pulses; at least 12 are needed, record more turns"),
+        (np.arange(5.0), "has 5 pulses; at least 12 are needed; record more turns"),
         (np.array([*range(20), 3.0]), "has a pulse at 3 s after one at 19 s; times must ascend"),
         (np.delete(np.arange(60.0), np.arange(5, 55, 4)), "misses 13 and doubles 0 of 47 pulses; check the trigger level"),
     ],

@@ -115,7 +115,7 @@ def test_slow_channel_begins_at_its_first_reading():
     value[11] = np.nan
     _, found, notes = even_samples(T, value, "a:")
     assert np.flatnonzero(np.isnan(found)).tolist() == [2] and len(notes) == 2
-    with pytest.raises(jv.InputError, match="has 15 readings; at least 16 are needed, record more"):
+    with pytest.raises(jv.InputError, match="has 15 readings; at least 16 are needed; record more"):
         even_samples(T, np.where(np.arange(N) < 15, WAVE, np.nan), "a:")
     assert even_samples(T, np.where(np.arange(N) < 395, WAVE, np.inf), "a:")[1].size == N
 

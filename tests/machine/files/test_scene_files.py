@@ -147,7 +147,7 @@ def tables(**changed):
             dict(loads=None),
             "loads is missing; a scene file needs the table [loads], or [[exciters]] with an unbalance",
         ),
-        (dict(machine=5), "machine is 5; it must be a table, write [machine]"),
+        (dict(machine=5), "machine is 5; it must be a table; write [machine]"),
         (dict(machin={}), "machin is not part of a scene file; did you mean 'machine'? allowed: machine, loads"),
         (dict(machine__kind=None), "machine.kind is missing; allowed: one_mass, two_mass, three_mass, network"),
         (dict(machine__kind="twomass"), "machine.kind is 'twomass'; did you mean 'two_mass'? allowed: one_mass, two_mass"),
