@@ -161,11 +161,12 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
             what = "residuals" if has_fit else "readings"
             yield (
                 f"{vibration.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is "
-                f"{vibration.place}, but an unbalance turns with the rotor: use the tachometer of the shaft that causes the "
-                "vibration, or leave out the part of the record in which loads are jammed or another machine runs"
+                f"{vibration.frequency_text}, but an unbalance turns with the rotor: use the tachometer of the shaft that "
+                "causes the vibration, or leave out the part of the record in which loads are jammed or another machine runs"
                 if not problem.has_loads
                 else f"{vibration.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is "
-                f"{vibration.place}: the motion of the loads is not that of the scene, or the fit has ended at a wrong minimum"
+                f"{vibration.frequency_text}: the motion of the loads is not that of the scene, or the fit has ended at a "
+                "wrong minimum"
             )
 
 

@@ -495,7 +495,7 @@ def _stretches(scene: Scene, count: int, step: float) -> tuple[int, int, int]:
 
 
 def _stop_frequency(scene: Scene) -> float:
-    """Return the highest natural frequency while all stops press, rad/s; 0 without stops."""
+    """Return the highest natural frequency while all stops are in contact, rad/s; 0 without stops."""
     model = linear_model(scene)
     stiffness = np.array(model.carrier.stiffness)
     stops = [effect for effect in scene.effects if isinstance(effect, Stop)]

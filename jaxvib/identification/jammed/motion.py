@@ -2,10 +2,10 @@
 derivatives.
 
 The state is y = (q, q', angles of the loads, their rates, states of high-pass filters). The exact equations of the scene are
-integrated by equal steps of order 8, over J stretches of a record at once. A step also ends where a stop begins or ceases to
-press, see `jaxvib.identification.supports.contact`. The last state end_j of stretch j has the derivative G_j with respect to
-the first state start_j of the stretch, and H_j with respect to all other unknowns z. A change dz, and a change of the state at
-the first sample, then change start_j by D_j:
+integrated by equal steps of order 8, over J stretches of a record at once. A step also ends where the contact with a stop
+begins or ends, see `jaxvib.identification.supports.contact`. The last state end_j of stretch j has the derivative G_j with
+respect to the first state start_j of the stretch, and H_j with respect to all other unknowns z. A change dz, and a change of
+the state at the first sample, then change start_j by D_j:
 
     D_1 = d(state at the first sample),      D_{j+1} = G_j D_j + H_j dz + (end_j - start_{j+1})
 
@@ -33,7 +33,7 @@ from jaxvib.equations.state import State
 from jaxvib.identification.angle import RecordedDrive
 from jaxvib.identification.problem import DELAY_MARGIN
 from jaxvib.identification.response import Samples, Unknowns, sensor_rows
-from jaxvib.identification.supports.contact import held, pressing, side_count, switched_step, with_pressing
+from jaxvib.identification.supports.contact import pressing, side_count, switched_step, with_fixed_contact, with_pressing
 from jaxvib.machine.drives.drive import Drive, IdealDrive
 from jaxvib.machine.scene import Scene
 from jaxvib.ode.dopri8_loop import LoopDopri8
@@ -87,8 +87,8 @@ def _equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pai
         scene_of_run = eqx.tree_at(lambda scene: scene.exciters[0].unbalance, scene_of_run, jnp.hypot(pair[0], pair[1]))
     shifted = ShiftedDrive(drive=drive, phase=phase, end=samples.end, speed=drive.speed)
     scene_of_run: Any = eqx.tree_at(lambda scene: scene.exciters[0].drive, scene_of_run, shifted)
-    held_effects = tuple(held(effect, scene_of_run.machine) for effect in scene_of_run.effects)
-    scene_of_run = eqx.tree_at(lambda scene: scene.effects, scene_of_run, held_effects)
+    fixed_effects = tuple(with_fixed_contact(effect, scene_of_run.machine) for effect in scene_of_run.effects)
+    scene_of_run = eqx.tree_at(lambda scene: scene.effects, scene_of_run, fixed_effects)
     model = assemble(scene_of_run)
     gains = jnp.stack([jnp.asarray(unknowns.gain(x, channel.name)) for channel in samples.channels])
     corners = jnp.asarray([2.0 * np.pi * channel.high_pass for channel in samples.channels if channel.high_pass > 0.0])

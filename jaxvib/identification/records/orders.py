@@ -32,7 +32,7 @@ class ForeignVibration(NamedTuple):
     share: float
 
     @property
-    def place(self) -> str:
+    def frequency_text(self) -> str:
         """Frequency of the vibration, in words."""
         return f"at {self.frequency:.3g} Hz" if self.order is None else f"at {self.order:.3g} times the rotor's speed"
 
@@ -50,7 +50,7 @@ def foreign_vibration(values: np.ndarray, angle: np.ndarray, step: float) -> For
     >>> found = foreign_vibration(np.cos(0.7 * angle) + 0.3 * np.cos(angle), angle, 0.01)
     >>> round(found.order, 2), found.share > 0.8
     (0.7, True)
-    >>> foreign_vibration(np.cos(25.0 * t) + 0.3 * np.cos(angle), angle, 0.01).place
+    >>> foreign_vibration(np.cos(25.0 * t) + 0.3 * np.cos(angle), angle, 0.01).frequency_text
     'at 3.98 Hz'
     >>> print(foreign_vibration(0.3 * np.cos(25.0 * t) + np.cos(angle), angle, 0.01))
     None
@@ -87,7 +87,7 @@ def _spectrum(values: np.ndarray, step: float) -> tuple[np.ndarray, float]:
 
 
 def _line(power: np.ndarray) -> tuple[float, float]:
-    """Return the place of the strongest line of a spectrum, in bins, and its share of the power; both are 0 without a line."""
+    """Return the position of the strongest line of a spectrum, in bins, and its share of the power; (0, 0) without a line."""
     inner = power[_LINE + 1 :]
     peak = int(np.argmax(inner)) + _LINE + 1
     line = slice(peak - _LINE, peak + _LINE + 1)

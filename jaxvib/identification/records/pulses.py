@@ -27,7 +27,7 @@ _MAX_FAULTS = 0.1
 def rising_edges(time: np.ndarray, level: np.ndarray, where: str) -> np.ndarray:
     """Return the times at which a sampled signal rises through the middle of its range, interpolated between the samples.
 
-    A pulse counts once, even if noise crosses the middle several times.
+    A pulse counts once, even if noise makes the signal cross the middle several times.
 
     >>> t = np.arange(0.0, 1.0, 1e-3)
     >>> rising_edges(t, np.sin(40.0 * np.pi * t - 1.0), "run: channel 'tacho'")[:2].round(5).tolist()

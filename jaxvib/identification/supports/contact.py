@@ -1,8 +1,8 @@
-"""Steps of a motion that end where a stop begins or ceases to press.
+"""Steps of a motion that end where the contact with a stop begins or ends.
 
-A side of a stop presses if its penetration p and its force k p + c p' are positive. Both numbers together are the switch
-s = min(p, k p + c p'). Between two changes of the sign of a switch the equations are smooth, and a step of order 8 is accurate.
-A change at the time t has the derivative
+A side of a stop is in contact if its penetration p and its force k p + c p' are positive. Its switch is s = min(p, k p + c p').
+Between two changes of the sign of a switch the equations are smooth, and a step of order 8 is accurate. A change at the time t
+has the derivative
 
     dt = -ds / s',      ds: change of s at a constant time
 
@@ -39,16 +39,16 @@ Step = Callable[[Array, Array, Array, Dynamics], Array]
 """Function that returns the state after a step from a time, a state and a length of the step, by equations."""
 
 
-class HeldStop(Effect):
-    """Stop of which each side presses or not, as stated, at every displacement. Its force is smooth.
+class FixedContactStop(Effect):
+    """Stop whose contact is fixed: each side is in contact, or not, at every displacement. Its force is smooth.
 
-    **Attributes**: `stop`; `presses` (s,): 1 for each of its `sides` that presses, otherwise 0.
+    **Attributes**: `stop`; `presses` (s,): 1 for each of its `sides` that is in contact, otherwise 0.
     """
 
     stop: Stop
     presses: Array
     sides: tuple[Side, ...] = eqx.field(static=True)
-    kind: str = eqx.field(static=True, default="held_stop", kw_only=True)
+    kind: str = eqx.field(static=True, default="fixed_contact_stop", kw_only=True)
 
     def terms(self) -> tuple[Term, ...]:
         """Return the force of spring and damper."""
@@ -59,25 +59,25 @@ class HeldStop(Effect):
         return jnp.stack([self.stop.penetration(displacement, side)[0] for side in self.sides])
 
     def energy(self, displacement: Array) -> Array:
-        """Return the energy of the sides that press, J."""
+        """Return the energy of the sides in contact, J."""
         return 0.5 * self.stop.stiffness * jnp.sum(self.presses * self.penetrations(displacement) ** 2)
 
     def resistance(self, displacement: Array, velocity: Array) -> Array:
-        """Return the force (k,) of the dampers of the sides that press, N."""
+        """Return the force (k,) of the dampers of the sides in contact, N."""
         rates, back = jax.jvp(self.penetrations, (displacement,), (velocity,))[1], jax.vjp(self.penetrations, displacement)[1]
         return self.stop.damping * back(self.presses * rates)[0]
 
 
-def held(effect: Effect, machine: Machine) -> Effect:
-    """Return a stop as a `HeldStop` that does not press, and any other effect unchanged."""
+def with_fixed_contact(effect: Effect, machine: Machine) -> Effect:
+    """Return a stop as a `FixedContactStop` without contact, and any other effect unchanged."""
     if not isinstance(effect, Stop):
         return effect
     sides: tuple[Side, ...] = ("above", "below") if effect.side == "both" and len(effect.rows(machine)) == 1 else (effect.side,)
-    return HeldStop(effect, jnp.zeros(len(sides)), sides)
+    return FixedContactStop(effect, jnp.zeros(len(sides)), sides)
 
 
-def _effects(dynamics: Dynamics) -> list[HeldStop]:
-    return [effect for effect in dynamics.exciters[0].effects if isinstance(effect, HeldStop)]
+def _effects(dynamics: Dynamics) -> list[FixedContactStop]:
+    return [effect for effect in dynamics.exciters[0].effects if isinstance(effect, FixedContactStop)]
 
 
 def side_count(dynamics: Dynamics) -> int:
@@ -93,7 +93,7 @@ def penetrations(dynamics: Dynamics, q: Array, v: Array) -> tuple[Array, Array, 
     found, effects = [], dynamics.exciters[0].effects
     placed = [effect for effect in effects for term in effect.terms() if isinstance(term, SupportForce)]
     for effect, support in zip(placed, dynamics.supports, strict=True):
-        if isinstance(effect, HeldStop):
+        if isinstance(effect, FixedContactStop):
             depth, rate = jax.jvp(effect.penetrations, (support.rows @ q,), (support.rows @ v,))
             force = effect.stop.stiffness * depth + effect.stop.damping * rate
             found.append((depth, rate, jnp.minimum(depth, force)))
@@ -102,19 +102,19 @@ def penetrations(dynamics: Dynamics, q: Array, v: Array) -> tuple[Array, Array, 
 
 
 def pressing(dynamics: Dynamics, q: Array, v: Array) -> Array:
-    """Return True (s,) for each side of a stop that presses."""
+    """Return True (s,) for each side of a stop that is in contact."""
     return penetrations(dynamics, q, v)[2] > 0.0
 
 
 def with_pressing(dynamics: Dynamics, presses: Array) -> Dynamics:
-    """Return the equations in which the sides `presses` (s,) press."""
+    """Return the equations in which the sides `presses` (s,) are in contact."""
     sizes = [len(stop.sides) for stop in _effects(dynamics)]
     ends = [sum(sizes[: k + 1]) for k in range(len(sizes))]
     parts = [presses[end - size : end].astype(float) for end, size in zip(ends, sizes, strict=True)]
 
     def places(dynamics: Any) -> list[Array]:
         (group,) = dynamics.groups
-        return [effect.presses for effect in group.part.effects if isinstance(effect, HeldStop)]
+        return [effect.presses for effect in group.part.effects if isinstance(effect, FixedContactStop)]
 
     return eqx.tree_at(places, dynamics, parts)
 
@@ -122,15 +122,16 @@ def with_pressing(dynamics: Dynamics, presses: Array) -> Dynamics:
 def switched_step(
     step: Step, rates: Step, dynamics: Dynamics, t: Array, y: Array, presses: Array, h: Array
 ) -> tuple[Array, Array]:
-    """Return the state after the time `h`, and the sides of stops that press then.
+    """Return the state after the time `h`, and the sides of stops that are in contact then.
 
     **Arguments**: `step`; `rates`: function of the same arguments, which returns the rates of the state; the time `t`; the
-    state `y`, whose first entries are displacements and velocities; the sides `presses` (s,) that press.
+    state `y`, whose first entries are displacements and velocities; the sides `presses` (s,) that are in contact.
     """
     nd = dynamics.stiffness_per_mass.shape[0]
 
     def wrong(y: Array, presses: Array, dynamics: Dynamics) -> Array:
-        """Return the switches (s,), positive for a side that should press and does not, or the reverse."""
+        """Return the switches (s,), positive for a side that is in contact in the state but not in the equations, or the
+        reverse."""
         return jnp.where(presses, -1.0, 1.0) * penetrations(dynamics, y[:nd], y[nd : 2 * nd])[2]
 
     def go_on(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
@@ -157,7 +158,7 @@ def switched_step(
 
 
 def _turning(start: tuple[Array, Array], last: Array, presses: Array, h: Array) -> Array:
-    """Return the time after which a side that does not press is nearest to its stop within a step, if it may touch the stop
+    """Return the time after which a side without contact is nearest to its stop within a step, if it may touch the stop
     then; otherwise 0.
 
     **Arguments**: penetrations (s,) and their rates at the `start`; the `last` rates (s,); length of the step.

@@ -30,10 +30,10 @@ def test_strongest_vibration_that_is_not_the_rotors(parts, order, frequency):
     assert found.share == pytest.approx(1.0 / power, abs=0.08)
     if order is None:
         assert found.order is None and found.frequency == pytest.approx(frequency, rel=0.01)
-        assert found.place == f"at {found.frequency:.3g} Hz"
+        assert found.frequency_text == f"at {found.frequency:.3g} Hz"
     else:
         assert found.frequency is None and found.order == pytest.approx(order, rel=0.01)
-        assert found.place == f"at {found.order:.3g} times the rotor's speed"
+        assert found.frequency_text == f"at {found.order:.3g} times the rotor's speed"
 
 
 @pytest.mark.parametrize("parts", [{"rotor": 1.0, "order": 0.9}, {"rotor": 1.0, "constant": 0.9}, {"noise": 1.0}, {}])

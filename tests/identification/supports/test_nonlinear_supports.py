@@ -22,7 +22,7 @@ from jaxvib.identification.fit import project
 from jaxvib.identification.jammed.motion import _recorded, closed_motion, linearized
 from jaxvib.identification.problem import build_problem
 from jaxvib.identification.supports import start
-from jaxvib.identification.supports.contact import HeldStop, held, switched_step
+from jaxvib.identification.supports.contact import FixedContactStop, switched_step, with_fixed_contact
 from jaxvib.identification.supports.start import _guide
 from jaxvib.ode.dopri8_loop import LoopDopri8
 
@@ -85,7 +85,7 @@ def test_short_contact_within_a_step_is_that_of_short_steps():
     scene = jv.Scene(
         machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(0.1), unbalance=1e-9)], effects=jv.Stop(2e6, gap=1e-3)
     )
-    dynamics = dynamics_of(assemble(eqx.tree_at(lambda s: s.effects, scene, (held(scene.effects[0], machine),))))
+    dynamics = dynamics_of(assemble(eqx.tree_at(lambda s: s.effects, scene, (with_fixed_contact(scene.effects[0], machine),))))
     solver = LoopDopri8(tangents=True)
 
     def rates(t, y, _, dynamics):
@@ -114,9 +114,9 @@ def test_short_contact_within_a_step_is_that_of_short_steps():
         (jv.Stop(2e5, gap=1e-3, damping=300.0), jv.planar_rotor(mass=40.0, stiffness=1e6, damping=100.0)),
     ],
 )
-def test_held_stop_has_the_force_of_the_stop(stop, machine):
-    rng, (term,), frozen = np.random.default_rng(0), stop.terms(), held(stop, machine)
-    assert isinstance(frozen, HeldStop)
+def test_fixed_contact_stop_has_the_force_of_the_stop(stop, machine):
+    rng, (term,), frozen = np.random.default_rng(0), stop.terms(), with_fixed_contact(stop, machine)
+    assert isinstance(frozen, FixedContactStop)
     count, pressed = len(stop.rows(machine)), 0
     for _ in range(60):
         x, v = jnp.asarray(1.5e-3 * rng.normal(size=count)), jnp.asarray(rng.normal(size=count))
@@ -229,6 +229,6 @@ def test_scenes_with_supports_that_are_not_included_are_refused():
     balls = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
     refused(jv.Scene(scene.machine, balls, scene.exciter.drive, scene.effects), "effects.stop is a nonlinear support; identify")
     several = [scene.exciter, jv.Exciter(drive=jv.ConstantSpeed(50.0), unbalance=0.1)]
-    refused(jv.Scene(scene.machine, exciters=several, effects=scene.effects), "needs a scene with one exciter without loads")
+    refused(jv.Scene(scene.machine, exciters=several, effects=scene.effects), "only in scenes with one exciter without loads")
     refused(scene, "effects.stop presses on the foundation", channels=(jv.Channel("f", "force", direction="up"),))
     refused(scene, "of a scene with linear supports and one exciter without loads can be unknown", names=["drive.inertia"])
