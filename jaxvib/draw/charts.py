@@ -266,7 +266,7 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
     ratios = np.asarray([after / before if before else np.nan for _, before, after in rows])
     drawn = np.isfinite(ratios) & (ratios > 0.0)
     places = np.arange(len(rows))[::-1]
-    # Ratios beyond these limits leave the axis; otherwise all other bars would be as thin as lines.
+    # Bars of ratios beyond these limits are cut off; otherwise all other bars would be as thin as lines.
     low, high = max(min([0.7, *ratios[drawn]]), 1e-4), min(max([1.4, *ratios[drawn]]), 1e4)
     for place, ratio, there, (_, before, after) in zip(places, ratios, drawn, rows, strict=True):
         look: Look = {"color": COLORS[0]} if ratio <= 1.0 else {"color": COLORS[3], "hatch": "///", "edgecolor": "white"}

@@ -1,1 +1,1 @@
-"""Parts of a scene: machine, loads, drive and effects. They are immutable parameters and contain no time."""
+"""Parts of a scene: machine, loads, drive and effects. They are immutable and contain parameters, not states."""
