@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.motion.analysis.scaled_error import natural_units
 from optimize import amplitude, foundation_force, transmissibility
 
 BALLS = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
@@ -144,10 +145,21 @@ def test_reduced_model_has_the_lowest_frequencies():
     chain = 4e4 * (2 * np.eye(30) - np.eye(30, k=1) - np.eye(30, k=-1))
     machine = jv.from_matrices(2.0 * np.eye(30), 1e-4 * chain, chain, places=[[29]], reduce=6)
     wanted = 2.0 * np.sqrt(4e4 / 2.0) * np.sin(np.arange(1, 7) * np.pi / 62)
-    np.testing.assert_allclose(np.sqrt(np.diagonal(machine.stiffness)), wanted, rtol=1e-9)
-    np.testing.assert_allclose(machine.mass, np.eye(6), atol=1e-12)
-    shape = np.sqrt(2.0 / 31.0 / 2.0) * np.abs(np.sin(30 * np.arange(1, 7) * np.pi / 31))
-    np.testing.assert_allclose(np.abs(machine.rows_at(1))[0], shape, rtol=1e-9)
+    shape = np.sqrt(2.0 / 31.0 / 2.0) * np.abs(np.sin(30 * np.arange(1, 7) * np.pi / 31))  # for the modal masses 1
+    np.testing.assert_allclose(machine.mass, np.eye(6) / np.max(shape) ** 2, atol=1e-12 / np.max(shape) ** 2)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(machine.stiffness)) * np.max(shape), wanted, rtol=1e-9)
+    np.testing.assert_allclose(np.abs(machine.rows_at(1))[0], shape / np.max(shape), rtol=1e-9)
+
+
+def test_natural_unit_of_a_heavy_reduced_model_is_its_vibration():
+    """Far above the resonances each mode k vibrates by S f_k^2 at the place, with the shape f_k for the modal masses 1."""
+    chain = 4e7 * (2 * np.eye(30) - np.eye(30, k=1) - np.eye(30, k=-1))
+    machine = jv.from_matrices(2e3 * np.eye(30), 1e-4 * chain, chain, places=[[29]], reduce=2)
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(1e3), unbalance=0.3, at=1)])
+    shape = np.sqrt(2.0 / 31.0 / 2e3) * np.abs(np.sin(30 * np.arange(1, 3) * np.pi / 31))
+    np.testing.assert_allclose(natural_units(scene).displacement, 0.3 * np.max(shape) ** 2, rtol=1e-9)
+    vibration = np.max(np.abs(machine.rows_at(1)[0] * jv.response(scene, [1e3]).displacement[0]))
+    np.testing.assert_allclose(vibration, 0.3 * np.max(shape) ** 2, rtol=0.01)
 
 
 @pytest.mark.parametrize(("kept", "size"), [(4, 4), (5, 6), (6, 6)])
