@@ -1,7 +1,7 @@
 """Angle of a rotor over time, from the pulses of a tachometer, an angle, a speed, or a prescribed drive.
 
-Pulses and samples are fitted by a spline of degree 5 with evenly spaced knots. Their number minimizes the Bayesian information
-criterion. The second derivative of the spline, on which the force of an unbalance depends, is smooth. If a wheel
+Pulses and samples are fitted by a spline of degree 5 with evenly spaced knots. The number of knots minimizes the Bayesian
+information criterion. The second derivative of the spline, on which the force of an unbalance depends, is smooth. If a wheel
 has several marks, each mark has an unknown offset from its place, because marks are unevenly spaced. All pulses may be early or
 late by a common time with the standard error of one pulse, because recorders round times up, down, or to the nearest sample.
 The functions e_m(t) follow from the covariance of the coefficients:
@@ -67,7 +67,8 @@ class RecordedDrive(IdealDrive):
     kind: str = eqx.field(static=True, default="recorded", kw_only=True)
 
     def columns_at(self, t: Array, order: int) -> Array:
-        """Return the derivatives of an `order` of the angle and of its errors e_m (1 + m,) at time `t`; order 0: the values."""
+        """Return the derivatives of the given `order` of the angle and of its errors e_m (1 + m,) at time `t`; order 0: the
+        values."""
         place = (t - self.begin) / self.width
         k = jnp.clip(jnp.floor(place), 0.0, self.last)
         rows = self.table[k.astype(int)]

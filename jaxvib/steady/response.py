@@ -347,7 +347,7 @@ def _slow_speed(resonances: Array) -> Array:
 
 def motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dict[str, Any]]:
     """Return the status and the fields of `AbstractResponse` at one speed, rad/s."""
-    # Within a few units in the last place of an undamped resonance the amplitude consists of rounding errors.
+    # Within a few units in the last place of the speed of an undamped resonance, the amplitude consists of rounding errors.
     size = jnp.max(magnitude(model.force_direction)) / jnp.min(jnp.diagonal(model.mass))
     trial = magnitude(jax.lax.stop_gradient(model).displacement(jax.lax.stop_gradient(omega)))
     bounded = jnp.all(trial * 100.0 * jnp.finfo(size.dtype).eps <= size)  # both are 0 if the forces cancel

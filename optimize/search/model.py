@@ -1,7 +1,7 @@
 """Quadratic model of the Lagrangian at a design: second derivatives and the step to the minimum.
 
-Sizes of arrays: s designs, d free parameters, me held quantities (equalities), mi demands (inequalities), p or
-`parts` pieces of the objective, k pieces beside the largest one, m equations.
+Sizes of arrays: s designs, d free parameters, me held quantities (equalities), mi demands (inequalities), p or `parts` pieces
+of the objective, k pieces in addition to the largest one, m equations.
 """
 
 from __future__ import annotations

@@ -26,8 +26,8 @@ def read_run(
 ) -> MeasuredRun:
     """Read a recorded run of a machine from a file.
 
-    - Text (CSV, or columns between semicolons, tabs or blanks), with a column of times, or with the sampling rate in a line
-      such as "# rate: 2000 Hz"
+    - Text (CSV, or columns separated by semicolons, tabs or blanks), with a column of times, or with the sampling rate in a
+      line such as "# rate: 2000 Hz"
     - TDMS (`pip install '.[tdms]'`), universal files with dataset 58 (`'.[uff]'`), MATLAB's MAT files of all versions
       (`'.[mat]'`), WAV (`'.[mat]'`), MF4 (`'.[mf4]'`)
 

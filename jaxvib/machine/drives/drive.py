@@ -71,7 +71,7 @@ class Drive(Part):
         """
 
     def state_units(self) -> tuple[Array, ...]:
-        """Return the typical magnitudes of the states of a motor beside the angle and the speed; () without such states."""
+        """Return the typical magnitudes of the states of a motor other than the angle and the speed; () without such states."""
         return ()
 
     def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -83,8 +83,8 @@ class Drive(Part):
         return ()
 
     def settled(self) -> "Drive":
-        """Return the drive in its final state: an ideal drive at its working speed, or a motor switched off if it is switched
-        off at some time."""
+        """Return the drive in its final state: an ideal drive at its working speed, and a motor that is switched off at some
+        time as one that is off from the start."""
         return self
 
 

@@ -213,9 +213,9 @@ def synchronous_orbit(
     **Arguments**: `scene` without effects that permit the rotation of loads about their own centres; and
 
     - `regime`: a motion of the averaged theory with `speed` and `phases`; or these two arguments:
-    - `speed`: start of Omega, rad/s or text; default: the mean of the motors' no-load speeds; typical: 60 to 320
-    - `phases` (N,): starts of alpha, rad; default: 0. The first phase that is free keeps its value, because it defines the
-      origin of time
+    - `speed`: starting value of Omega, rad/s or text; default: the mean of the motors' no-load speeds; typical: 60 to 320
+    - `phases` (N,): starting values of alpha, rad; default: 0. The first phase that is free keeps its value, because it defines
+      the origin of time
     - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-8 (the default; in
       single precision 1e-3)
     - `points`: a fixed number of points on a period in place of an accuracy; typical: 17 to 65. Under `jit` and `vmap` the
@@ -256,8 +256,8 @@ def synchronous_orbit(
 class SynchronousPlan(NamedTuple):
     """Plan of an exact synchronous motion.
 
-    **Attributes**: the `scene` with its drives in their final state; starts of `speed`, rad/s, and `phases` (N,), rad; numbers
-    of collocation `points` to try one after the other; relative `accuracy`; `is_known`: True if no parameter is traced.
+    **Attributes**: the `scene` with its drives in their final state; starting values of `speed`, rad/s, and `phases` (N,), rad;
+    numbers of collocation `points` to try one after the other; relative `accuracy`; `is_known`: True if no parameter is traced.
     """
 
     scene: Scene
