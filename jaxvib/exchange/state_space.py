@@ -161,8 +161,8 @@ def state_space(
     - `scene`: for a model at rest only the machine, the loads, the nonlinear supports and the rotor speed matter, and several
       exciters are allowed
     - `at`: "rest" (the default), or a jam from `jam_modes(scene).select(mode)` or `phase_jams(scene)`
-    - `rotor_speed` n, rad/s, for a machine at rest with a gyroscopic matrix (default: the mean speed of the drives); typical:
-      0 to 500
+    - `rotor_speed` n, rad/s, negative if clockwise, for a machine at rest with a gyroscopic matrix (default: the mean speed of
+      the drives); typical: 0 to 500
 
     **Returns** `StateSpace`.
 
@@ -183,7 +183,7 @@ def state_space(
         return _model_in_jam(scene, at)
     if at != "rest":
         raise InputError("at", f"is {quoted(at)}; it must be 'rest' or a jam, for example jam_modes(scene).select(3)")
-    speed = _mean_speed(scene) if rotor_speed is None else number(rotor_speed, "rad/s", "rotor_speed", low=0.0)
+    speed = _mean_speed(scene) if rotor_speed is None else number(rotor_speed, "rad/s", "rotor_speed")
     return _model_at_rest(scene, speed)
 
 

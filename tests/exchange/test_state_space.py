@@ -123,6 +123,12 @@ def test_state_of_a_jam_does_not_depend_on_its_common_phase():
     np.testing.assert_allclose(jv.state_space(scene(), shifted).x0, jv.state_space(scene(), jam).x0, atol=1e-12)
 
 
+def test_clockwise_rotation_reverses_the_gyroscopic_terms():
+    clockwise, rest, other = (jv.state_space(rotor_scene(), rotor_speed=n).A for n in (-300.0, 0.0, 300.0))
+    np.testing.assert_allclose(clockwise - rest, rest - other, atol=1e-9 * np.max(np.abs(rest)))
+    assert np.max(np.abs(other - rest)) > 1.0
+
+
 def test_jam_outputs_follow_the_jam_over_rotor_speed():
     modes = [jv.jam_modes(scene(speed=n)).select(3) for n in (120.0, 119.99, 120.01)]
     model = jv.state_space(scene(), modes[0])
