@@ -75,7 +75,7 @@ class MachineFit(Result):
     - `phase`, rad: direction of the unbalance of each exciter at the rotor angle 0, anticlockwise from the horizontal
     - `first_states`, SI: of each run with loads on its rotor, the coordinates of the machine, their velocities, the angles of
       the loads, their speeds and the angle of the rotor at the first sample; empty without loads
-    - `channels`: names of the compared channels of each run
+    - `channels`: names of the compared channels of each run, and their `kinds`
     - `noise`: standard deviation of the residuals of each run's channels, SI
     - `chance`: probability that pure noise has vibrations at orders of the rotor's speed that are as strong as those of the
       residuals; the smallest one of all channels
@@ -101,6 +101,7 @@ class MachineFit(Result):
     phase: np.ndarray = eqx.field(metadata=in_unit("rad", "exciter"))
     first_states: tuple[np.ndarray, ...]
     channels: tuple[tuple[str, ...], ...]
+    kinds: tuple[tuple[str, ...], ...]
     noise: tuple[np.ndarray, ...]
     chance: float = eqx.field(metadata=in_unit(""))
     time: tuple[np.ndarray, ...]
@@ -336,6 +337,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         phase=np.array([math.atan2(*fitted.linear[2 * k : 2 * k + 2][::-1]) for k in range(exciters)]),
         first_states=first_states(problem, fitted.linear) if problem.has_loads else (),
         channels=tuple(tuple(channel.name for channel in samples.channels) for samples in problem.runs),
+        kinds=tuple(tuple(channel.kind for channel in samples.channels) for samples in problem.runs),
         noise=fitted.noise,
         chance=chance,
         time=problem.times,

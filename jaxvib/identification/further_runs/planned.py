@@ -114,9 +114,15 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     require_linear_supports(fit.scene, "plan_runs")
     noises = _noises(fit) | {name: (Noise(np.ones(1), each), 1.0 / planned.rate) for name, each in planned.noise.items()}
     vibration_channels = [channel for channel in planned.channels if channel.kind in MOTIONS]
+    kinds = dict(pair for run in zip(fit.channels, fit.kinds, strict=True) for pair in zip(*run, strict=True))
     for channel in vibration_channels:
+        there = f"channel {quoted(channel.name)}"
+        if (kind := kinds.get(channel.name, channel.kind)) != channel.kind:
+            problem = (
+                f"is of kind {channel.kind}, but {kind} in the fit, whose noise and gain it would have; give it another name"
+            )
+            raise InputError(f"candidates: {planned.name}: {there}", problem)
         if channel.name not in noises:
-            there = f"channel {quoted(channel.name)}"
             raise InputError(f"candidates: {planned.name}: {there}", "is new; give its noise, noise={name: standard deviation}")
     time = np.arange(0.0, planned.duration, 1.0 / planned.rate)
     readings = {channel.name: np.zeros(time.size) for channel in vibration_channels}

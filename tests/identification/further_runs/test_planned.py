@@ -37,7 +37,8 @@ def fit():
     return SimpleNamespace(
         scene=jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=0.05)]),
         names=NAMES, scale=np.array([4e4, 0.05, 300.0]), gain_names=("deck", "frame"), phase=np.array([0.4]),
-        channels=(("frame",), ("deck", "frame")), noise=(np.array([1e-3]), np.array([5e-3, 7e-3])),
+        channels=(("frame",), ("deck", "frame")), kinds=(("velocity",), ("velocity",) * 2),
+        noise=(np.array([1e-3]), np.array([5e-3, 7e-3])),
         time=(0.01 * np.arange(3), 0.0025 * np.arange(3)), readings=(np.zeros((3, 1)), np.zeros((3, 2))),
         fitted=(np.zeros((3, 1)), np.zeros((3, 2))), information=np.diag([4e4, 100.0, 900.0, 1e4, 1e4, 400.0]),
     )  # fmt: skip
@@ -73,6 +74,8 @@ def test_noise_of_another_rate_and_of_new_channels(noise, deviation):
     ]  # no gain, but the mark of the angle
     with pytest.raises(jv.InputError, match="candidates: ramp: channel 'new' is new; give its noise, noise="):
         expected_run(fit(), ramp(channels=(jv.Channel("new", "velocity", at=1),)))
+    with pytest.raises(jv.InputError, match="channel 'deck' is of kind displacement, but velocity in the fit"):
+        expected_run(fit(), ramp(channels=(jv.Channel("deck", "displacement", at=1),)))
 
 
 @pytest.mark.parametrize("rate", [100.0, 50.0, 200.0])
@@ -81,7 +84,9 @@ def test_coloured_noise_keeps_its_density_at_other_rates(rate):
     white = 1e-3 * np.random.default_rng(0).normal(size=20000)
     left, taps = np.asarray(lfilter([1.0], [1.0, -0.9], white)), np.array([1.0, -0.9])
     parts = {"time": (0.01 * np.arange(20000),), "readings": (left[:, None],), "fitted": (np.zeros((20000, 1)),)}
-    coloured = SimpleNamespace(**vars(fit()) | {"channels": (("frame",),), "noise": ([np.std(left)],)} | parts)
+    coloured = SimpleNamespace(
+        **vars(fit()) | {"channels": (("frame",),), "kinds": (("velocity",),), "noise": ([np.std(left)],)} | parts
+    )
     samples = expected_run(coloured, ramp(rate=rate)).fitted.problem.runs[0]
     for frequency in (0.5, 3.0, 10.0):  # Hz
 
