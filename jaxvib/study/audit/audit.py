@@ -25,7 +25,7 @@ from jaxvib.study.audit.compared import CHANGES, EffectRow, RepeatedComparison, 
 from jaxvib.study.audit.comparisons import MIN_AMPLITUDE_SHARE, JamComparison, RunComparison, without_excluded_effects
 from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers
 from jaxvib.study.audit.tiers import TierRow, tier_rows
-from jaxvib.study.audit.variants import possible_variants, present_variants
+from jaxvib.study.audit.variants import possible_variants, present_variants, require_absent
 from jaxvib.units import Number, count, number
 
 _TIER_STEPS = 1
@@ -142,8 +142,9 @@ def audit(
       timings, which saves a compilation for each effect
     - `progress`: a function that is called with the name of each step and the finished share of all steps (0 to 1)
 
-    **Returns** `Audit`. **Raises** `InputError` for an accuracy that is not between 0 and 1, `ComputationError` (status
-    "absent") for a mode that does not exist, and the errors of `jam_modes` and `simulate`.
+    **Returns** `Audit`. **Raises** `InputError` for an accuracy that is not between 0 and 1, and for a possible effect that the
+    scene has already, `ComputationError` (status "absent") for a mode that does not exist, and the errors of `jam_modes` and
+    `simulate`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -158,6 +159,7 @@ def audit(
     if isinstance(accuracy, bool) or not isinstance(accuracy, (int, float)) or not 0.0 < accuracy < 1.0:
         raise InputError("accuracy", f"is {quoted(accuracy)}; it must be a number between 0 and 1, such as 0.01 for 1 %")
     scene = validate_scene(scene)
+    require_absent(scene, possible or ())
     count(repeats, "repeats", low=0)
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
 
@@ -173,11 +175,8 @@ def audit(
     # The scale of a machine that almost does not move is the unbalance radius of its loads.
     amplitude = [a * (values.magnified / MIN_AMPLITUDE_SHARE if values.magnified > 1.0 else 1.0) for a in values.amplitude]
     variants = [*present_variants(scene, until), *possible_variants(scene, amplitude, possible)]
-    status = "done"
-    if not np.isfinite(values.omega):
-        status = "failed"
-    elif not values.uncertainty <= 0.5 * accuracy:
-        status = "unsettled"
+    finite_status = "done" if values.uncertainty <= 0.5 * accuracy else "unsettled"
+    status = finite_status if np.isfinite(values.omega) else "failed"
     seconds, compiling = repeated.times(scene)
     steps = 1 + len(variants) + (_TIER_STEPS if tiers else 0)
     effects = []

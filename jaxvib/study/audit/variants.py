@@ -76,6 +76,15 @@ def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
         )
 
 
+def require_absent(scene: Scene, possible: Sequence[Effect]) -> None:
+    """**Raises** `InputError` for a possible effect that the scene has already and of which it cannot have a second one."""
+    present = {effect.kind for effect in scene.all_effects if not effect.repeatable}
+    for k, effect in enumerate(possible):
+        if effect.kind in present:
+            problem = f"is {effect.kind}, which the scene has already; leave it out, an audit removes each effect of the scene"
+            raise InputError(f"possible[{k}]", problem)
+
+
 def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[Effect] | None) -> Iterator[Variant]:
     """Yield variants of the scene with one effect that it lacks and could have.
 
@@ -84,11 +93,9 @@ def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[
 
     **Arguments**: `amplitude` (nd,): amplitudes of the coordinates, m or rad, for the typical values.
     """
-    present = {effect.kind for effect in scene.all_effects if not effect.repeatable}
     for effect in given or ():
-        if effect.kind not in present:
-            with_effect = scene.replace(effects=(*scene.all_effects, effect))
-            yield Variant(effect.kind, False, with_effect, "as given")
+        with_effect = scene.replace(effects=(*scene.all_effects, effect))
+        yield Variant(effect.kind, False, with_effect, "as given")
     if given is not None:
         return
     present_kinds = {effect.kind for effect in scene.all_effects}
