@@ -43,7 +43,7 @@ that counts as rounding."""
 _KINK_STEPS = 4
 """Number of first-order steps that move a design back onto a kink."""
 
-_ACTIVE_DISTANCE = 1e-6
+ACTIVE_DISTANCE = 1e-6
 """Largest distance of a demand or a free parameter from its limit, relative to the limit, at which it counts as active."""
 
 _MAX_PENALTY = 1e9
@@ -376,11 +376,11 @@ def optimality(problem: Problem, point: Point) -> Optimality:
     slopes = np.where(np.isfinite(point.slopes), point.slopes, 0.0)
     rows, slope = slopes[:, 1:], slopes[:, 0]
     counts = np.ones((s, m + mi), bool)
-    counts[:, m:] = point.values[:, 1 + m :] > -_ACTIVE_DISTANCE
+    counts[:, m:] = point.values[:, 1 + m :] > -ACTIVE_DISTANCE
     if problem.parts > 1:
-        slope, piece_gradients, meets = at_kink(point, _ACTIVE_DISTANCE)
+        slope, piece_gradients, meets = at_kink(point, ACTIVE_DISTANCE)
         rows, counts = np.concatenate([rows, piece_gradients], axis=1), np.concatenate([counts, meets], axis=1)
-    at_low, at_high = point.z <= _ACTIVE_DISTANCE, point.z >= 1.0 - _ACTIVE_DISTANCE
+    at_low, at_high = point.z <= ACTIVE_DISTANCE, point.z >= 1.0 - ACTIVE_DISTANCE
     fixed = np.asarray(problem.space.low == problem.space.high)[None, :] & np.ones((s, 1), bool)
     free = ~(at_low | at_high | fixed)
     dual = np.zeros(counts.shape)

@@ -10,11 +10,15 @@ from jaxvib.display import shown_unit
 from optimize.quantities.quantity import Demand
 from optimize.result import Influence, Limit, Machine
 from optimize.search.find import SearchResult
-from optimize.search.polish import FEASIBILITY_TOLERANCE
+from optimize.search.polish import ACTIVE_DISTANCE, FEASIBILITY_TOLERANCE
 from optimize.search.problem import Problem
 
 _STEP = 0.01
 """Relative change of a free parameter for its influence, and of a limit for the improvement of the objective."""
+
+
+_EDGE = 2.0 * ACTIVE_DISTANCE
+"""Distance from a bound, relative to the range, within which a free parameter with a multiplier is at its bound."""
 
 
 def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult, sides: np.ndarray) -> tuple[Limit, ...]:
@@ -51,14 +55,14 @@ def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult,
         rows.append(Limit(demand.words, demand.quantity.unit, value, limit, float(violation), active, *effect))
     numbers = space.numbers(result.point.z[best])
     low, high = (np.asarray(b) for b in (problem.space.low, problem.space.high))
-    sizes = np.abs([low, high])
-    edge = 1e-9 * np.where(problem.space.logs, sizes, np.max(sizes, axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
         slopes = np.where(space.logs, numbers * np.log(high / low), high - low)
+        position = np.where(space.logs, np.log(numbers / low) / np.log(high / low), (numbers - low) / (high - low))
     for k, (word, unit) in enumerate(problem.space.words()):
         dual = duals.bounds[best, k]
-        upper = numbers[k] >= high[k] - edge[1, k]
-        if low[k] == high[k] or slopes[k] == 0.0 or not (upper or numbers[k] <= low[k] + edge[0, k]) or dual == 0.0:
+        upper = position[k] > 0.5
+        is_active = min(position[k], 1.0 - position[k]) <= _EDGE and dual != 0.0
+        if low[k] == high[k] or slopes[k] == 0.0 or not is_active:
             continue
         shown, factor = shown_unit(unit, abs(numbers[k]))
         what = f"{word} {'at most' if upper else 'at least'} {numbers[k] * factor:.5g} {shown}"

@@ -7,7 +7,7 @@ from two_springs import FREE, SCENE, plain, point_of
 from optimize import DesignSpace, hold
 from optimize.result import Machine
 from optimize.search.find import SearchResult
-from optimize.search.polish import Optimality
+from optimize.search.polish import ACTIVE_DISTANCE, Optimality
 from optimize.search.problem import problem_of
 from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours
 
@@ -71,6 +71,8 @@ def test_active_bounds_are_listed(scale, z, dual, what, multiplier):
     assert limit.what == what and limit.active and limit.violation == 0.0
     np.testing.assert_allclose(limit.limit, 9e4 if z == 1.0 else 1e4)
     np.testing.assert_allclose([limit.multiplier, limit.gain], [multiplier, multiplier / 4.0], rtol=1e-12)
+    near = ended([[abs(z - 0.5 * ACTIVE_DISTANCE), 0.5]], [[4.0]], bounds=[dual, 0.0])
+    assert [limit.what for limit in limits_of(problem, [], near, np.zeros((0, 2)))] == [what]
     away = ended([[0.999, 0.5]], [[4.0]], bounds=[dual, 0.0])
     assert limits_of(problem, [], away, np.zeros((0, 2))) == ()
     fixed = np.array([9e4, 1e4]), np.array([9e4, 9e4])
