@@ -30,7 +30,7 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
     found = jv.run_up(loaded_scene(scene, without), until, least=least)
     output.picture("run_up.png", found.plot)
     output.csv(csv, found.run, "trajectory_time")
-    names = ("resonances", "speed", "caught_at", "peak_amplitude", "peak_force")
+    names = ("resonances", "speed", "caught_at", "peak_amplitude", "peak_force", "weight_error")
     optional_fields = {"least_torque": found.least_torque} if least else {}
     document = {"status": found.status_name, "message": found.message, **fields_of(found, *names), **optional_fields}
     output.done(document, found.summary, "run_up", found)

@@ -15,9 +15,10 @@ from jaxvib.equations.linear import natural_frequencies
 from jaxvib.equations.model import assemble
 from jaxvib.errors import InputError
 from jaxvib.machine.drives.drive import Motor, MotorWrapper, SwitchedOff
+from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.machine.validation import lifting_torques, start_notes, validate_scene
+from jaxvib.machine.validation import first_moment, lifting_torques, start_notes, validate_scene
 from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.motion.envelope.result import Envelope, plot_histories
 from jaxvib.motion.start import initial_state
@@ -43,6 +44,9 @@ _START_ANGLES = 8
 _LIFTING_SHARE = 0.02
 """Relative difference between the least torque and the torque that lifts an unbalance up to which they count as equal; the
 least torque has an error of 1 %."""
+
+_MIN_SHOWN_ERROR = 0.01
+"""Smallest relative error of peaks that the text of a run-up states; that of averaging without gravity is about as large."""
 
 _LARGEST_FACTOR, _BISECTIONS = 64.0, 10
 """Largest factor of the torques in the search for the weakest motors, and largest number of its bisections."""
@@ -75,6 +79,7 @@ class MotorRunUp(Result):
     - `least_torque`: the smallest factor by which the torques of all motors can be multiplied such that all exciters still pass
       their resonances; 1/64 if this factor is still sufficient; NaN if it was not requested, or if even motors 64 times as
       strong do not pass
+    - `weight_error`: share by which the weight of the unbalances can change the peaks; 0 without gravity
     - `run`: the averaged motion, an `Envelope`
     - `scene`
     """
@@ -88,6 +93,19 @@ class MotorRunUp(Result):
     least_torque: Array = eqx.field(metadata=in_unit(""))
     run: Envelope = eqx.field(metadata=part(prefix="run_"))
     scene: Scene = eqx.field(metadata=SCENE)
+
+    @property
+    def weight_error(self) -> float:
+        """Share by which the weight of the unbalances, which averaging omits, can change the peaks.
+
+        It is the largest S g / (J w^2) of all motors, with the unbalance S, the inertia J and the lowest natural frequency w; 0
+        without gravity.
+        """
+        g = np.hypot.reduce([float(each) for each in total_gravity(self.scene.all_effects).values()] or [0.0])
+        turned = [each for each in self.scene.exciters if isinstance(each.drive, Motor)]
+        ratios = [float(moment / each.drive.inertia) for each in turned if (moment := first_moment(each)) is not None]  # pyright: ignore[reportAttributeAccessIssue]
+        resonances = np.asarray(self.resonances)
+        return float(max(ratios, default=0.0) * g / np.min(resonances[resonances > 0.0], initial=np.inf) ** 2)
 
     def summary(self) -> str:
         """Return the outcome as text: a line for each exciter, the peaks and the weakest motors."""
@@ -103,6 +121,9 @@ class MotorRunUp(Result):
         of = " (largest of several initial angles; the figure shows one run)" if _turned_motors(self.scene) else ""
         force = quantity_text(self.peak_force, "N", 4)
         lines += [f"  peaks on the way{of}:", f"    {peaks}; magnitude of the foundation force {force}"]
+        if self.weight_error > _MIN_SHOWN_ERROR:
+            share = f"{100.0 * self.weight_error:.2g} %"
+            lines.append(f"    the weight of the unbalances, which averaging omits, changes peaks by up to about {share}")
         if np.isfinite(self.least_torque):
             lines.append(f"  all pass with torques of at least {float(self.least_torque):.3g} times those of the motors")
             lifting = _lifting_factor(self.scene)
@@ -156,7 +177,11 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     weight of the unbalances, which averaging omits, determine these angles. Peaks are therefore the largest ones of several
     runs from different initial angles: 8 runs for each motor after the first one, or for each motor if another exciter has an
     ideal drive. The peaks of a single run can be half as large. Compared with the full equations from the same angles without
-    gravity, the peaks have errors of 2 % for a screen that passes its resonances within two turns.
+    gravity, the peaks have errors of 2 % for a screen that passes its resonances within two turns. With gravity, the weight S g
+    of an unbalance changes the speed of its rotor within each turn by a share of about S g / (J w^2). This excites the
+    resonance w already at half of this speed, and the vibration that remains changes the later peak. The change has either
+    sign, depending on the initial angle, and is up to about this share (`weight_error`), which can exceed 20 % for screens; use
+    `simulate` from rest for peaks with less error.
 
     **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between passing a
     resonance and being caught use `simulate`. The torque of a motor with currents is its steady torque here. This changes
