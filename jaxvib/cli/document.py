@@ -26,7 +26,7 @@ _NOTED_KEY = "jaxvib.noted_measures"
 
 
 def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options --deck and --slope, which `measures_of` reads, to a command."""
+    """Add the options --deck, --slope and --layer, which `measures_of` reads, to a command."""
 
     def store_value(context: click.Context, parameter: click.Parameter, value: Any) -> None:
         if isinstance(value, tuple):
@@ -36,6 +36,8 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
                 if point.count(",") != 1:
                     raise InputError("--deck", f"is {quoted(point)}; give X,Y from the centre of mass, m, such as 1.5,0.1")
             value = [numbers([part.strip() for part in point.split(",")], "m", "--deck", 2).tolist() for point in value]
+        elif parameter.name == "layer":
+            value = None if value is None else [part.strip() for part in value.split(",")]
         elif value is not None:
             from jaxvib.units import number  # slow import, which --help does not need
 
@@ -62,7 +64,14 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
         help="Point of the deck of a body in a plane for stroke, throw and conveying speed, m, such as 1.5,0.1, repeatable "
         "[centre of mass].",
     )
-    return deck(slope(command))
+    layer = click.option(
+        "--layer",
+        metavar="WIDTH,HEIGHT,DENSITY",
+        expose_value=False,
+        callback=store_value,
+        help="Layer of material on the deck, for the throughput, such as '1.5 m, 55 mm, 1600 kg/m^3'.",
+    )
+    return deck(slope(layer(command)))
 
 
 def measures_of(scene: jv.Scene, motion: jv.Jam | jv.PhaseJam | jv.Orbit | jv.Vibration) -> jv.VibrationMeasures:
@@ -85,24 +94,24 @@ def measures_of(scene: jv.Scene, motion: jv.Jam | jv.PhaseJam | jv.Orbit | jv.Vi
 
 
 def deck_of_options() -> dict[str, Any]:
-    """Return the values of the options --deck (`at`, a list of points) and --slope that the user gave."""
+    """Return the values of the options --deck (`at`, a list of points), --slope and --layer that the user gave."""
     return dict(click.get_current_context().meta.get(_DECK_KEY, {}))
 
 
 def require_deck_options(scene: jv.Scene) -> None:
-    """**Raises** `InputError` for the options --deck and --slope with a machine that is not a body in a plane."""
+    """**Raises** `InputError` for the options of the deck with a machine that is not a body in a plane."""
     deck = deck_of_options()
     if deck and scene.machine.places != "plane":
-        option = "--deck" if "at" in deck else "--slope"
+        option = "--deck" if "at" in deck else f"--{next(iter(deck))}"
         raise InputError(option, f"is for bodies in a plane, not for a machine of kind '{scene.machine.kind}'; leave it out")
 
 
 def run_measures(run: jv.Run | jv.Envelope) -> jv.VibrationMeasures | None:
-    """Return the measures of a run; None, with a note about --deck and --slope, for a run without vibration."""
+    """Return the measures of a run; None, with a note about the options of the deck, for a run without vibration."""
     if not run.no_vibration:
         return measures_of(run.scene, run.vibration())
     if deck_of_options():
-        note("note: --deck, --slope: no stroke, throw and conveying, because the run ends without a vibration")
+        note("note: --deck, --slope, --layer: no stroke, throw and conveying, because the run ends without a vibration")
     return None
 
 

@@ -167,6 +167,7 @@ class VibrationMeasures(Readable):
     - `point` (2,) of a body in a plane, its `point_stroke`, m peak to peak along the long axis of its path, its
       `point_acceleration`, g, `throw_angle`, rad, and `throw_number`, see `Ellipse`, and `conveying_speed`, m/s, the estimate
       of `jaxvib.conveying_speed`; with a leading axis if several points were requested; None for other machines
+    - `throughput`, kg/s, at the `point`; None if no `layer` was given
     - `coordinates` (nt,): names of the coordinates, and `directions` of the force on the foundation
     """
 
@@ -189,6 +190,7 @@ class VibrationMeasures(Readable):
     throw_angle: Array | None = eqx.field(metadata=in_unit("rad"), default=None)
     throw_number: Array | None = eqx.field(metadata=in_unit(""), default=None)
     conveying_speed: Array | None = eqx.field(metadata=in_unit("m/s"), default=None)
+    throughput: Array | None = eqx.field(metadata=in_unit("kg/s"), default=None)
     coordinates: tuple[str, ...] = eqx.field(static=True, default=())
     directions: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -262,9 +264,11 @@ class VibrationMeasures(Readable):
         if self.point is None or any(each is None for each in values):
             return []
         lines = []
+        values.append(np.full_like(self.conveying_speed, np.nan) if self.throughput is None else self.throughput)
         for place, *each in zip(np.atleast_2d(self.point), *map(np.atleast_1d, values), strict=True):
-            stroke, acceleration, angle, throw, speed = map(float, each)
+            stroke, acceleration, angle, throw, speed, flow = map(float, each)
             conveys = "flights longer than a turn" if np.isnan(speed) else f"conveys {speed:.3f} m/s"
+            conveys += "" if np.isnan(flow) else f", {3.6 * flow:.4g} t/h"
             lines += [
                 f"point ({', '.join(f'{float(x):.4g}' for x in place)}) m: stroke {quantity_text(stroke, 'm', 4)} peak to peak "
                 f"at {quantity_text(angle, 'rad', 4)}, {acceleration:.3g} g,",
@@ -285,6 +289,7 @@ def vibration_measures(
     at: int | Number | Sequence[Number] | Sequence[Sequence[Number]] | None = None,
     body: int = 0,
     slope: Number = 0.0,
+    layer: Sequence[Number] | None = None,
 ) -> VibrationMeasures:
     """Return stroke, acceleration, velocity, isolation, forces on supports, torque, power and throw of a vibration.
 
@@ -302,9 +307,11 @@ def vibration_measures(
     - `at`: point of a deck, (x, y) of the body number `body`, m, or a list of points; default: its centre of mass; typical:
       both ends of the deck
     - `slope` of the deck, rad or text from x anticlockwise; typical: "-15 deg" to 0 (the default)
+    - `layer`: width, m, height, m, and bulk density, kg/m^3, of the material on the deck, for the throughput; typical:
+      ("1.5 m", "55 mm", "1600 kg/m^3")
 
     **Returns** `VibrationMeasures`, with derivatives. **Raises** `InputError` for a point that the machine does not have, and
-    for `at` or `slope` with a machine that is not a body in a plane.
+    for `at`, `slope` or `layer` with a machine that is not a body in a plane.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0),
@@ -318,7 +325,8 @@ def vibration_measures(
     """
     scene = validate_scene(scene)
     along, kind = known_number(slope, "rad", "slope"), scene.machine.kind
-    for name, given, is_given in (("at", at, at is not None), ("slope", slope, when_known(lambda tilt: tilt != 0.0, along))):
+    tilted = when_known(lambda tilt: tilt != 0.0, along)
+    for name, given, is_given in (("at", at, at is not None), ("slope", slope, tilted), ("layer", layer, layer is not None)):
         if is_given and scene.machine.places != "plane":
             problem = f"is {quoted(given)}; it is for bodies in a plane, not for a machine of kind {quoted(kind)}; leave it out"
             raise InputError(name, problem)
@@ -337,7 +345,19 @@ def vibration_measures(
         vibration = (first, motion.amplitude, motion.foundation_force)
         phase = motion.offsets + motion.deviation_harmonics[:, 0].real  # of loads that differ
         motion = _vibration_at_phases(scene, motion.rotor_speed, motion.omega, phase, *vibration, motion.power)
-    return _measures(scene, motion, places if has_list else places[0], along)
+    measures = _measures(scene, motion, places if has_list else places[0], along)
+    if layer is None or measures.conveying_speed is None:
+        return measures
+    return dataclasses.replace(measures, throughput=_mass_per_length(layer) * jnp.abs(measures.conveying_speed))
+
+
+def _mass_per_length(layer: Sequence[Number]) -> Array:
+    """Return the product of width, height and bulk density of a layer, kg/m."""
+    if not isinstance(layer, (list, tuple)) or len(layer) != 3:
+        raise InputError("layer", f"is {quoted(layer)}; give width, height and density, as ('1.5 m', '55 mm', '1600 kg/m^3')")
+    kinds = zip(("width", "height", "density"), layer, ("m", "m", "kg/m^3"), strict=True)
+    width, height, density = (number(x, unit, f"layer ({name})", low=0.0) for name, x, unit in kinds)
+    return width * height * density
 
 
 @cached

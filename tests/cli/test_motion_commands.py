@@ -350,7 +350,9 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     assert code == 0 and [regime["stable"] for regime in regimes] == [True, False]
     np.testing.assert_allclose(np.abs([regime["phases"][1] for regime in regimes]), [np.pi, 0.0], atol=1e-9)
     assert (tmp_path / "o" / "regimes.png").stat().st_size > 10_000
-    out = typed("regimes", "screen.toml", "--deck", "0.4, 0.1", "--slope", "-5 deg")[1]
+    layer = ("--layer", "1.5 m, 55 mm, 1600 kg/m3")
+    out = typed("regimes", "screen.toml", "--deck", "0.4, 0.1", "--slope", "-5 deg", *layer)[1]
+    assert out.count(" t/h") == out.count("conveys ")
     assert "954.887" in out and "point (0.4, 0.1) m: stroke" in out and max(map(len, out.splitlines())) <= 80
     assert "rotation: exciter 1 anticlockwise, exciter 2 clockwise" in out and "margin: factor" in out
     assert "natural frequencies: 42.706, 42.706, 51.247 rpm" in out and "stable, above all natural frequencies:" in out

@@ -170,6 +170,12 @@ def test_loads_of_inclined_supports_follow_from_their_springs(screen):
     assert f"foundation: {abs(total[0]):.4g} N across, {abs(total[1]):.4g} N up (dynamic)" in measures.summary()
     u = rows_of((1.0, 0.2)) @ z
     np.testing.assert_allclose(measures.conveying_speed, jv.conveying_speed(jnp.asarray(u), w, slope="-10 deg"), rtol=1e-12)
+    assert measures.throughput is None and "t/h" not in measures.summary()
+    carried = jv.vibration_measures(screen, found, at=(1.0, 0.2), slope="-10 deg", layer=("1.5 m", "50 mm", "1.6 t/m^3"))
+    np.testing.assert_allclose(carried.throughput, 1.5 * 0.05 * 1600.0 * np.abs(measures.conveying_speed), rtol=1e-12)
+    assert f"m/s, {3.6 * float(carried.throughput):.4g} t/h" in carried.summary()
+    with pytest.raises(jv.InputError, match=r"^layer is \(1.5, 0.05\); give width, height and density"):
+        jv.vibration_measures(screen, found, layer=(1.5, 0.05))
     path = jv.ellipse_of(jnp.asarray(u), w, slope="-10 deg")
     np.testing.assert_allclose(measures.throw_number, path.throw_number, rtol=1e-12)
     np.testing.assert_allclose(measures.throw_angle, path.direction, rtol=1e-12)
@@ -373,7 +379,7 @@ def test_static_load_does_not_depend_on_the_order_of_ends():
 
 def test_points_are_refused_except_on_bodies_in_a_plane(jam):
     shaken, found = jam
-    for given in ({"at": 7}, {"at": (3.0, 1.0)}, {"at": [(3.0, 1.0)]}, {"slope": "-10 deg"}, {"body": 1}):
+    for given in ({"at": 7}, {"at": (3.0, 1.0)}, {"at": [(3.0, 1.0)]}, {"slope": "-10 deg"}, {"body": 1}, {"layer": [1]}):
         with pytest.raises(jv.InputError, match=rf"^{next(iter(given))} is .*(leave it out|number 0)"):
             jv.vibration_measures(shaken, found, **given)
 
