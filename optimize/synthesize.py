@@ -312,11 +312,11 @@ _Motion = int | Literal["working"] | None
 
 
 def _motion_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> _Motion:
-    """Return the motion of a search: the jam mode of its objective, otherwise that of the first demand with a jam mode."""
-    quantities = objective, *(d.quantity for d in demands)
+    """Return the motion of a search: the jam mode of its objective, otherwise that of the first demand, otherwise that of the
+    first held quantity with a jam mode."""
+    quantities = objective, *(d.quantity for d in demands), *(h.quantity for h in space.held)
     modes = [q.mode for q in quantities if q.mode is not None]
-    all_quantities = *quantities, *(h.quantity for h in space.held)
-    is_working = any(isinstance(part, RegimeQuantity) for q in all_quantities for part in walk(q))
+    is_working = any(isinstance(part, RegimeQuantity) for q in quantities for part in walk(q))
     return modes[0] if modes else "working" if is_working else None
 
 
@@ -326,7 +326,7 @@ def _run(scene: Scene, motion: _Motion, verify: bool) -> tuple[Run | None, str]:
     **Returns** the run and an empty text, or None and the reason why there is no run.
     """
     if motion is None:
-        return None, "neither the objective nor the demands have a motion to integrate"
+        return None, "no quantity of the search has a motion to integrate"
     if not verify:
         return None, "not requested"
     try:  # a failed verification must not lose the machine

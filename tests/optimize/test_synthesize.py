@@ -120,7 +120,7 @@ def test_wrong_arguments_raise_clear_errors():
     ):
         with pytest.raises(jv.InputError, match=says):
             synthesize(space, wish, subject_to=subject_to, begin=begin)
-    assert _run(SCENE, None, True)[1].startswith("neither the objective nor the demands have a motion")
+    assert _run(SCENE, None, True)[1].startswith("no quantity of the search has a motion")
     assert _run(SCENE, 3, False) == (None, "not requested")
 
 
@@ -215,6 +215,11 @@ def test_the_mode_of_a_search_is_that_of_its_objective():
     assert (
         _motion_of(SPACE, mass, [mass < 9.0, whose < 1.0, force < 1.0]) == 4 and _motion_of(SPACE, mass, [mass < 9.0]) is None
     )
+
+
+def test_the_mode_of_a_search_can_be_that_of_a_held_quantity():
+    held = DesignSpace(SCENE, {"loads.drag": (1.0, 2.0)}, [hold(jam_frequency(mode=3))])
+    assert _motion_of(held, total_mass(), []) == 3 and _motion_of(held, amplitude(mode=4), []) == 4
 
 
 def test_searches_of_all_numbers_of_loads_count(monkeypatch):
