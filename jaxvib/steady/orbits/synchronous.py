@@ -18,6 +18,7 @@ from jaxvib.display import Drawn, Onto, quantity_text, speed_text
 from jaxvib.equations.forces import drive_torques
 from jaxvib.equations.linear import require_terms
 from jaxvib.equations.state import State
+from jaxvib.equations.torque_balance import owners_of
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drives.drive import SwitchedOff
 from jaxvib.machine.effects.base import has_term
@@ -45,10 +46,13 @@ from jaxvib.steady.orbits.whole import (
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.units import Number, Numbers, count, known_number, number, numbers, validate_tolerance
-from jaxvib.units.known import is_known
+from jaxvib.units.known import is_known, when_known
 
 _MAX_UNKNOWN_STEPS = 128
 """Limit of the integration steps for the multipliers under a JAX transformation; reverse derivatives need a static limit."""
+
+_ONE_ANGLE = 1e-3
+"""Largest difference between the phases of loads at one angle, rad."""
 
 _STABLE_MARGIN = 1e3
 """Distance of the largest multiplier from 1, in units of rounding, below which a disturbance counts as neither growing nor
@@ -212,7 +216,8 @@ def synchronous_orbit(
 
     **Arguments**: `scene` without effects that permit the rotation of loads about their own centres; and
 
-    - `regime`: a motion of the averaged theory with `speed` and `phases`; or these two arguments:
+    - `regime`: a motion of the averaged theory with `speed` and `phases` of all masses, with the loads of each exciter at one
+      angle; or these two arguments:
     - `speed`: starting value of Omega, rad/s or text; default: the mean of the motors' no-load speeds; typical: 60 to 320
     - `phases` (N,): starting values of alpha, rad; default: 0. The first phase that is free keeps its value, because it defines
       the origin of time
@@ -280,9 +285,9 @@ def plan_synchronous(
     """Validate the arguments of `synchronous_orbit`, and choose start and points. **Raises** `InputError`."""
     if regime is not None and (speed is not None or phases is not None):
         raise InputError("regime", "is given together with speed or phases; leave one of them out")
-    if regime is not None:
-        speed, phases = regime.speed, regime.phases
     scene = validate_scene(scene)
+    if regime is not None:
+        speed, phases = regime.speed, _phases_of_exciters(scene, regime)
     require_terms(scene.all_effects, _SYNCHRONOUS_TERMS, "is|are not part of a synchronous motion")
     for k, exciter in enumerate(scene.exciters):
         _require_one_body(exciter, scene.prefix_of(k))
@@ -298,7 +303,8 @@ def plan_synchronous(
     else:
         raise InputError("speed", "is missing; give the speed near which the loads turn, rad/s, for example speed=95.0")
     n = len(scene.exciters)
-    angles = jnp.zeros(n, start.dtype) if phases is None else numbers(phases, "rad", "phases", n)
+    field = "phases" if regime is None else "regime.phases"
+    angles = jnp.zeros(n, start.dtype) if phases is None else numbers(phases, "rad", field, n)
     all_known = is_known(scene, start, angles)
     if accuracy is None:
         accuracy = 1e-8 if start.dtype.itemsize >= 8 else 1e-3
@@ -311,6 +317,31 @@ def plan_synchronous(
         accuracy=validate_tolerance(accuracy, "accuracy", start.dtype, 1e3),
         is_known=all_known,
     )
+
+
+def _phases_of_exciters(scene: Scene, regime: HasSpeedAndPhases) -> Array:
+    """Return the phases (N,) of the exciters in a regime, which may state those of all rotating masses.
+
+    **Raises** `InputError` for a regime of some of the masses, and for loads of one exciter at different phases.
+    """
+    owners = owners_of([0 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters])
+    phases, masses = jnp.asarray(regime.phases), getattr(regime, "masses", None)
+    if masses is not None and masses.shape != owners.shape:
+        raise InputError(
+            "regime.masses", f"are {masses.size} of the scene's {owners.size} rotating masses; give a regime of all"
+        )
+    if phases.shape != owners.shape:
+        return phases
+    first = np.searchsorted(owners, np.arange(len(scene.exciters)))
+
+    def check(phases: np.ndarray) -> None:
+        differs = np.abs(np.exp(1j * phases) - np.exp(1j * phases[first[owners]])) > _ONE_ANGLE
+        if np.any(differs):
+            problem = "differ; this function is for loads of an exciter at one angle, use simulate or envelope for others"
+            raise InputError("regime.phases", f"of the loads of exciter {owners[np.argmax(differs)] + 1} {problem}")
+
+    when_known(check, phases)
+    return phases[first]
 
 
 def _require_one_body(exciter: Exciter, place: str) -> None:

@@ -1,5 +1,7 @@
 """Exact synchronous motions against equations of motion by hand, integrated by SciPy, and against closed forms."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ from scipy.optimize import fsolve
 import jaxvib as jv
 from jaxvib.results.status import status_names
 from jaxvib.steady.orbits.limit import _fold, _Point
+from jaxvib.steady.orbits.synchronous import plan_synchronous
 from jaxvib.units import Bounds
 
 G = 9.81
@@ -297,6 +300,23 @@ def test_wrong_input_ends_in_one_sentence(general):
         jv.synchronous_orbit(general, phases=[0.0, 1.0, 2.0])
     with pytest.raises(jv.InputError, match="regime is given together with speed"):
         jv.synchronous_orbit(general, jv.synchronous_orbit(general, phases=[0.0, 3.0]), speed=100.0)
+
+
+def test_regimes_of_loads_start_from_their_angle():
+    """Two loads of the first exciter have one angle in the orbit; the regime has a phase for each of them."""
+    loads = jv.balls(count=2, mass=0.5, radius=0.2, drag=1.0)
+    exciters = [jv.Exciter(loads, jv.ConstantSpeed(110.0), at=(-0.3, 0.0)), jv.Exciter(drive=motor(), unbalance=1.5)]
+    scene = jv.Scene(body(), exciters=exciters)
+
+    def started(phases, masses):
+        regime = SimpleNamespace(speed=jnp.asarray(99.0), phases=jnp.array(phases), masses=jnp.array(masses))
+        return plan_synchronous(scene, regime, speed=None, phases=None, accuracy=None, points=None).phases.tolist()
+
+    assert started([0.1, 0.1 + 2.0 * np.pi, 0.7], [0, 1, 2]) == [0.1, 0.7]
+    with pytest.raises(jv.InputError, match=r"regime\.phases of the loads of exciter 1 differ; this function is for loads"):
+        started([0.1, 0.2, 0.7], [0, 1, 2])
+    with pytest.raises(jv.InputError, match=r"regime\.masses are 2 of the scene's 3 rotating masses; give a regime of all"):
+        started([0.1, 0.7], [0, 2])
 
 
 def test_limit_of_synchronization_is_the_fold_of_the_motion(general, orbit):
