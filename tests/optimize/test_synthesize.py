@@ -218,7 +218,8 @@ def test_the_mode_of_a_search_is_that_of_its_objective():
 
 
 def test_the_mode_of_a_search_can_be_that_of_a_held_quantity():
-    held = DesignSpace(SCENE, {"loads.drag": (1.0, 2.0)}, [hold(jam_frequency(mode=3))])
+    free = {"machine.stiffness": (1e4, 9e4), "loads.drag": (1.0, 2.0)}
+    held = DesignSpace(SCENE, free, [hold(jam_frequency(mode=3), 60.0)])
     assert _motion_of(held, total_mass(), []) == 3 and _motion_of(held, amplitude(mode=4), []) == 4
 
 
