@@ -32,6 +32,9 @@ def _times(until: Number, spin_up: Number | None) -> tuple[float, float | None]:
 def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
     """Return the largest foundation force, N, of a run from rest (full equations).
 
+    The force is read at 4000 times of the run. The value is therefore too small by up to some per cent if the run is long and
+    the peak short, as that of a collision with a `Stop`; the measure `run.peak_force` of sweeps has no such error.
+
     **Arguments**
 
     - `until`: end of the integration, s or text; typical: 5 to 30
