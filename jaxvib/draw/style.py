@@ -93,7 +93,6 @@ def panels(
     size: Sequence[float] = (7.0, 3.0),
     widths: Sequence[float] | None = None,
     share_x: bool | Literal["col"] = False,
-    polar: bool = False,
     ax: Onto = None,
 ) -> tuple[Figure, list[Axes]]:
     """Create a figure with `rows` x `columns` axes in the common style, or use the axes `ax` and their figure.
@@ -119,10 +118,7 @@ def panels(
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(size[0] * columns, size[1] * rows))
         FigureCanvasAgg(figure)
-        look = {"projection": "polar"} if polar else None
-        grid = figure.subplots(
-            rows, columns, squeeze=False, sharex=share_x, width_ratios=None if widths is None else [*widths], subplot_kw=look
-        )
+        grid = figure.subplots(rows, columns, squeeze=False, sharex=share_x, width_ratios=None if widths is None else [*widths])
     return figure, list(grid.ravel())
 
 

@@ -203,27 +203,19 @@ def collocation(scene: PeriodicScene, grid: Grid, x: Array, omega: Array, *, for
     return _Collocation(residual, scale, matrix)
 
 
-def solve_whole(
-    scene: PeriodicScene, grid: Grid, omega: Array, *, forced: bool, known: WholeMotion | None = None
-) -> WholeMotion:
+def solve_whole(scene: PeriodicScene, grid: Grid, omega: Array, *, forced: bool) -> WholeMotion:
     """Solve for the periodic motion of a scene by Newton's method.
 
         x'' = f(theta, x, x', Omega)    at the M points of the grid,    ' = d/dtheta
         mean psi of the first body = 0    if the motion is not forced; Omega is then an unknown
 
-    **Arguments**: `omega`, rad/s: the speed of a `forced` motion, otherwise the initial value of the speed; `known`: the
-    solution, if it is known.
+    **Arguments**: `omega`, rad/s: the speed of a `forced` motion, otherwise the initial value of the speed.
 
     Derivatives with respect to every parameter of the scene, and with respect to `omega` of a forced motion, follow from the
     implicit function theorem.
     """
-    if known is None:
-        start = linear_start(scene, grid, omega)
-    else:
-        start, omega = known.x, omega if forced else known.omega
     speed = omega if forced else jax.lax.stop_gradient(omega)
-    grid_key = (grid.theta.size, grid.symmetric)
-    x, w = _solve(scene, speed, jax.lax.stop_gradient(start), grid_key=grid_key, forced=forced, is_known=known is not None)
+    x, w = _solve(scene, speed, linear_start(scene, grid, omega), grid_key=(grid.theta.size, grid.symmetric), forced=forced)
     return WholeMotion(x, w)
 
 
@@ -246,10 +238,8 @@ def linear_start(scene: PeriodicScene, grid: Grid, omega: Array) -> Array:
 
 @eqx.filter_custom_jvp
 def _solve(
-    scene: PeriodicScene, omega: Array, start: Array, *, grid_key: tuple[int, bool], forced: bool, is_known: bool
+    scene: PeriodicScene, omega: Array, start: Array, *, grid_key: tuple[int, bool], forced: bool
 ) -> tuple[Array, Array]:
-    if is_known:
-        return start, omega
     grid, size, weight = grid_of(*grid_key), start.size, jnp.minimum(scene.feedback, 1.0)
 
     def move(unknowns: tuple[Array, Array], change: Array, length: Array) -> tuple[Array, Array]:
@@ -277,9 +267,9 @@ def _solve(
 
 
 @_solve.def_jvp
-def _solve_jvp(primals, tangents, *, grid_key: tuple[int, bool], forced: bool, is_known: bool):
+def _solve_jvp(primals, tangents, *, grid_key: tuple[int, bool], forced: bool):
     scene, omega, start = primals
-    x, w = _solve(scene, omega, start, grid_key=grid_key, forced=forced, is_known=is_known)
+    x, w = _solve(scene, omega, start, grid_key=grid_key, forced=forced)
     grid = grid_of(*grid_key)
     by_omega = tangents[1] if forced else None
     change = eqx.filter_jvp(lambda s, v: residual_of(s, grid, x, v), (scene, w), (tangents[0], by_omega))[1].ravel()
