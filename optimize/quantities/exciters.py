@@ -294,11 +294,7 @@ def resonance_distance() -> Quantity:
     'distance from the nearest resonance at least 0.5'
     """
     text = "distance from the nearest resonance"
-    return RegimeQuantity("resonance_distance", "", _distance, text=text, tiers=("leading",), pieces_function=_distances)
-
-
-def _distance(evaluation: Evaluation, tier: Tier) -> Array:
-    return -jnp.max(_distances(evaluation, -1.0, tier))
+    return RegimeQuantity("resonance_distance", "", text=text, tiers=("leading",), pieces_function=_distances)
 
 
 def _distances(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
@@ -325,11 +321,7 @@ def least_torque() -> Quantity:
     'least torque needed to pass the resonances at most 0.7'
     """
     text = "least torque needed to pass the resonances"
-    return RegimeQuantity("least_torque", "", _least_torque, text=text, tiers=("leading",), pieces_function=_least_torques)
-
-
-def _least_torque(evaluation: Evaluation, tier: Tier) -> Array:
-    return jnp.max(_least_torques(evaluation, 1.0, tier))
+    return RegimeQuantity("least_torque", "", text=text, tiers=("leading",), pieces_function=_least_torques)
 
 
 def _least_torques(evaluation: Evaluation, sign: float, tier: Tier) -> Array:

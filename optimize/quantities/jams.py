@@ -55,7 +55,7 @@ def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
 def jam_quantity(
     name: str,
     unit: str,
-    function: Callable[..., Array],
+    function: Callable[..., Array] | None,
     mode: int,
     tier: Tier,
     text: str,
@@ -300,12 +300,8 @@ def fold_margin(*, mode: int) -> Quantity:
     'distance to the fold, mode 3 at least 60 rpm'
     """
     return jam_quantity(
-        "fold_margin", "rad/s", _margin, mode, "leading", "distance to the fold", tiers=("leading",), pieces_function=_margins
+        "fold_margin", "rad/s", None, mode, "leading", "distance to the fold", tiers=("leading",), pieces_function=_margins
     )
-
-
-def _margin(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
-    return _margins(evaluation, 1.0, tier, mode)[0]
 
 
 def _margins(evaluation: Evaluation, sign: float, tier: Tier, mode: int) -> Array:

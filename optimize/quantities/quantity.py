@@ -188,7 +188,8 @@ class Quantity:
 
 @dataclass(frozen=True)
 class BuiltinQuantity(Quantity):
-    """Quantity of this package. Its function has the arguments evaluation (an `Evaluation`), tier and `settings`."""
+    """Quantity of this package. Its function has the arguments evaluation (an `Evaluation`), tier and `settings`; without a
+    function it is the largest of its `pieces`."""
 
     tier: Tier = "leading"
     settings: tuple[object, ...] = ()
@@ -203,7 +204,8 @@ class BuiltinQuantity(Quantity):
             raise InputError("tier", f"is {quoted(self.tier)}; {self.words} is computed as: {', '.join(self.tiers)}")
 
     def read(self, evaluation: Evaluation) -> Array:
-        assert self.function is not None
+        if self.function is None:
+            return jnp.max(self.pieces(evaluation))
         return jnp.reshape(self.function(evaluation, self.tier, *self.settings), ())
 
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:

@@ -69,12 +69,8 @@ def _response_quantity(
             raise InputError("speed", f"is {quoted(speed)}; it must be positive")
         raise InputError("between", f"is {quoted(between)}; speeds must be positive and ascend")
     return BuiltinQuantity(
-        name, unit, _largest, tiers=("leading",), text=text, settings=(read, speeds, *settings), pieces_function=_pieces
+        name, unit, tiers=("leading",), text=text, settings=(read, speeds, *settings), pieces_function=_pieces
     )
-
-
-def _largest(evaluation: Evaluation, tier: Tier, read: Read, speeds: Speeds, *settings: object) -> Array:
-    return jnp.max(_values(evaluation, read, speeds, settings))
 
 
 def _pieces(evaluation: Evaluation, sign: float, tier: Tier, read: Read, speeds: Speeds, *settings: object) -> Array:
@@ -270,11 +266,7 @@ def fold_distance() -> Quantity:
     'distance from the nearest fold of the response at least 0.2'
     """
     text = "distance from the nearest fold of the response"
-    return BuiltinQuantity("fold_distance", "", _fold_distance, tiers=("leading",), text=text, pieces_function=_fold_distances)
-
-
-def _fold_distance(evaluation: Evaluation, tier: Tier) -> Array:
-    return -jnp.max(_fold_distances(evaluation, -1.0, tier))
+    return BuiltinQuantity("fold_distance", "", tiers=("leading",), text=text, pieces_function=_fold_distances)
 
 
 def _fold_distances(evaluation: Evaluation, sign: float, tier: Tier) -> Array:

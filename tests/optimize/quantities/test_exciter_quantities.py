@@ -222,4 +222,4 @@ def test_pieces_of_the_resonance_distance_have_its_value(ratio):
     distances = np.abs(np.asarray(jv.natural_frequencies(scene)) / speed - 1.0)
     np.testing.assert_allclose(exciters._distances(given, -1.0, "leading"), -distances, rtol=1e-12)
     np.testing.assert_allclose(exciters._distances(given, 1.0, "leading"), [np.min(distances)], rtol=1e-12)
-    np.testing.assert_allclose(exciters._distance(given, "leading"), np.min(distances), rtol=1e-12)
+    np.testing.assert_allclose(resonance_distance().read(given), np.min(distances), rtol=1e-12)
