@@ -204,7 +204,7 @@ def response_force(*, speed: Number | None = None, between: Sequence[Number] | N
     >>> response_force(between=("100 rpm", "900 rpm")).unit
     'N'
     """
-    return _response_quantity("response_force", "N", _field("foundation_force"), "force under unbalances", speed, between)
+    return _response_quantity("response_force", "N", _field, "force under unbalances", speed, between, "foundation_force")
 
 
 @validated
@@ -221,7 +221,7 @@ def response_transmissibility(*, speed: Number | None = None, between: Sequence[
     'transmissibility under unbalances at most 0.1'
     """
     text = "transmissibility under unbalances"
-    return _response_quantity("response_transmissibility", "", _field("transmissibility"), text, speed, between)
+    return _response_quantity("response_transmissibility", "", _field, text, speed, between, "transmissibility")
 
 
 @validated
@@ -236,15 +236,11 @@ def response_torque(*, speed: Number | None = None, between: Sequence[Number] | 
     >>> (response_torque(between=("100 rpm", "900 rpm")) < "12 N m").words
     'largest shaft torque under unbalances from 100 to 900 rpm at most 12 N m'
     """
-    return _response_quantity("response_torque", "N m", _field("torque"), "shaft torque under unbalances", speed, between)
+    return _response_quantity("response_torque", "N m", _field, "shaft torque under unbalances", speed, between, "torque")
 
 
-def _field(name: str) -> Read:
-    """Return the function that reads a field of a response; the torques of several exciters are added."""
-    return partial(_read_field, name)
-
-
-def _read_field(name: str, model: UnbalancedModel, w: Array) -> Array:
+def _field(model: UnbalancedModel, w: Array, name: str) -> Array:
+    """Return a field of a response; the torques of several exciters are added."""
     if name in ("foundation_force", "transmissibility"):
         require_foundation(model.scene)
     return jnp.sum(motion_at(model, w)[1][name])
