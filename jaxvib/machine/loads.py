@@ -299,14 +299,8 @@ def _circular(
     ball_radius: Number | None = None,
 ) -> CircularLoads:
     n = count(count_, "loads.count", each=256)
-    read = partial(read_numbers, CircularLoads, "loads", n)
-    loads = CircularLoads(
-        **read(mass=mass, radius=radius, drag=drag),
-        inertia=None if inertia is None else read(inertia=inertia)["inertia"],
-        count=n,
-        kind=kind,
-        ball_radius=None if ball_radius is None else read(ball_radius=ball_radius)["ball_radius"],
-    )
+    given = {"mass": mass, "radius": radius, "drag": drag, "inertia": inertia, "ball_radius": ball_radius}
+    loads = CircularLoads(**read_numbers(CircularLoads, "loads", n, **given), count=n, kind=kind)
     if loads.ball_radius is not None:
         _require_room(loads, loads.ball_radius)
     return loads

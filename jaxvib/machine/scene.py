@@ -164,20 +164,19 @@ def unbalance(*, force: Number, at: Number) -> Array:
 
 def read_unbalance(drive: Drive, unbalance: Number | None, unbalance_mass: Number | None) -> tuple[Array | None, Array | None]:
     """Return the unbalance S and its mass m. **Raises** `InputError` if the rotor has less inertia than S^2/m."""
-    given = {name: value for name, value in (("unbalance", unbalance), ("unbalance_mass", unbalance_mass)) if value is not None}
-    if "unbalance_mass" in given and "unbalance" not in given:
+    if unbalance_mass is not None and unbalance is None:
         raise InputError("unbalance_mass", f"is {quoted(unbalance_mass)} without an unbalance; give unbalance=..., in kg m")
     try:
-        values = read_numbers(Exciter, "", **given)
+        moment, mass = read_numbers(Exciter, "", unbalance=unbalance, unbalance_mass=unbalance_mass).values()
     except InputError as error:
         if error.field != "unbalance" or not _is_force(unbalance):
             raise
         needs = f"{{ force = '{unbalance}', at = '1500 rpm' }}"
         problem = f"is {quoted(unbalance)}, a force; state its speed too, as {needs} in a file, by jaxvib.unbalance in Python"
         raise InputError("unbalance", problem) from error
-    if len(values) == 2 and not drive.ideal:
-        when_known(_require_inertia, *values.values(), drive.inertia)  # pyright: ignore[reportAttributeAccessIssue]
-    return values.get("unbalance"), values.get("unbalance_mass")
+    if mass is not None and not drive.ideal:
+        when_known(_require_inertia, moment, mass, drive.inertia)  # pyright: ignore[reportAttributeAccessIssue]
+    return moment, mass
 
 
 def _is_force(value: object) -> bool:

@@ -195,12 +195,8 @@ class DCMotorElectrical(Motor):
         self, voltage: Number, resistance: Number, torque_constant: Number, inertia: Number, inductance: Number | None = None
     ):
         given = {"voltage": voltage, "resistance": resistance, "torque_constant": torque_constant, "inertia": inertia}
-        self.voltage, self.resistance, self.torque_constant, self.inertia = read_numbers(
-            DCMotorElectrical, "drive", **given
-        ).values()
-        self.inductance = None
-        if inductance is not None:
-            self.inductance = read_numbers(DCMotorElectrical, "drive", inductance=inductance)["inductance"]
+        for name, value in read_numbers(DCMotorElectrical, "drive", **given, inductance=inductance).items():
+            setattr(self, name, value)
         self.kind = "dc_motor_electrical"
 
     @property

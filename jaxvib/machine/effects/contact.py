@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -72,15 +71,12 @@ class LoadContact(Effect):
     kind: str = eqx.field(static=True)
 
     def __init__(self, stiffness: Number, damping: Number = 0.0, restitution: Number | None = None):
-        read = functools.partial(read_numbers, LoadContact, "effects.load_contact")
-        self.stiffness, self.damping = read(stiffness=stiffness, damping=damping).values()
-        self.restitution = None
-        if restitution is not None:
-            self.restitution = read(restitution=restitution)["restitution"]
-            # A scene with traced values is built anew for its checks; the damping was then checked before.
-            if when_known(lambda damping: damping == 0.0, self.damping) is False:
-                problem = "excludes damping, which it determines; leave one of them out"
-                raise InputError("effects.load_contact.restitution", problem)
+        given = {"stiffness": stiffness, "damping": damping, "restitution": restitution}
+        self.stiffness, self.damping, self.restitution = read_numbers(LoadContact, "effects.load_contact", **given).values()
+        # A scene with traced values is built anew for its checks; the damping was then checked before.
+        if restitution is not None and when_known(lambda damping: damping == 0.0, self.damping) is False:
+            problem = "excludes damping, which it determines; leave one of them out"
+            raise InputError("effects.load_contact.restitution", problem)
         self.tracks, self.kind = None, "load_contact"
 
     def terms(self) -> tuple[Term, ...]:

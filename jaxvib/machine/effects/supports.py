@@ -44,7 +44,7 @@ def _read_place(
         raise InputError(f"effects.{kind}", "has both a platform and a position; give one of them")
     if platform is not None and (isinstance(platform, bool) or not isinstance(platform, int) or platform < 1):
         raise InputError(f"effects.{kind}.platform", f"is {quoted(platform)}; it must be a whole number, at least 1")
-    return platform, None if position is None else read_numbers(part, f"effects.{kind}", position=position)["position"]
+    return platform, read_numbers(part, f"effects.{kind}", position=position)["position"]
 
 
 class CubicSupport(_Support):

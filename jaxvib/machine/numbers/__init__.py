@@ -20,7 +20,7 @@ from jax import Array
 from jaxvib.display import ELECTRICAL
 from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.startup import start
-from jaxvib.units import Bounds, Numbers, number, numbers
+from jaxvib.units import Bounds, number, numbers
 from jaxvib.units.known import when_known
 
 _KEY = "number"
@@ -101,8 +101,10 @@ def number_specs(part: type) -> Mapping[str, NumberSpec]:
     return {name: spec._replace(words=spec.words or name.replace("_", " ")) for name, spec in found.items()}
 
 
-def read_numbers(part: type[eqx.Module], section: str, length: int | None = None, /, **values: Numbers) -> dict[str, Array]:
+def read_numbers(part: type[eqx.Module], section: str, length: int | None = None, /, **values: Any) -> dict[str, Any]:
     """Return the arguments of a constructor as arrays in SI units, validated by the metadata of the fields of the same names.
+
+    None remains None for a field that may be None.
 
     **Arguments**: `section`, name of the table in a scene file, for error messages, or ""; `length` of arrays, None for any
     length.
@@ -116,8 +118,11 @@ def read_numbers(part: type[eqx.Module], section: str, length: int | None = None
     jaxvib.errors.InputError: drive.duration is 0 s; it must be greater than 0
     """
     start()  # a part of a user's file may be the first array of a process
-    specs = number_specs(part)
-    return {name: _read(specs[name], value, f"{section}.{name}".lstrip("."), length) for name, value in values.items()}
+    specs, optional = number_specs(part), {field.name for field in dataclasses.fields(part) if "None" in str(field.type)}
+    return {
+        name: None if value is None and name in optional else _read(specs[name], value, f"{section}.{name}".lstrip("."), length)
+        for name, value in values.items()
+    }
 
 
 def _read(spec: NumberSpec, value: Any, field: str, length: int | None) -> Array:

@@ -85,9 +85,8 @@ def support(
         raise InputError("to", f"is {to}, the body itself; a support joins two different bodies")
     found = read_numbers(PlaneSupport, "", at=at, stiffness=stiffness)
     constants = damping_constants(damping, "damping", found["stiffness"])
-    found |= read_numbers(PlaneSupport, "", damping=constants, angle=angle)
-    other = None if at_other is None else read_numbers(PlaneSupport, "", at_other=at_other)["at_other"]
-    return PlaneSupport(**found, at_other=other, body=body, to=to)
+    found |= read_numbers(PlaneSupport, "", damping=constants, angle=angle, at_other=at_other)
+    return PlaneSupport(**found, body=body, to=to)
 
 
 class Body(Part):

@@ -231,10 +231,9 @@ def rotor(
     read = partial(read_numbers, Rotor, "machine")
 
     def terms(field: str, values: Sequence[Number] | None) -> Array | None:
-        if values is None:
-            return None
         given = read(**{field: values})[field]
-        when_known(partial(_require_passive, field), *given)
+        if given is not None:
+            when_known(partial(_require_passive, field), *given)
         return given
 
     places = read(2, position=position)["position"]
@@ -251,7 +250,7 @@ def rotor(
     found = {**read(mass=mass), **read(2, stiffness=stiffness)}
     k = found["stiffness"]
     found |= read(2, damping=damping_constants(damping, "machine.damping", k, lambda: found["mass"] * k / jnp.sum(k)))
-    up = None if stiffness_up is None else read(2, stiffness_up=stiffness_up)["stiffness_up"]
+    up = read(2, stiffness_up=stiffness_up)["stiffness_up"]
     resisting = None
     if damping_up is not None:
         vertical = k if up is None else up
@@ -382,7 +381,7 @@ def planar_rotor(
     found = read(mass=mass, stiffness=stiffness)
     k = found["stiffness"]
     found |= read(damping=damping_constants(damping, "machine.damping", k, lambda: found["mass"]))
-    up = None if stiffness_up is None else read(stiffness_up=stiffness_up)["stiffness_up"]
+    up = read(stiffness_up=stiffness_up)["stiffness_up"]
     resisting = None
     if damping_up is not None:
         vertical = damping_constants(damping_up, "machine.damping_up", k if up is None else up, lambda: found["mass"])
