@@ -158,6 +158,12 @@ def linear_model(scene: Scene) -> LinearModel:
     return LinearModel(scene, model.carrier, model.mounts, model.supports, mass)
 
 
+def mean_speed(scene: Scene) -> Array:
+    """Return the mean speed of all rotors, rad/s, anticlockwise."""
+    speeds = [exciter.direction * exciter.drive.speed for exciter in scene.exciters]
+    return sum(speeds[1:], speeds[0]) / len(speeds)
+
+
 class ExcitedModel(LinearModel):
     """Linear model under the force of masses that turn together at the speed w: S w^2 Re(f exp(i w t)) on the coordinates.
 

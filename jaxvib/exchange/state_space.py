@@ -14,7 +14,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.averaged import Amplitudes, averaged_field
-from jaxvib.equations.linear import linear_model
+from jaxvib.equations.linear import linear_model, mean_speed
 from jaxvib.errors import InputError, optional_module, quoted, require_writable, with_ending, written
 from jaxvib.exchange.model import Signal, coordinate_signals, force_inputs, foundation_forces
 from jaxvib.machine.drives.drive import ConstantSpeed
@@ -183,14 +183,8 @@ def state_space(
         return _model_in_jam(scene, at)
     if at != "rest":
         raise InputError("at", f"is {quoted(at)}; it must be 'rest' or a jam, for example jam_modes(scene).select(3)")
-    speed = _mean_speed(scene) if rotor_speed is None else number(rotor_speed, "rad/s", "rotor_speed")
+    speed = mean_speed(scene) if rotor_speed is None else number(rotor_speed, "rad/s", "rotor_speed")
     return _model_at_rest(scene, speed)
-
-
-def _mean_speed(scene: Scene) -> Array:
-    """Return the mean speed of all rotors, rad/s, anticlockwise."""
-    speeds = [exciter.direction * exciter.drive.speed for exciter in scene.exciters]
-    return sum(speeds[1:], speeds[0]) / len(speeds)
 
 
 def _model_at_rest(scene: Scene, speed: Array) -> StateSpace:

@@ -28,6 +28,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import require_double
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.stiffness import equal_step_length, fastest_decay
+from jaxvib.numerics.linalg import poles_of
 from jaxvib.numerics.noise import Noise, bounded, limited
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Bounds, Number
@@ -587,10 +588,7 @@ def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
 
 def damped_modes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return the natural frequencies (k,) rad/s and damping ratios (k,) of the damped modes with complex eigenvalues."""
-    mass, damping, stiffness = (np.asarray(each) for each in _matrices(scene))
-    nd = mass.shape[0]
-    flow = np.block([[np.zeros((nd, nd)), np.eye(nd)], [-np.linalg.solve(mass, stiffness), -np.linalg.solve(mass, damping)]])
-    poles = np.linalg.eigvals(flow)
+    poles = poles_of(*_matrices(scene))
     poles = poles[poles.imag > 0.0]
     poles = poles[np.argsort(np.abs(poles))]
     return np.abs(poles), -poles.real / np.abs(poles)

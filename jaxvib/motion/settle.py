@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import speed_text
-from jaxvib.equations.linear import linear_model
+from jaxvib.equations.linear import linear_model, mean_speed
 from jaxvib.equations.state import State
 from jaxvib.errors import ComputationError
 from jaxvib.machine.scene import Scene
@@ -24,6 +24,7 @@ from jaxvib.motion.plan import EqualSteps, RunPlan, StepChoice, Tolerance, plan_
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.simulate import last_state, prepare_run, run_planned
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state, start_state
+from jaxvib.numerics.linalg import poles_of
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
@@ -230,15 +231,14 @@ def _with_final_status(run: Run, name: str) -> Run:
 
 @cached
 def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
-    model, speeds = linear_model(scene), [exciter.direction * exciter.drive.speed for exciter in scene.exciters]
-    return model.mass, model.carrier.stiffness, model.damping(sum(speeds[1:], speeds[0]) / len(speeds))
+    """Return the matrices (nd, nd) of mass, damping with gyroscopic terms, and stiffness."""
+    model = linear_model(scene)
+    return model.mass, model.damping(mean_speed(scene)), model.carrier.stiffness
 
 
 def _slowest_decay(scene: Scene) -> float:
     """Return the smallest decay rate of free vibrations of the carrier with its loads, 1/s; 0 if a vibration does not decay."""
-    mass, stiffness, damping = (np.asarray(matrix, float) for matrix in _matrices(scene))
-    accelerations = np.linalg.solve(mass, -np.concatenate([stiffness, damping], axis=1))
-    poles = np.linalg.eigvals(np.concatenate([np.eye(len(mass), 2 * len(mass), len(mass)), accelerations]))
+    poles = poles_of(*(np.asarray(matrix, float) for matrix in _matrices(scene)))
     slowest = float(np.min(-poles.real))
     return slowest if slowest > 1e-12 * float(np.max(np.abs(poles))) else 0.0
 

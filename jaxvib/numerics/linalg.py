@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.custom_batching import custom_vmap
+from numpy.typing import NDArray
 
 _MAX_UNROLLED_EQUATIONS = 8
 """Largest number of equations for which `eliminate` is as fast as a library call for each system of a batch."""
@@ -116,6 +117,15 @@ def hermitian_error(pencil: tuple[Array, Array], values: Array, shapes: Array) -
     rounding = shapes.shape[0] * eps * (top_terms + jnp.abs(values) * bottom_terms) / bottom
     length = jnp.abs(values)
     return jnp.where(length > 0.0, (jnp.abs(top / bottom - values) + rounding) / jnp.where(length > 0.0, length, 1.0), jnp.inf)
+
+
+def poles_of(
+    mass: Array | np.ndarray, damping: Array | np.ndarray, stiffness: Array | np.ndarray
+) -> NDArray[np.complexfloating]:
+    """Return the roots s (2 n,) of det(s^2 M + s C + K) = 0, in NumPy's arithmetic."""
+    flow = -np.linalg.solve(mass, np.concatenate([stiffness, damping], axis=1))
+    n = len(flow)
+    return np.linalg.eigvals(np.concatenate([np.eye(n, 2 * n, n), flow])).astype(complex)
 
 
 @jax.custom_jvp

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import LinearModel, estimated_frequencies
+from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.torque_balance import TorqueBalance, influence_of, torques_at
-from jaxvib.numerics.linalg import magnitude
+from jaxvib.numerics.linalg import magnitude, poles_of
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
@@ -263,7 +263,8 @@ def _newton_round(row: Array, phase: Array, balance: TorqueBalance, at: AtSpeed)
 def load_speeds(balance: TorqueBalance) -> np.ndarray:
     """Return load speeds below the rotor speed, dense near the carrier's resonances at this rotor speed."""
     model, speed = balance.model, float(balance.speed)
-    poles = _poles(model, balance.speed) if model.modal is None else np.asarray(model.modal.poles)
+    matrices = model.mass, model.damping(balance.speed), model.carrier.stiffness
+    poles = poles_of(*matrices) if model.modal is None else np.asarray(model.modal.poles)
     turning = np.abs(np.imag(poles))
     centres = np.unique(turning[turning > 0.0])
     offsets = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 30)])
@@ -271,13 +272,6 @@ def load_speeds(balance: TorqueBalance) -> np.ndarray:
     top = speed * (1.0 - np.geomspace(1e-6, 0.1, 12))
     speeds = np.unique(np.concatenate([np.linspace(0.02, 0.98, LOAD_SPEEDS) * speed, top, *crowd]))
     return speeds[(speeds > 1e-3 * speed) & (speeds < speed)]
-
-
-def _poles(model: LinearModel, speed: Array) -> np.ndarray:
-    """Return the roots s (2 nd,) of det(K + s (C + n G) + s^2 M) = 0, n the rotor's `speed`."""
-    flow = np.linalg.solve(model.mass, -np.concatenate([model.carrier.stiffness, model.damping(speed)], axis=1))
-    nd = len(flow)
-    return np.linalg.eigvals(np.concatenate([np.eye(nd, 2 * nd, nd), flow]))
 
 
 def _regular_phases(balance: TorqueBalance) -> np.ndarray:
