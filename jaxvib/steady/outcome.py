@@ -13,6 +13,7 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.machine.scene import Scene
@@ -20,6 +21,7 @@ from jaxvib.machine.validation import allowed_unknowns
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.compat import enumeration_of
+from jaxvib.runtime.programs import cached
 from jaxvib.units.known import is_known
 
 REFUSED = "a traced parameter has a value that is not allowed: call the function outside of jit, grad and vmap to see which one"
@@ -61,6 +63,17 @@ def outcome(
     refused = enumeration_of(result.status).refused  # pyright: ignore[reportAttributeAccessIssue]
     status = jax.tree.map(lambda own, other: jnp.where(allowed, own, other), result.status, refused)
     return eqx.tree_at(lambda result: result.status, without_numbers(allowed, result), status)
+
+
+def entry(batch: Result, kind: type[SomeResult], index: int) -> SomeResult:
+    """Return the entry `index` of a batch of results, as a result of a `kind` that has part of its fields."""
+    fields = {name: getattr(batch, name) for name in kind.__dataclass_fields__}
+    return _entry(kind(**fields), np.asarray(index, np.uint32))
+
+
+@cached
+def _entry(batch: SomeResult, index: Array | np.ndarray) -> SomeResult:
+    return jax.tree.map(lambda leaf: leaf[index], batch)
 
 
 def unknown_is_positive(number: Array | None) -> Array | None:

@@ -39,7 +39,7 @@ from jaxvib.steady.jams.folds import (
     rotor_speed_at,
     scanned_speed,
 )
-from jaxvib.steady.outcome import REFUSED, outcome
+from jaxvib.steady.outcome import REFUSED, entry, outcome
 from jaxvib.units.known import when_known
 
 STABILITY_CRITERION = "by slope, for light loads that stay together"
@@ -193,8 +193,7 @@ class JamModes(AbstractJam):
         **Raises** `InputError` for a number outside 1 .. 2 nd + 1, `ComputationError` (status "absent") if it does not exist at
         this rotor speed; with `throw=False`, and under a JAX transformation, the status states this and no error is raised.
         """
-        row = self.row(mode, throw=throw)
-        return _row(Jam(**{name: getattr(self, name) for name in Jam.__dataclass_fields__}), np.asarray(row, np.uint32))
+        return entry(self, Jam, self.row(mode, throw=throw))
 
     def summary(self) -> str:
         """Return the table of `jaxvib modes` in text; amplitudes and foundation force are zero to peak.
@@ -257,11 +256,6 @@ def stays_text(jam: Jam, growth: float) -> str:
 def _modes_of_pieces(folds: Folds, resonances: Array) -> Array:
     """Return the mode number of each piece of a branch."""
     return piece_modes(jnp.where(folds.exists, folds.omega, jnp.inf), folds.exists, resonances)
-
-
-@cached
-def _row(jams: Jam, row: Array | np.ndarray) -> Jam:
-    return jax.tree.map(lambda leaf: leaf[row], jams)
 
 
 def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit | None, ax: Onto) -> Drawn:

@@ -34,6 +34,7 @@ from jaxvib.steady.jams.phase_starts import (
     solved_clusters,
 )
 from jaxvib.steady.jams.phases import AbstractPhaseJam, PhaseJam, PhaseStatus, jam_from, loads_with_drag, phase_jam
+from jaxvib.steady.outcome import entry
 from jaxvib.units import count, random_numbers
 
 _SHOWN_DRAG_FACTOR = 30.0
@@ -70,8 +71,7 @@ class PhaseJams(AbstractPhaseJam):
         n = self.omega.shape[0]
         if not 0 <= index < n:
             raise InputError("index", f"is {quoted(index)}; there are {n} jams, counted from 0")
-        fields = {name: getattr(self, name) for name in PhaseJam.__dataclass_fields__}
-        return _select_jams(PhaseJam(**fields), np.asarray(index, np.uint32))
+        return entry(self, PhaseJam, index)
 
     @validated
     def follow(self, index: int, omega: Array) -> PhaseBranch:
@@ -233,11 +233,6 @@ def _contains_jam(branch: PhaseBranch, place: int, growth: Array) -> bool:
     """Return True if point `place` of the branch is, at the scene's drag, a jam with this `growth` (or its mirror image)."""
     near = abs(float(branch.drag_factor[place]) - 1.0) < 1e-4
     return near and abs(float(branch.growth[place] - growth)) < 1e-3 * abs(float(growth))
-
-
-@cached
-def _select_jams(jams: PhaseJam, index: Array | np.ndarray) -> PhaseJam:
-    return jax.tree.map(lambda leaf: leaf[index], jams)
 
 
 def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
