@@ -151,7 +151,6 @@ class RunPlan:
     - `is_known`: True if scene, end and state have values
     - `is_estimated`: True if a second run with larger steps estimates the error; `accuracy`: the error that repeated runs must
       reach, or None
-    - `fastest`: fastest rate of the motion, rad/s
     """
 
     given_scene: Scene
@@ -163,7 +162,6 @@ class RunPlan:
     is_known: bool
     is_estimated: bool
     accuracy: float | None
-    fastest: Array | np.ndarray
 
 
 def plan_run(
@@ -225,7 +223,6 @@ def plan_run(
         is_known=known,
         is_estimated=is_estimated,
         accuracy=steps.error if isinstance(steps, Accuracy) else None,
-        fastest=fastest,
     )
 
 

@@ -278,7 +278,7 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
             return run
         tolerance = float(cast(Array, control.tolerance))
         # With smaller steps, rounding errors alone would exceed the accuracy.
-        radians = plan.fastest * latest.window.time[-1]
+        radians = plan.integration.bounds[0] * latest.window.time[-1]
         if tolerance <= floor or float(estimated_error(jnp.zeros(()), 0.0, plan.scene, latest.steps, radians)) > accuracy:
             break
         # The tolerance is reduced more than in proportion, because the error decreases more slowly than the tolerance.
@@ -296,10 +296,10 @@ def _compare_runs(
     **Arguments**: `earlier_evaluations`: number of evaluations of the earlier runs.
     """
     coarse_states, evaluation_counts = (coarse.window.state, coarse.status), (fine.evaluations, earlier_evaluations)
-    solver = plan.integration.solver
+    solver, (fastest, _) = plan.integration.solver, plan.integration.bounds
     order = 8 if solver is None else solver.order(None) or 1
     error, evaluations = _estimate_error(
-        plan.scene, plan.fastest, fine.window, fine.steps, *coarse_states, control, coarser, evaluation_counts, order
+        plan.scene, fastest, fine.window, fine.steps, *coarse_states, control, coarser, evaluation_counts, order
     )
     return dataclasses.replace(fine, error=error, evaluations=evaluations)
 
