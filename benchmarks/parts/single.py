@@ -24,7 +24,7 @@ from parts.common import TOLERANCES, as_first_written, best, best_in_turn, first
 import jaxvib as jv
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.control import PIController
-from jaxvib.runtime.parallel import cores
+from jaxvib.runtime.cpu import cores
 
 
 def integrator(scene: jv.Scene, start: jv.State, controller: str = "equal steps") -> Callable[..., Any]:

@@ -58,7 +58,7 @@ def prepare_cpu(devices: int | None = 1) -> str:
     jaxvib.errors.InputError: prepare_cpu was called after JAX had begun to compute; call it before any array is created
     """
     if devices is None:
-        devices = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+        devices = cores()
     if isinstance(devices, bool) or not isinstance(devices, int) or devices < 1:
         raise InputError("devices", f"is {quoted(devices)}; it must be a whole number, at least 1, or None for all cores")
     if backend_started():
@@ -81,6 +81,11 @@ def prepare_cpu(devices: int | None = 1) -> str:
     os.environ["XLA_FLAGS"] = " ".join(flags)
     limit_blas_threads()
     return os.environ["XLA_FLAGS"]
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 def limit_blas_threads() -> None:

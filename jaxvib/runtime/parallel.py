@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
-import os
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import TypeVar
@@ -21,6 +20,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
+from jaxvib.runtime.cpu import cores
 from jaxvib.runtime.devices import shared_devices
 from jaxvib.runtime.stored import is_debugging
 
@@ -35,11 +35,6 @@ _OPTIONS = {
     "jax_default_device": jax.default_device,
 }
 """JAX's options on which results depend, and the context managers that set them in one thread."""
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 def in_parallel(function: Callable[[Item], Outcome], items: Iterable[Item]) -> Generator[tuple[Item, Outcome], None, None]:
