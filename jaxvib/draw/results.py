@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
-from jaxvib.draw.charts import solid_and_dashed
+from jaxvib.draw.charts import scaled_amplitudes, solid_and_dashed
 from jaxvib.draw.style import (
     COLORS,
     GUIDE,
@@ -18,7 +18,6 @@ from jaxvib.draw.style import (
     UNSTABLE,
     Look,
     legend_above,
-    length_unit,
     log_ticks,
     panels,
 )
@@ -55,10 +54,9 @@ def modes_chart(
     """
     unit, scale = speed_unit(unit)
     figure, (top, bottom) = panels(2, size=(6.0, 2.6), share_x=True, ax=ax)
-    tilts = np.asarray([units is not None and each == "rad" for each in units or names])
-    length, factor = length_unit(amplitude[:, ~tilts])
-    labels = ["mrad" if tilt else length for tilt in tilts]
-    for axis, values in ((top, scale * omega[:, None]), (bottom, np.where(tilts, 1e3, factor) * amplitude)):
+    labels, scaled = scaled_amplitudes(amplitude, names, units)
+    shown = np.stack([values for _, values in scaled], axis=1)
+    for axis, values in ((top, scale * omega[:, None]), (bottom, shown)):
         for k in range(values.shape[1]):
             color, mark = COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]
             for kind, face in ((stable, color), (~stable, "white")):
@@ -74,7 +72,6 @@ def modes_chart(
     legend_above(top)
     top.set_ylabel(f"load speed, {unit}")
     bottom.set(ylabel=f"amplitude, {', '.join(dict.fromkeys(labels))}, zero to peak", xlabel="number of the jam mode")
-    shown = amplitude * np.where(tilts, 1e3, factor)
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
     if shown.size:
         bottom.set(yscale="log", ylim=(0.6 * np.min(shown), 1.7 * np.max(shown)))

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.colors import BoundaryNorm, ListedColormap, to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path
@@ -112,10 +112,9 @@ def _cells_path(corners: np.ndarray, chosen: np.ndarray) -> Path:
     return Path(cells.reshape(-1, 2), np.tile([Path.MOVETO, *[Path.LINETO] * 3, Path.CLOSEPOLY], len(cells)))
 
 
-def _light(colour: str) -> tuple[float, float, float]:
+def _light(colour: str) -> tuple[float, ...]:
     """Return the colour mixed with white, which makes black lines on it visible."""
-    red, green, blue = (int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
-    return 0.55 * red + 0.45, 0.55 * green + 0.45, 0.55 * blue + 0.45
+    return tuple(0.55 * part + 0.45 for part in to_rgb(colour))
 
 
 def _scales(axis: Axes, x_label: str, y_label: str, log: tuple[bool, bool]) -> None:
