@@ -187,19 +187,8 @@ def _arc(begin: float) -> np.ndarray:
 
 
 def _hull(points: np.ndarray) -> np.ndarray:
-    """Return the convex hull of points (n, 2), closed, by Andrew's monotone chain."""
-    ordered = sorted(map(tuple, np.round(points, 9).tolist()))
+    """Return the convex hull of points (n, 2), anticlockwise and closed."""
+    from scipy.spatial import ConvexHull  # slow import
 
-    def chain(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-        corners: list[tuple[float, float]] = []
-        for x, y in points:
-            while len(corners) > 1:
-                (ax, ay), (bx, by) = corners[-2:]
-                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0.0:
-                    break
-                corners.pop()
-            corners.append((x, y))
-        return corners[:-1]
-
-    outline = chain(ordered) + chain(ordered[::-1])
-    return np.array([*outline, outline[0]])
+    corners = points[ConvexHull(points).vertices]
+    return np.concatenate([corners, corners[:1]])
