@@ -213,13 +213,16 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
         values = values[np.isfinite(values)]
         low, high = min(low, np.min(values, initial=np.inf)), max(high, np.max(values, initial=-np.inf))
     if not low <= high:
-        raise InputError(
-            "measure", f"is {quoted(name)}, which has no value in any case; choose another one: {', '.join(opened.names)}"
-        )
+        raise _no_value(opened, name)
     edges = np.linspace(low, high if high > low else low + max(abs(low), 1.0) * 1e-6, _HISTOGRAM_BINS + 1)
     counts = sum(np.histogram(_values(opened, name, rows), edges)[0] for rows in opened.pieces())
     _, factor = display_unit(opened, name)
     return distribution_chart(factor * edges, np.asarray(counts), x_label=measure_label(opened, name), ax=ax)
+
+
+def _no_value(opened: Store, name: str) -> InputError:
+    problem = "which has no value in any case; choose another one"
+    return InputError("measure", f"is {quoted(name)}, {problem}: {', '.join(opened.names)}")
 
 
 def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
@@ -248,9 +251,7 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
                 chosen = has_value & inside
                 sums[axis][k] += [np.sum(values[chosen]), np.sum(chosen)]
     if not total[1]:
-        raise InputError(
-            "measure", f"is {quoted(name)}, which has no value in any case; choose another one: {', '.join(opened.names)}"
-        )
+        raise _no_value(opened, name)
     means = np.asarray([sums[axis][:, 0] / np.maximum(sums[axis][:, 1], 1) for axis in axes])
     means = np.where(np.asarray([sums[axis][:, 1] for axis in axes]) > 0, means, np.nan)
     label = f"mean of {measure_label(opened, name)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Literal, TypeVar
 
@@ -175,12 +176,8 @@ def _single(tree: Tree) -> Tree:
 
 def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) -> Cost:
     scene, mode = request.scene, jam.mode
-
-    def read(found: Result) -> Array:
-        return getattr(found, quantity)
-
+    read = operator.attrgetter(quantity)
     reference = np.ravel(np.asarray(read(jam.fine), float))
-
     units = scene.machine.structure().units if quantity == "amplitude" else ()
 
     def error(value: Array) -> float:
@@ -219,10 +216,7 @@ def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) 
 def _at_the_end(request: _Request, quantity: str, end: float | None, reason: str) -> Cost:
     """Return the cost of a quantity of a scene without an exact jam, measured at the end of a run from rest."""
     end = WINDOW_PERIODS * slow_period(request.scene) if end is None else end
-
-    def read(found: Result) -> Array:
-        return getattr(found, quantity)
-
+    read = operator.attrgetter(quantity)
     start = initial_state(request.scene)
     units = request.scene.machine.structure().units if quantity == "amplitude" else ()
 
