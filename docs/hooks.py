@@ -10,6 +10,8 @@ import tempfile
 import latex2mathml.converter
 from mkdocs.structure.files import File
 
+import optimize
+
 ROOT = pathlib.Path(__file__).parents[1]
 OPTIMIZE = "Design: the package `optimize`"
 INCLUDED = {
@@ -23,25 +25,15 @@ INCLUDED = {
 
 def public_groups():
     """{title: {public name: dotted path of its home}}: the groups of `jaxvib/__init__.pyi`, and `optimize`."""
-    text = (ROOT / "jaxvib" / "__init__.pyi").read_text(encoding="utf-8")
-    homes = _homes(text)
     groups, title = {}, ""
-    for line in text[text.index("__all__") :].splitlines():
-        if found := re.fullmatch(r"    # (.*)", line):
-            title = found[1]
-        elif found := re.fullmatch(r'    "(\w+)",', line):
-            groups.setdefault(title, {})[found[1]] = homes.get(found[1], f"jaxvib.{found[1]}")
-    groups[OPTIMIZE] = _homes((ROOT / "optimize" / "__init__.py").read_text(encoding="utf-8"))
-    return {title: {name: home for name, home in names.items() if not name.startswith("__")} for title, names in groups.items()}
-
-
-def _homes(text):
-    """{name: module.name} of all `from module import name`."""
-    found = {}
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.ImportFrom):
-            found |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+    for line in (ROOT / "jaxvib" / "__init__.pyi").read_text(encoding="utf-8").splitlines():
+        if line.startswith("# "):
+            title = line[2:]
+        elif line.startswith("from "):
+            (node,) = ast.parse(line).body
+            groups.setdefault(title, {}).update({alias.name: f"{node.module}.{alias.name}" for alias in node.names})
+    groups[OPTIMIZE] = {name: f"{getattr(optimize, name).__module__}.{name}" for name in optimize.__all__}
+    return groups
 
 
 def address(title):
