@@ -83,12 +83,10 @@ class Branches(AbstractJam):
         )
 
 
-@validated
 @overload
 def branches(scene: Scene, *, exact: Literal[False] = False, points: int = 2000, most: Number | None = None) -> Branches: ...
 
 
-@validated
 @overload
 def branches(
     scene: Scene,

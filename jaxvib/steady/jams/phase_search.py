@@ -111,12 +111,10 @@ class PhaseJams(AbstractPhaseJam):
         return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN_DRAG_FACTOR, unit=unit, ax=ax)
 
 
-@validated
 @overload
 def phase_jams(scene: Scene, *, starts: int = 128, seed: int = 0) -> PhaseJams: ...
 
 
-@validated
 @overload
 def phase_jams(scene: Scene, *, near: tuple[Array, Array]) -> PhaseJam: ...
 

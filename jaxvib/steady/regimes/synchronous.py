@@ -282,12 +282,10 @@ def _has_resultant(found: AbstractSynchronousRegime) -> bool:
     return len({found.scene.exciters[owner].direction for owner in owners}) < 2
 
 
-@validated
 @overload
 def synchronous_regimes(scene: Scene, *, masses: Sequence[int] | None = None) -> SynchronousRegimes: ...
 
 
-@validated
 @overload
 def synchronous_regimes(
     scene: Scene, *, masses: Sequence[int] | None = None, near: tuple[Number, Array]
