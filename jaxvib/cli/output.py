@@ -66,18 +66,6 @@ def write_file(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8", errors="replace")
 
 
-class LinesAtIntervals:
-    """Progress as lines on stderr, for output that is not a terminal: a call prints its text if the last line is old enough."""
-
-    def __init__(self) -> None:
-        self.last = time.monotonic()
-
-    def __call__(self, text: str) -> None:
-        if time.monotonic() - self.last > SECONDS_BETWEEN_LINES:
-            self.last = time.monotonic()
-            click.echo(text, err=True)
-
-
 def _wrapped(text: str) -> str:
     """Return a text whose lines fit on the terminal and break between words. Continued lines are indented; tables are kept."""
     columns = shutil.get_terminal_size().columns
@@ -149,8 +137,15 @@ class Output:
 
         self.end_waiting()
         if not sys.stderr.isatty():
-            lines = LinesAtIntervals()
-            yield lambda what, share: lines(f"{what}: {share:.0%}")
+            last = time.monotonic()
+
+            def line(what: str, share: float) -> None:
+                nonlocal last
+                if time.monotonic() - last > SECONDS_BETWEEN_LINES:
+                    last = time.monotonic()
+                    click.echo(f"{what}: {share:.0%}", err=True)
+
+            yield line
             return
         columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.cli.output import LinesAtIntervals
 from jaxvib.errors import InputError, optional_module, quoted
 
 if TYPE_CHECKING:
@@ -42,15 +40,17 @@ def sweep(
     if not resume and path.exists():
         raise InputError("--no-resume", f"is given, but {quoted(str(path))} exists already; give another folder with --store")
     definition = load_study(study)
-    output.end_waiting()
-    show = _ProgressLines()
     try:
-        result = run_study(definition, path, workers=workers, scheduler=scheduler, timeout=timeout, report=show)
+        with output.progress() as progress:
+
+            def report(now: Progress) -> None:
+                progress(_progress_text(now), now.done / now.cases)
+
+            result = run_study(definition, path, workers=workers, scheduler=scheduler, timeout=timeout, report=report)
     except KeyboardInterrupt:
-        show.end()
         click.echo(f"stopped: finished cases are saved in {path}; run the same command again to continue", err=True)
         raise
-    show.end()
+    output.picture("sweep.png", result.plot)
     _print_result(result, output, "sweep")
 
 
@@ -76,8 +76,6 @@ def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory:
 
 
 def _print_result(result: Sweep, output: Output, name: str) -> None:
-    if name == "sweep":
-        output.picture("sweep.png", result.plot)
     from jaxvib.sweeps.results import results_table  # slow import, which --help does not need
 
     def text() -> str:
@@ -87,26 +85,8 @@ def _print_result(result: Sweep, output: Output, name: str) -> None:
     output.done(result.as_dict(), text, name, result)
 
 
-class _ProgressLines:
-    """Display of the progress on the last line of a terminal; if the output is not a terminal, as new lines at intervals."""
-
-    def __init__(self) -> None:
-        self.lines = LinesAtIntervals()
-        self.open = False
-
-    def __call__(self, now: Progress) -> None:
-        share = 100.0 * now.done / now.cases
-        text = f"{now.done} of {now.cases} cases ({share:.1f} %), {now.rate:.3g} a second, {_duration_text(now.left)} left"
-        if sys.stderr.isatty():
-            click.echo(f"\r\x1b[K{text}", nl=False, err=True)
-            self.open = True
-        else:
-            self.lines(text)
-
-    def end(self) -> None:
-        """End the line of progress."""
-        if self.open:
-            click.echo(err=True)
+def _progress_text(now: Progress) -> str:
+    return f"{now.done} of {now.cases} cases, {now.rate:.3g} a second, {_duration_text(now.left)} left"
 
 
 def _duration_text(seconds: float) -> str:
