@@ -102,7 +102,7 @@ def quoted(value: object, longest: int = 60) -> str:
     return text if len(text) <= longest else f"{text[: longest - 4].rstrip()} ..."
 
 
-def require_one_of(value: object, allowed: Iterable[str], field: str, verb: str = "is") -> None:
+def require_one_of(value: object, allowed: Iterable[str], field: str) -> None:
     """Check a choice. **Raises** `InputError` for a value that is not one of the `allowed` names.
 
     >>> require_one_of("left", ("above", "below"), "effects.stop.side")
@@ -112,7 +112,7 @@ def require_one_of(value: object, allowed: Iterable[str], field: str, verb: str 
     """
     allowed = tuple(allowed)
     if not isinstance(value, str) or value not in allowed:
-        raise InputError(field, f"{verb} {quoted(value)}; allowed: {', '.join(allowed)}")
+        raise InputError(field, f"is {quoted(value)}; allowed: {', '.join(allowed)}")
 
 
 def require_path(value: object, field: str) -> Path:

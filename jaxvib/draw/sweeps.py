@@ -179,13 +179,11 @@ def shares_chart(
     *,
     x_label: str,
     log: bool = False,
-    level: str = "95 %",
     ax: Axes | None = None,
 ) -> Drawn:
     """Draw fractions (n,) over x (n,) by name, each with its confidence interval as a bar or a band.
 
-    `shares` contains for each name the fraction and the lower and the upper end of its confidence interval. `level` is the
-    confidence level as text.
+    `shares` contains for each name the fraction and the lower and the upper end of its confidence interval, of 95 %.
 
     >>> import numpy as np
     >>> share = np.array([0.1, 0.5])
@@ -204,7 +202,7 @@ def shares_chart(
             reach = 100.0 * np.maximum([share - low, high - share], 0.0)
             axis.errorbar(place, 100.0 * share, reach, fmt="none", ecolor=colour, elinewidth=0.9, capsize=2.0)
     axis.set_ylim(-3.0, 103.0)
-    _scales(axis, x_label, f"share of the cases, % ({level} confidence)", (log, False))
+    _scales(axis, x_label, "share of the cases, % (95 % confidence)", (log, False))
     legend_above(axis, 3)
     return figure if ax is None else ax
 

@@ -35,23 +35,23 @@ Place = int | float | Sequence[float] | Array | BodyPoint | None
 y) of a body in a plane, m; None is the default place of the machine."""
 
 
-def read_place(at: int | Number | Sequence[Number] | None, name: str) -> int | Array | None:
-    """Return a place from a user's argument `name`: the number of a platform, or a distance or a point in m.
+def read_place(at: int | Number | Sequence[Number] | None) -> int | Array | None:
+    """Return a place from a user's argument `at`: the number of a platform, or a distance or a point in m.
 
     **Raises** `InputError` for values that are neither a number nor a list of two numbers, or not in m.
 
-    >>> read_place(["100 mm", 0.2], "at").tolist()
+    >>> read_place(["100 mm", 0.2]).tolist()
     [0.1, 0.2]
     """
     if at is None:
         return None
     if isinstance(at, (int, np.integer)):
         if at == 0 and not isinstance(at, bool):
-            raise InputError(name, "is 0; platforms and places are numbered from 1, and a distance of 0 m is written 0.0")
-        return count(at, name)
+            raise InputError("at", "is 0; platforms and places are numbered from 1, and a distance of 0 m is written 0.0")
+        return count(at, "at")
     if isinstance(at, (list, tuple)) or getattr(at, "ndim", 0) > 0:
-        return numbers(at, "m", name, 2)
-    return number(cast(Number, at), "m", name)
+        return numbers(at, "m", "at", 2)
+    return number(cast(Number, at), "m", "at")
 
 
 def read_number_of_place(place: object, allowed: str, last: int, name: str) -> int:

@@ -106,7 +106,7 @@ class Exciter(Part):
         numbers = {"unbalance": unbalance, "unbalance_mass": unbalance_mass}
         self.unbalance, self.unbalance_mass = read_unbalance(drive, **numbers)
         self.carries = ("loads",) * (loads is not None) + ("unbalance",) * (unbalance is not None)
-        place = read_place(at, "at")
+        place = read_place(at)
         self.platform, self.position = (place, None) if isinstance(place, int) else (None, place)
         self.body = count(body, "body", low=0)
 

@@ -25,6 +25,7 @@ from jaxvib.machine.scene import MAX_USUAL_SPEED, Exciter, Scene, read_unbalance
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.units import conditions_of_traced_values
+from jaxvib.units.columns import STANDARD_GRAVITY
 from jaxvib.units.known import is_known, when_known
 from jaxvib.units.reading import require_real
 
@@ -175,14 +176,14 @@ def implausible_numbers(scene: Scene) -> list[str]:
     if mass > _MAX_MASS:
         note("machine.mass", f"{mass / 1e3:g} t", "kg", f"{mass / 1e3:g} kg")
     supports = [each.stiffness for each in getattr(scene.machine, "supports", ())]
-    if supports and mass >= _MIN_MASS and 0.0 < np.sum(supports) * _MAX_SAG < 9.80665 * mass:
-        sag = f"{9.80665 * mass / float(np.sum(supports)):.3g} m"
+    if supports and mass >= _MIN_MASS and 0.0 < np.sum(supports) * _MAX_SAG < STANDARD_GRAVITY * mass:
+        sag = f"{STANDARD_GRAVITY * mass / float(np.sum(supports)):.3g} m"
         note(
             "machine.supports.stiffness", f"so small that the machine sags by {sag}", "N/m", f"{float(np.max(supports)):g} N/mm"
         )
     stiffness = float(np.sum(getattr(scene.machine, "stiffness", 0.0)))
-    if mass >= _MIN_MASS and 0.0 < stiffness * _MAX_SAG < 9.80665 * mass:
-        sag = f"{9.80665 * mass / stiffness:.3g} m"
+    if mass >= _MIN_MASS and 0.0 < stiffness * _MAX_SAG < STANDARD_GRAVITY * mass:
+        sag = f"{STANDARD_GRAVITY * mass / stiffness:.3g} m"
         largest = float(np.max(scene.machine.stiffness))  # pyright: ignore[reportAttributeAccessIssue]
         note("machine.stiffness", f"so small that the machine sags by {sag}", "N/m", f"{largest:g} N/mm")
     return notes

@@ -321,9 +321,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         trajectory = self.window if part == "window" else self.trajectory
         if trajectory is None:
             raise InputError("part", "is 'all', but the run kept only its window; simulate with save='all'")
-        return motion_of_point(
-            self.scene.machine, trajectory, on_body(read_place(at, "at"), self.scene.machine.require_body(body))
-        )
+        return motion_of_point(self.scene.machine, trajectory, on_body(read_place(at), self.scene.machine.require_body(body)))
 
     def harmonic(self) -> Harmonic:
         """Return the harmonic with the frequency `omega` that is fitted to the window, see `fit_harmonic`.

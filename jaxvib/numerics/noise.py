@@ -205,9 +205,7 @@ def bounded(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return 1.0 / ratio_plus_z, np.sqrt(ratio * ratio_plus_z)
 
 
-def autoregression(
-    residual: np.ndarray, used: np.ndarray | None = None, max_order: int = _MAX_ORDER
-) -> tuple[np.ndarray, float]:
+def autoregression(residual: np.ndarray, used: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """Return the filter that turns noise into white noise, and the standard deviation of the white noise.
 
         e_k = r_k + a_1 r_{k-1} + ... + a_p r_{k-p}
@@ -215,7 +213,7 @@ def autoregression(
     The coefficients solve the Yule-Walker equations; the order p has the smallest Bayesian information criterion. The order is
     0 unless the noise is clearly coloured, see `_COLOUR_GAIN`.
 
-    **Arguments**: `residual` r (n,); `used` (n,): False for samples to leave out; `max_order`: largest order.
+    **Arguments**: `residual` r (n,); `used` (n,): False for samples to leave out.
 
     **Returns** (1, a_1, ..., a_p) and the standard deviation of e.
 
@@ -230,7 +228,7 @@ def autoregression(
     """
     used = np.isfinite(residual) if used is None else used & np.isfinite(residual)
     n = int(np.count_nonzero(used))
-    max_order = max(min(max_order, n // 20), 0)
+    max_order = max(min(_MAX_ORDER, n // 20), 0)
     r = np.where(used, residual, 0.0)
     size = 2 ** int(np.ceil(np.log2(2 * r.size + 1)))
     spectra = [np.fft.rfft(each, size) for each in (r, used.astype(float))]

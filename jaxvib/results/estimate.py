@@ -96,17 +96,17 @@ def student_quantile(freedom: int) -> float:
     return float(stdtrit(freedom, 0.975))
 
 
-def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np.ndarray, np.ndarray]:
-    """Return Wilson's confidence interval (default: 95 %) of the share `hits` / `cases`; 0 to 1 if there are no cases.
+def wilson(hits: np.ndarray, cases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return Wilson's confidence interval (95 %) of the share `hits` / `cases`; 0 to 1 if there are no cases.
 
-    The interval contains all shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases).
+    The interval contains all shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases), z = 1.96.
 
     >>> [round(float(end), 4) for end in wilson(np.asarray(0), np.asarray(10))]
     [0.0, 0.2775]
 
     Source: E. B. Wilson, Probable inference, the law of succession, and statistical inference, 1927.
     """
-    n = np.maximum(cases, 1)
+    n, z = np.maximum(cases, 1), 1.959964
     share, more = hits / n, z**2 / n
     middle = (share + more / 2.0) / (1.0 + more)
     half = z * np.sqrt(share * (1.0 - share) / n + more / (4.0 * n)) / (1.0 + more)

@@ -43,10 +43,9 @@ class Readable(eqx.Module):
         return "\n".join([f"{type(self).__name__}:", *_lines(self)])
 
 
-def values_text(values: object, unit: str = "", digits: int = 5) -> str:
-    """Return numbers of any shape in their display unit as text: all of up to 12 numbers, otherwise their shape and range.
-
-    **Arguments**: `values` in the SI `unit`; `digits`: significant digits.
+def values_text(values: object, unit: str = "") -> str:
+    """Return numbers of any shape, in the SI `unit`, in their display unit as text: all of up to 12 numbers, otherwise their
+    shape and range.
 
     >>> values_text([[0.01, 0.02], [0.03, float("nan")]], "m"), values_text(np.linspace(0.0, 0.1, 50), "m")
     ('[10, 20], [30, nan] mm', '(50,) from 0 to 100 mm')
@@ -57,11 +56,11 @@ def values_text(values: object, unit: str = "", digits: int = 5) -> str:
     finite = array[np.isfinite(array)]
     shown, factor = shown_unit(unit, float(np.max(np.abs(finite), initial=0.0)))
     if array.size <= _MAX_ENTRIES:
-        return f"{_entries(factor * array, lambda x: f'{x:.{digits}g}')} {shown}".rstrip()
+        return f"{_entries(factor * array, lambda x: f'{x:.5g}')} {shown}".rstrip()
     if finite.size == 0:
         return f"{array.shape} of nan"
     name, span = ("magnitude ", np.abs(finite)) if array.dtype.kind == "c" else ("", finite)
-    return f"{array.shape} {name}from {factor * np.min(span):.{digits}g} to {factor * np.max(span):.{digits}g} {shown}".rstrip()
+    return f"{array.shape} {name}from {factor * np.min(span):.5g} to {factor * np.max(span):.5g} {shown}".rstrip()
 
 
 def _has_values(tree: eqx.Module) -> bool:

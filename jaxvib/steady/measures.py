@@ -33,8 +33,9 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import Jam
 from jaxvib.steady.jams.phases import PhaseJam
 from jaxvib.steady.orbits.describe import Orbit
-from jaxvib.steady.points import STANDARD_GRAVITY, at_positive_speed, ellipse_at, require_amplitudes, rows_in_plane
+from jaxvib.steady.points import at_positive_speed, ellipse_at, require_amplitudes, rows_in_plane
 from jaxvib.units import Number, known_number, number, numbers
+from jaxvib.units.columns import STANDARD_GRAVITY
 from jaxvib.units.known import when_known
 
 ZONE_LIMITS = {
@@ -333,7 +334,7 @@ def vibration_measures(
     deck = scene.machine.require_body(body)
     has_list = isinstance(at, (list, tuple)) and len(at) > 0 and all(isinstance(each, (list, tuple)) for each in at)
     points = cast("Sequence[Sequence[Number]]", at) if has_list else [cast("Sequence[Number] | None", at)]
-    places = tuple(on_body(read_place(point, "at"), deck) for point in points)
+    places = tuple(on_body(read_place(point), deck) for point in points)
     if isinstance(motion, Jam):
         motion = _vibration_of(scene, motion.omega, motion.displacement, motion.foundation_force)
     elif isinstance(motion, PhaseJam):

@@ -27,10 +27,8 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, known_number, number, numbers
+from jaxvib.units.columns import STANDARD_GRAVITY
 from jaxvib.units.known import when_known
-
-STANDARD_GRAVITY = 9.80665
-"""Acceleration 1 g, m/s^2."""
 
 
 def _rounding(semi_axis: Array) -> float:
@@ -244,7 +242,7 @@ class PathsOfPoints(eqx.Module):
         **Returns** `Ellipse`. **Raises** `InputError` for a place that the machine does not have.
         """
         motion = self.harmonic()
-        place = on_body(read_place(at, "at"), motion.machine.require_body(body))
+        place = on_body(read_place(at), motion.machine.require_body(body))
         return _ellipse(motion, place, known_number(slope, "rad", "slope"))
 
     @validated

@@ -9,6 +9,7 @@ import numpy as np
 from jaxvib.units.reading import unit_ratio
 
 STANDARD_GRAVITY = 9.80665
+"""Acceleration 1 g, m/s^2."""
 
 _SPELLINGS: dict[str, dict[str, float]] = {
     "s": {

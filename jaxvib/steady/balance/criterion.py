@@ -94,18 +94,16 @@ class Criterion(Result):
         return speeds_chart(*drawn, unit=unit, ax=ax)
 
 
-def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = None) -> Array:
+def criterion_functional(scene: Scene, omega: Array) -> Array:
     """Return the functional of the criterion at speed `omega` (scalar, rad/s): mean of S . r over one turn, kg m^2.
 
         f(S, w) = (S^2 w^2 / 2) Re(e^H A(w) e)
 
-    S is the common unbalance of the loads, r the displacement of the exciter's axis that it causes, A the receptance of the
-    mount and e the rotating direction of the force. For a mount with two directions e^H A e is the trace of A plus a term of
-    the gyroscopic coupling. If f < 0, the displacement of the axis is on average opposite to the loads, and they spread until
-    they balance; if f > 0, they gather. The paper states this for two or more loads, as an approximation;
+    S is the unbalance of all loads at one point, r the displacement of the exciter's axis that it causes, A the receptance of
+    the mount and e the rotating direction of the force. For a mount with two directions e^H A e is the trace of A plus a term
+    of the gyroscopic coupling. If f < 0, the displacement of the axis is on average opposite to the loads, and they spread
+    until they balance; if f > 0, they gather. The paper states this for two or more loads, as an approximation;
     `balanced_states(scene).stability()` has the exact result.
-
-    **Arguments**: `unbalance` S kg m; default: that of all loads at one point.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=30.0)
@@ -116,9 +114,9 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
     Source: Filimonikhin et al. 2022, equations (1)-(3), (15), (28).
     """
     direction = rotating_direction(scene.mounting)
-    size = circular_loads(scene).unbalance() if unbalance is None else unbalance
+    unbalance = circular_loads(scene).unbalance()
     receptance = jnp.sum(direction.conj() * (port_receptance(scene, omega) @ direction)).real
-    return size**2 * omega**2 / 2.0 * receptance
+    return unbalance**2 * omega**2 / 2.0 * receptance
 
 
 CRITERION_TERMS = (
