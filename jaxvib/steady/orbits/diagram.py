@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -167,26 +167,12 @@ def exact_branches(
     omega = np.interp(np.linspace(0.0, 1.0, points), np.linspace(0.0, 1.0, grid.size), grid)
     solve = _Solver(scene, accuracy, low)
     values = solve(omega)
-    fields = {name: getattr(values, name) for name in ExactBranches.__dataclass_fields__ if name not in ("special", "scene")}
-    return ExactBranches(**fields, scene=scene, special=_special_points(solve, values))
+    return ExactBranches(**{name: values[name] for name in _FIELDS}, scene=scene, special=_special_points(solve, values))
 
 
-class _Values(NamedTuple):
-    """Exact jams with a leading axis; `tests` (P, 4) change sign at stability changes, see `_tests`."""
-
-    status: OrbitStatus
-    omega: np.ndarray
-    rotor_speed: np.ndarray
-    slope: np.ndarray
-    amplitude: np.ndarray
-    foundation_force: np.ndarray
-    power: np.ndarray
-    stable: np.ndarray
-    multiplier: np.ndarray
-    multipliers: np.ndarray
-    residual: np.ndarray
-    error: np.ndarray
-    tests: Any
+_FIELDS = tuple(name for name in ExactBranches.__dataclass_fields__ if name not in ("special", "scene"))
+_Values: TypeAlias = dict[str, Any]
+"""These fields of exact jams, with a leading axis, and `tests` (P, 4), which change sign at stability changes, see `_tests`."""
 
 
 class _Solver:
@@ -203,7 +189,7 @@ class _Solver:
         first, *more = (collocation_points(self.scene, points) for points in _COLLOCATION_POINTS)
         found = self._batches(omega, first)
         for point_count in more:
-            todo = np.flatnonzero(~(found.error <= self.accuracy))
+            todo = np.flatnonzero(~(found["error"] <= self.accuracy))
             if todo.size == 0:
                 break
             found = jax.tree.map(functools.partial(_replaced_rows, todo), found, self._batches(omega[todo], point_count))
@@ -237,7 +223,7 @@ def _values(scene: Scene, omega: Array | np.ndarray, points: int, accuracy: floa
     start = jax.vmap(lambda w: light_rotor_speed(model.linear, w))(omega)
     steps = jnp.max(steps_for(model, omega, start, implicit=implicit))
     orbit, growth = orbits(model, omega, start, "omega", points, steps, accuracy, implicit=implicit)
-    return _Values(*(getattr(orbit, name) for name in _Values._fields[:-1]), tests=_tests(growth))
+    return {name: getattr(orbit, name) for name in _FIELDS} | {"tests": _tests(growth)}
 
 
 _KINDS_OF_TESTS = ("torus", "half_turn", "half_turn", "symmetry")
@@ -267,18 +253,18 @@ def _special_points(solve: _Solver, grid: _Values) -> tuple[SpecialPoint, ...]:
         kinds = ["fold", *("period_doubling" if kind == "half_turn" else kind for kind in _KINDS_OF_TESTS)]
 
     def read(values: _Values) -> np.ndarray:
-        return np.concatenate([values.slope[:, None], values.tests], axis=1)
+        return np.concatenate([values["slope"][:, None], values["tests"]], axis=1)
 
     tests = read(grid)
     row, which = np.nonzero(tests[:-1] * tests[1:] < 0.0)
     if row.size == 0:
         return ()
     pick = np.arange(row.size)
-    a, b = grid.omega[row], grid.omega[row + 1]
+    a, b = grid["omega"][row], grid["omega"][row + 1]
     fa, fb = tests[row, which], tests[row + 1, which]
     beyond = np.maximum(row - 1, 0)
     with np.errstate(all="ignore"):
-        share = next_share(np, (a, fa), (b, fb), (grid.omega[beyond], tests[beyond, which]), 1e-12)
+        share = next_share(np, (a, fa), (b, fb), (grid["omega"][beyond], tests[beyond, which]), 1e-12)
     values, done = grid, np.zeros(row.size, bool)
     while not np.all(done):
         # A converged root stays unchanged until all have converged.
@@ -294,9 +280,9 @@ def _special_points(solve: _Solver, grid: _Values) -> tuple[SpecialPoint, ...]:
         (a, fa), (b, fb) = (x, f), other
     points = []
     for k in range(row.size):
-        s = values.multipliers[k]
+        s = values["multipliers"][k]
         # Two real multipliers with product 1 are a root of the torus test, but not a bifurcation: such a point is left out.
         is_real_pair = which[k] == 1 and not np.any((np.abs(np.abs(s) - 1.0) < 1e-4) & (np.abs(s.imag) > 1e-6))
-        if np.isfinite(values.rotor_speed[k]) and not is_real_pair:
-            points.append(SpecialPoint(kinds[which[k]], float(a[k]), float(values.rotor_speed[k])))
+        if np.isfinite(values["rotor_speed"][k]) and not is_real_pair:
+            points.append(SpecialPoint(kinds[which[k]], float(a[k]), float(values["rotor_speed"][k])))
     return tuple(sorted(points, key=lambda point: point.omega))
