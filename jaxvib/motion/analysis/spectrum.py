@@ -37,8 +37,8 @@ class Spectrum(Result):
     **Attributes** (P segments, nf frequencies, nd coordinates, nb directions of the force)
 
     - `time` (P,), s: the middles of the segments
-    - `frequency` (nf,), rad/s, up to 1.5 times the largest rotor speed; its resolution is about 2 pi divided by the duration of
-      a segment
+    - `frequency` (nf,), rad/s, up to 1.5 times the largest rotor speed; two vibrations have separate peaks if their
+      frequencies differ by at least 4 pi divided by the duration of a segment
     - `amplitude` (P, nf, nd), m (rad for tilts)
     - `force` (P, nf, nb), N, on the foundation
     - `rotor_speeds` (P, E), rad/s, of the E exciters, and `load_speeds` (P, L), rad/s, of the L exciters with loads: means over
@@ -125,8 +125,8 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     count(parts, "parts")
     if parts > 1 and trajectory is None:
         raise InputError("parts", f"is {parts}, but the run saved only its end; simulate with save='all', or give 1")
-    stretch = window if parts == 1 or trajectory is None else trajectory
-    time = np.asarray(stretch.time, float)
+    source = window if parts == 1 or trajectory is None else trajectory
+    time = np.asarray(source.time, float)
     # Neighbouring segments overlap by one half, because the Hann window suppresses the ends of each segment.
     size = time.size if parts == 1 else 2 * time.size // (parts + 1)
     if size < 64:
@@ -137,8 +137,8 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     step = float(np.ptp(time)) / (time.size - 1)  # the mean, because single precision rounds each time
     points = _ZERO_PADDING_FACTOR * 2 ** int(np.ceil(np.log2(size)))
     frequency = 2.0 * np.pi * np.fft.rfftfreq(points, step)
-    speeds = np.stack([np.asarray(item, float) for item in stretch.rotor_speeds], axis=1)
-    rates = [np.mean(np.asarray(item.rate[0], float), axis=1) for item in stretch.state.exciters if item.rate]
+    speeds = np.stack([np.asarray(item, float) for item in source.rotor_speeds], axis=1)
+    rates = [np.mean(np.asarray(item.rate[0], float), axis=1) for item in source.state.exciters if item.rate]
     top = max(float(np.max(np.abs(speeds))), 1e-300)
     if np.pi / step < _MAX_FREQUENCY_RATIO * top:
         stored = f"is {parts}, but the run has {2.0 * np.pi / (step * top):.2g} states for each turn of the rotor"
@@ -159,8 +159,8 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     return Spectrum(
         time=np.array([0.5 * (time[s] + time[s + size - 1]) for s in starts]),
         frequency=frequency[is_shown],
-        amplitude=amplitudes(np.asarray(stretch.state.displacement, float)),
-        force=amplitudes(np.asarray(stretch.foundation_force, float)),
+        amplitude=amplitudes(np.asarray(source.state.displacement, float)),
+        force=amplitudes(np.asarray(source.foundation_force, float)),
         rotor_speeds=means(speeds),
         load_speeds=means(np.stack(rates, axis=1) if rates else np.zeros((time.size, 0))),
         resonances=np.asarray(estimated_frequencies(scene), float),
