@@ -74,7 +74,8 @@ class BalancedStates(Result):
       loads in two planes "turn in plane 1", "shape 1 in plane 1", ...
     - `scene`
 
-    If all loads are on one line, there is one more neutral direction than `dimension`.
+    For a plane in which all loads are on one line, there is one more neutral direction than `dimension` counts, except for two
+    loads on a rotor without imbalance.
     """
 
     status: BalanceStatus
@@ -126,14 +127,15 @@ class BalancedStates(Result):
     @property
     def share(self) -> np.ndarray:
         """Imbalance of the rotor in each plane of the loads, divided by the sum of m_j R_j there, (planes,): 0 for a balanced
-        rotor, above 1 if the loads cannot cancel it, see `planes`."""
+        rotor. Loads cannot cancel a share above 1, see `planes`."""
         sides = _sides(turning_loads(self.scene))
         return np.array([abs(plane.imbalance) / np.sum(sides[plane.loads]) for plane in _planes(self.scene)])
 
     @property
     def capacity(self) -> np.ndarray:
         """Largest imbalance of the rotor that the loads in each plane cancel, (planes,) kg m: that of loads at one angle, or of
-        balls and rollers with a `ball_radius` that touch each other. It holds for loads none of which outweighs the others."""
+        balls and rollers with a `ball_radius` that touch each other. If one load outweighs all others together, they do not
+        cancel small imbalances."""
         sides, touching = _sides(turning_loads(self.scene)), _touching_angle(self.scene)
         chains = [sides[plane.loads] * np.exp(1j * touching * np.arange(plane.loads.size)) for plane in _planes(self.scene)]
         return np.array([abs(np.sum(chain)) for chain in chains])
@@ -165,7 +167,7 @@ class BalancedStates(Result):
         """Plot the arrangements in the rotor's frame, each on a circle; for loads in two planes on a circle for each plane.
 
         Arrows show the unbalance of the loads and the imbalance of the rotor in the plane, relative to the unbalance of all
-        loads there at one angle. **Arguments**: `ax`: one axes object for each circle, those of a plane in succession.
+        loads there at one angle. **Arguments**: `ax`: one axes object for each circle, plane by plane.
         """
         from jaxvib.draw.results import draw_circle  # slow imports
         from jaxvib.draw.style import panels
@@ -210,8 +212,8 @@ def balanced_states(scene: Scene) -> BalancedStates:
     **Returns** `BalancedStates`.
 
     **Raises** `InputError` for loads that do not run on a circle, for loads in more than two planes, and for loads in one plane
-    with an imbalance that tilts the rotor, which they cannot cancel: a moment imbalance, or a static imbalance at another point
-    of the axis.
+    if the imbalance tilts the rotor (a moment imbalance, or a static imbalance at another point of the axis): loads in one
+    plane cannot cancel it.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -354,8 +356,8 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     fine, coarse = (np.linalg.eigvals(np.asarray(each)) for each in matrices)
     speed = float(scene.drive.speed)
     growth = float(_growth_rate(fine, speed, neutral))
-    # Half as many steps have at least 64 times the error: the order is 11 if all is resolved, and 6 if the motion of loads
-    # decays in a step.
+    # Half as many steps have at least 64 times the error: the order is 11 if the steps resolve all motions, and 6 if the motion
+    # of the loads decays within a step.
     error = float(np.max(np.min(np.abs(fine[:, None] - coarse[None, :]), axis=1))) / 63.0
     # Neutral multipliers are 1; their difference from 1 is rounding, which grows with the number of steps.
     rounding = float(np.max(np.sort(np.abs(fine - 1.0))[:neutral], initial=fine.size * np.finfo(fine.real.dtype).eps))
@@ -430,16 +432,17 @@ def stability_changes(
     stable: np.ndarray,
     angles: ArrayLike | None = None,
     *,
-    close: float = 1e-7,
+    rtol: float = 1e-7,
     steps: int | None = None,
 ) -> np.ndarray:
-    """Return the speeds at which the balanced motion changes its stability, ascending, by bisection to `close` of the speed.
+    """Return the speeds at which the balanced motion changes its stability, ascending.
 
-    `stable`: True for each of `speeds` at which the motion is stable; changes between two of them are found.
+    `stable`: True for each of `speeds` at which the motion is stable. A change between two of them is refined by bisection to
+    the relative accuracy `rtol`.
     """
     (change,) = np.nonzero(stable[1:] != stable[:-1])
     left, right = speeds[change], speeds[change + 1]
-    while left.size and np.max((right - left) / right) > close:
+    while left.size and np.max((right - left) / right) > rtol:
         middle = (left + right) / 2.0
         same = (balanced_growth(scene, middle, angles, steps=steps) < 0.0) == stable[change]
         left, right = np.where(same, middle, left), np.where(same, right, middle)
@@ -524,8 +527,8 @@ class BalancedStability(Result):
     - `stable`: True if deviations decay; `is_decided`: True if the growth over a turn exceeds the error of the computation
     - `growth`, 1/s: the largest growth rate of a deviation (if negative: the slowest decay), without neutral directions
     - `multipliers` (2 (nd + N),), complex, the largest first
-    - `neutral`: the number of multipliers that are 1 because the arrangements form a family (without an imbalance at least by a
-      common rotation)
+    - `neutral`: the number of multipliers that are 1 because the arrangements form a family. Without an imbalance, the family
+      contains at least the common rotation of all loads
     - `error` of the multipliers, estimated from half the number of steps
     - `rotor_speed`, rad/s, at which the stability was computed
     """

@@ -127,7 +127,7 @@ def criterion_map(
         scene_of_cell = scene_with(jnp.asarray(mass_factor[m]), drag_factor[d])
         growth = balanced_growth(scene_of_cell, grid, steps=steps)
         stable = growth < 0.0
-        changes = stability_changes(scene_of_cell, grid, stable, close=1e-5, steps=steps)
+        changes = stability_changes(scene_of_cell, grid, stable, rtol=1e-5, steps=steps)
         ends = [*([np.nan] if stable[0] else []), *changes, *([np.nan] if stable[-1] else [])]
         return growth, _shifts(np.reshape(ends, (-1, 2)), grid, boundary[m])
 

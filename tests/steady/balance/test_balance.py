@@ -392,7 +392,7 @@ def test_every_change_of_stability_is_halved_to_the_same_part(monkeypatch):
     monkeypatch.setattr(states, "balanced_growth", lambda scene, w, *_, **__: np.where((w > np.pi) & (w < 500.0), -1.0, 1.0))
     speeds = np.array([1.0, 3.1415, 3.1416, 400.0, 900.0])
     stable = (speeds > np.pi) & (speeds < 500.0)
-    found = states.stability_changes(loaded(), speeds, stable, close=1e-9)
+    found = states.stability_changes(loaded(), speeds, stable, rtol=1e-9)
     np.testing.assert_allclose(found, [np.pi, 500.0], rtol=1e-9)
 
 

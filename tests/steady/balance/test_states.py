@@ -67,7 +67,7 @@ def test_changes_of_stability_are_halved_until_they_are_known(monkeypatch):
 
     monkeypatch.setattr(states, "balanced_growth", growth)
     speeds = np.linspace(10.0, 40.0, 7)
-    found = stability_changes(None, speeds, growth(None, speeds, None, steps=0) < 0.0, close=1e-4)
+    found = stability_changes(None, speeds, growth(None, speeds, None, steps=0) < 0.0, rtol=1e-4)
     np.testing.assert_allclose(found, at, rtol=1e-4)
     assert 10 < len(asked) < 18  # from 5 in 10 to 1e-4
 
