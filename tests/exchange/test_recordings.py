@@ -129,7 +129,7 @@ def test_objects_of_matlab_raise_a_clear_error(name):
     folder = pathlib.Path(pytest.importorskip("scipy.io.matlab").__file__).parent / "tests" / "data"
     if not (folder / name).exists():
         pytest.skip("scipy was installed without its test data")
-    with pytest.raises(jv.InputError, match=r"holds objects of MATLAB \(.*\), such as timetables .* save arrays there"):
+    with pytest.raises(jv.InputError, match=r"holds objects of MATLAB \(.*\), such as timetables .* in MATLAB, save arrays"):
         jv.read_recording(folder / name)
 
 

@@ -43,7 +43,7 @@ _RATE_CELL = re.compile(
 )
 """Number and unit of a sampling rate. Three digits after a comma may be thousands or decimals, and are not matched."""
 
-_SI = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "force": "N"}
+_SI_UNITS = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "force": "N"}
 
 
 def read_channels(path: Path, rate: float | None) -> list[Recorded]:
@@ -134,7 +134,7 @@ def _read_text(path: Path, rate: float | None) -> Iterator[Recorded]:
 def _clocks(columns: Sequence[tuple[str, str]]) -> list[int]:
     """Return the indices of the columns of times from names and units.
 
-    A column T with a unit of another quantity, or beside a column of times, is a torque or a temperature.
+    A column T is a torque or a temperature if its unit is not a unit of time, or if there is another column of times.
     """
     named = [k for k, (name, _) in enumerate(columns) if name.lower() in _TIME_NAMES]
     times = [k for k in named if columns[k][0].lower() != "t" or unit_factor(columns[k][1] or "s", "s") is not None]
@@ -166,7 +166,7 @@ def _stated_rate(remarks: list[str], path: Path) -> float | None:
 
 
 def _cut_off_error(path: Path, difference: str) -> InputError:
-    """Return the error of a file whose header and data have different lengths."""
+    """Return the error of a file with fewer data than its header states."""
     return InputError(str(path), f"{difference}: the recording was cut off; export it again")
 
 
@@ -201,7 +201,7 @@ def _read_uff(path: Path, rate: float | None) -> Iterator[Recorded]:
         if function.kind == "history":
             yield Recorded(
                 function.about or f"node {function.response[0]}",
-                _SI.get(function.quantity, ""),
+                _SI_UNITS.get(function.quantity, ""),
                 function.x,
                 np.real(function.values),
             )
@@ -263,12 +263,13 @@ def _read_mat(path: Path, rate: float | None) -> Iterator[Recorded]:
         raise InputError(
             str(path),
             f"holds objects of MATLAB ({', '.join(objects[:5])}), such as timetables or Simulink data, which only MATLAB can "
-            "read; save arrays there, for example t = x.Time; a = x.Data; save('run.mat', 't', 'a')",
+            "read; in MATLAB, save arrays, for example t = x.Time; a = x.Data; save('run.mat', 't', 'a')",
         )
 
 
 def _clocks_of_arrays(arrays: dict[str, np.ndarray], rate: float | None) -> dict[str, np.ndarray]:
-    """Return the arrays of times by their dotted names; T is one only if its step agrees with a stated `rate`, Hz."""
+    """Return the arrays of times by their dotted names. If the file states a sampling rate, `rate`, Hz, an array T contains
+    times only if its step agrees with this rate."""
     folders: dict[str, list[tuple[str, str]]] = {}
     for name, value in arrays.items():
         folder, _, last = name.rpartition(".")
