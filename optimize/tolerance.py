@@ -41,8 +41,8 @@ class ToleranceRange(NamedTuple):
     Returned by `tolerance_ranges`.
 
     **Attributes**: `words`: name of the quantity or demand; `unit` of the quantity, SI; `design`: its value for the design;
-    `low` and `high`: 95 % of the machines for which the quantity exists lie between these values; `worst`: the largest value,
-    for a demand "at least" the smallest; `share`: fraction of the machines for which the quantity exists and, if it is a
+    `low` and `high`: the quantity is between these values in 95 % of the machines for which it exists; `worst`: the largest
+    value, for a demand "at least" the smallest; `share`: fraction of the machines for which the quantity exists and, if it is a
     demand, the demand is met.
     """
 
@@ -56,8 +56,7 @@ class ToleranceRange(NamedTuple):
 
 
 class _NumberRange(NamedTuple):
-    """Range of a parameter from `low` to `high`, SI. If `is_added`, the range is that of a mass that is added to the
-    parameter."""
+    """Range of a parameter from `low` to `high`, SI; if `is_added`, of a mass that is added to the parameter."""
 
     number: NamedNumber
     low: float
@@ -169,9 +168,9 @@ def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
 
 
 def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) -> Iterator[Scene]:
-    """Yield scenes with deviations of their numbers."""
+    """Yield copies of the scene whose parameters have random deviations."""
     errors, ranges = read_tolerances(scene, tolerances)
-    random = np.random.default_rng((count(seed, "seed", low=0), 1))  # independent of the numbers of `Sampled`
+    random = np.random.default_rng((count(seed, "seed", low=0), 1))  # other random numbers than those of `Sampled`
     batch = Sampled(errors, samples, seed).scenes(scene) if errors else None
     fractions = [random.permutation((np.arange(samples) + 0.5) / samples) for _ in ranges]
     for k in range(samples):
@@ -198,7 +197,7 @@ def _range(scene: Scene, name: str, low: str, high: str) -> _NumberRange:
         bounds = entry.spec.bounds
     first, last = (float(number(end.strip(), entry.unit, f"tolerances.{name}", **bounds._asdict())) for end in ends)
     if not first < last:
-        raise InputError(f"tolerances.{name}", f"is {low}..{high}; the second must be larger than the first")
+        raise InputError(f"tolerances.{name}", f"is {low}..{high}; the second value must be larger than the first")
     return _NumberRange(entry, first, last, material is not None)
 
 

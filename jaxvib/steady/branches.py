@@ -60,10 +60,10 @@ class Branches(AbstractJam):
         linear: bool = False,
         ax: Onto = None,
     ) -> Drawn:
-        """Plot load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable
-        dashed.
+        """Plot load speed, amplitudes (zero to peak) and foundation force over the rotor speed.
 
-        Jams at the scene's rotor speed are marked with the numbers of their modes.
+        Stable jams are solid lines, unstable ones dashed lines. Jams at the scene's rotor speed are marked with the numbers of
+        their modes.
 
         **Arguments**
 
@@ -109,7 +109,7 @@ def branches(
     least: Number | None = None,
     accuracy: float | None = None,
 ) -> Branches | ExactBranches:
-    """Return the branch n(Omega) of jams of coincident loads, through all its folds: in the limit of light loads, or `exact`.
+    """Return the branch n(Omega) of jams of coincident loads with all its folds, for light loads or, with `exact`, for any.
 
         n(Omega) = Omega + (mean braking torque of the vibration on the loads) / sum b_W R^2      (light loads, no dry friction)
 

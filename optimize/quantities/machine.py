@@ -138,8 +138,8 @@ def static_deflection(of: int | None = None) -> Quantity:
 
     **Arguments**: `of`: the platform; typical: 1 to 3; default: the largest deflection of all platforms.
 
-    **Returns** `Quantity`; typical: 2 to 50 mm; NaN if no support carries the platform, neither its own nor one of a platform
-    to which links connect it. A machine without platforms, or without this platform, raises `InputError` when the quantity is
+    **Returns** `Quantity`; typical: 2 to 50 mm; NaN if the platform neither has a support nor is connected by links to
+    a platform with one. A machine without platforms, or without this platform, raises `InputError` when the quantity is
     computed.
 
     >>> import jaxvib as jv
