@@ -40,13 +40,13 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
     frozen = jax.lax.stop_gradient(model)
     target = jax.lax.stop_gradient(speed)
 
-    def gap(w: Array) -> Array:
+    def residual(w: Array) -> Array:
         difference = rotor_speed_at(frozen, w) - w
         return jax.lax.rsqrt(jnp.maximum(difference, 1e-300)) - jax.lax.rsqrt(target - w)
 
-    omega = _newton(gap, near, target)
+    omega = _newton(residual, near, target)
     reached, slope = jax.jvp(lambda w: rotor_speed_at(frozen, w), (omega,), (jnp.ones_like(omega),))
-    # A Newton step from the root has length zero and the derivatives of the root.
+    # A further Newton step does not change the root, but has its derivatives with respect to the model and the rotor speed.
     omega = omega - (rotor_speed_at(model, omega) - speed) / slope
     converged = jnp.abs(reached - target) < 1e-9 * (target + jnp.abs(slope) * omega)
     is_valid = converged & (omega > 0.0) & (omega < target) & ((slope > 0.0) == (mode % 2 == 1))
@@ -76,7 +76,8 @@ def follow_fold(model: JammedModel, near: Array) -> tuple[Array, Array]:
 
 
 def _newton(f: Callable[[Array], Array], start: Array, upper: Array) -> Array:
-    """Return a root of `f` by Newton's method. The unknown stays below `upper`, and no step changes it by more than a tenth."""
+    """Return a root of `f` by Newton's method. The unknown stays below `upper`, and no Newton step changes it by more than a
+    tenth of its value."""
 
     def step(_: int, w: Array) -> Array:
         value, slope = jax.jvp(f, (w,), (jnp.ones_like(w),))
