@@ -1,6 +1,6 @@
 """Descent by Adam (optax) from many starts at once, with held quantities and with demands (by an augmented Lagrangian).
 
-Sizes of arrays: d free parameters, m equations.
+Sizes of arrays: d free parameters, m held quantities.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _STEPS_PER_UPDATE = 20
 class _SearchState(NamedTuple):
     """State of one search: the design with its values and derivatives (as in `Point`), the state of Adam, the step length, the
     multipliers and the weight of the demands, the largest violation of a demand at the last update of the multipliers
-    (`worst`), the modulus `size` of the initial objective, by which the objective is divided, and the number of `steps`."""
+    (`worst`), the `scale` by which the objective is divided (modulus of its initial value), and the number of `steps`."""
 
     z: Array
     values: Array
@@ -45,7 +45,7 @@ class _SearchState(NamedTuple):
     multipliers: Array
     weight: Array
     worst: Array
-    size: Array
+    scale: Array
     steps: Array
 
 
@@ -81,20 +81,20 @@ def _initial_states(point: Any, multipliers: Array) -> _SearchState:
     state = jax.vmap(_ADAM.init)(point.z)
     n = point.z.shape[0]
     ones = jnp.ones(n)
-    size = jnp.maximum(jnp.abs(point.values[:, 0]), 1e-300)
+    scale = jnp.maximum(jnp.abs(point.values[:, 0]), 1e-300)
     worst = jnp.full(n, jnp.inf)
     z, values, slopes, speeds, speed_slopes, *_ = point
     return _SearchState(
-        z, values, slopes, speeds, speed_slopes, state, ones, multipliers, 10.0 * ones, worst, size, jnp.zeros(n, int)
+        z, values, slopes, speeds, speed_slopes, state, ones, multipliers, 10.0 * ones, worst, scale, jnp.zeros(n, int)
     )
 
 
 def _step(problem: Problem, state: _SearchState, rate: Array) -> tuple[_SearchState, Array]:
     m = problem.equalities
-    off, excess = state.values[1 : 1 + m], state.values[1 + m :]
+    deviations, excess = state.values[1 : 1 + m], state.values[1 + m :]
     held = state.slopes[1 : 1 + m]
     demand_weights = jnp.maximum(0.0, state.multipliers + state.weight * excess)
-    slope = state.slopes[0] / state.size + demand_weights @ state.slopes[1 + m :]
+    slope = state.slopes[0] / state.scale + demand_weights @ state.slopes[1 + m :]
     free = jnp.ones_like(state.z)
     for _ in range(2):
         down = _project(slope, held, free)
@@ -102,23 +102,23 @@ def _step(problem: Problem, state: _SearchState, rate: Array) -> tuple[_SearchSt
     move, adam = _ADAM.update(_project(slope, held, free), state.adam)
     step = -rate * _project(jnp.asarray(move), held, free)
     if m:
-        correction = -_least_norm_solution(held, off)
+        correction = -_least_norm_solution(held, deviations)
         stopped = ((state.z <= 0.0) & (correction < 0.0)) | ((state.z >= 1.0) & (correction > 0.0))
-        step = step - _least_norm_solution(held * jnp.where(stopped, 0.0, 1.0)[None, :], off)
+        step = step - _least_norm_solution(held * jnp.where(stopped, 0.0, 1.0)[None, :], deviations)
     z = jnp.clip(state.z + state.length * step, 0.0, 1.0)
     near = tuple(_extrapolate(w, r, z - state.z) for w, r in zip(state.speeds, state.speed_slopes, strict=True))
     values, slopes, speeds, speed_slopes = derive(problem, z, near)
-    finite = jnp.all(jnp.isfinite(values)) & jnp.all(jnp.isfinite(slopes))
-    good = finite & jnp.all(jnp.abs(values[1 : 1 + m]) < _DESCENT_VIOLATION) & (rate > 0.0)
+    is_finite = jnp.all(jnp.isfinite(values)) & jnp.all(jnp.isfinite(slopes))
+    is_accepted = is_finite & jnp.all(jnp.abs(values[1 : 1 + m]) < _DESCENT_VIOLATION) & (rate > 0.0)
 
     def select(new: Array, old: Array) -> Array:
-        return jnp.where(good, new, old)
+        return jnp.where(is_accepted, new, old)
 
     new = (z, values, slopes, speeds, speed_slopes)
     z, values, slopes, speeds, speed_slopes = jax.tree.map(
         select, new, (state.z, state.values, state.slopes, state.speeds, state.speed_slopes)
     )
-    length = jnp.where(good, jnp.minimum(1.0, 1.2 * state.length), 0.5 * state.length)
+    length = jnp.where(is_accepted, jnp.minimum(1.0, 1.2 * state.length), 0.5 * state.length)
 
     update = (state.steps % _STEPS_PER_UPDATE == _STEPS_PER_UPDATE - 1) & (rate > 0.0)
     excess = values[1 + m :]
@@ -128,7 +128,7 @@ def _step(problem: Problem, state: _SearchState, rate: Array) -> tuple[_SearchSt
     weight = jnp.where(slow, jnp.minimum(3.0 * state.weight, 1e4), state.weight)
     state = _SearchState(
         z, values, slopes, speeds, speed_slopes, adam, length, multipliers, weight,
-        jnp.where(update, worst, state.worst), state.size, state.steps + 1,
+        jnp.where(update, worst, state.worst), state.scale, state.steps + 1,
     )  # fmt: skip
     return state, values[0]
 
