@@ -67,6 +67,20 @@ def test_numbers_come_in_any_unit(given, unit, expected):
     np.testing.assert_allclose(value, expected, rtol=1e-14)
 
 
+@pytest.mark.parametrize(
+    ("given", "unit", "says"),
+    [
+        (1j, "", "which is not a number; write a plain number"),
+        (1j, "kg", "which is not a number; write a number in kg"),
+        ([1.0, 2.0], "", "field is a list of 2 values; one plain number is needed"),
+        (np.ones(2), "m", r"field has shape \(2,\); one number in m is needed"),
+    ],
+)
+def test_messages_name_the_unit_if_there_is_one(given, unit, says):
+    with pytest.raises(jv.InputError, match=says):
+        number(given, unit, "field")
+
+
 def test_a_number_goes_to_a_program_as_it_is_known():
     """A number that JAX does not hold is not moved to its device first, and has the precision that it would have there."""
     plain, given = known_number("2 ms", "s", "field"), jnp.asarray(2e-3)

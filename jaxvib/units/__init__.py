@@ -19,7 +19,7 @@ from jaxvib.boundary import is_whole
 from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.compat import traced
 from jaxvib.runtime.devices import numpy_of
-from jaxvib.units.reading import Number, Numbers, to_float, unit_name
+from jaxvib.units.reading import Number, Numbers, number_words, to_float
 
 
 class Bounds(NamedTuple):
@@ -126,7 +126,7 @@ def known_number(value: Number, unit: str, field: str, *, low: float = -math.inf
 
 def _number(value: Number, unit: str, field: str, bounds: Bounds) -> Array | np.ndarray:
     if isinstance(value, (list, tuple)):
-        raise InputError(field, f"is a list of {len(value)} values; one number in {unit_name(unit)} is needed")
+        raise InputError(field, f"is a list of {len(value)} values; one {number_words(unit)} is needed")
     return _converted(to_float(value, unit, field), unit, field, (), bounds)
 
 
@@ -158,7 +158,7 @@ def numbers(
             raise InputError(field, f"has {len(value)} values; {needed}")
         for i, part in enumerate(value):
             if isinstance(part, (list, tuple)) or getattr(part, "ndim", 0) != 0:
-                raise InputError(f"{field}[{i}]", f"is not a single number; write a number in {unit_name(unit)}")
+                raise InputError(f"{field}[{i}]", f"is not a single number; write a {number_words(unit)}")
         parts = [to_float(v, unit, f"{field}[{i}]") for i, v in enumerate(value)]
         if length is not None and len(parts) != length:
             raise InputError(field, f"has {len(parts)} values; {length} are needed")
@@ -199,9 +199,9 @@ def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], 
     except OverflowError as error:
         raise InputError(field, f"is {quoted(value)}, which is too large; give a number below 1e308") from error
     except (TypeError, ValueError) as error:
-        raise InputError(field, f"is {quoted(value)}, which is not a number; write a number in {unit_name(unit)}") from error
+        raise InputError(field, f"is {quoted(value)}, which is not a number; write a {number_words(unit)}") from error
     if array.shape != shape:
-        raise InputError(field, f"has shape {array.shape}; one number in {unit_name(unit)} is needed")
+        raise InputError(field, f"has shape {array.shape}; one {number_words(unit)} is needed")
     _check_bounds(array, field, unit, bounds, place="each" if shape else "")
     return array
 

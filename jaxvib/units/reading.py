@@ -105,9 +105,9 @@ _UNREADABLE = (AttributeError, TypeError, ValueError, ArithmeticError, Assertion
 """Errors, other than pint's own classes, that pint raises for a string that is not a unit; it parses the string as Python."""
 
 
-def unit_name(unit: str) -> str:
-    """Return the name of a unit for messages: "no unit" for a plain number."""
-    return unit or "no unit"
+def number_words(unit: str) -> str:
+    """Return the words of messages for a number in a unit: "number in kg", or "plain number" without a unit."""
+    return f"number in {unit}" if unit else "plain number"
 
 
 def _example(unit: str) -> str:
@@ -179,7 +179,7 @@ def require_real(value: object, unit: str, field: str) -> None:
     if np.ma.is_masked(value):
         raise InputError(field, "has masked values; fill them in or leave them out")
     if not is_real(value):
-        raise InputError(field, f"is {quoted(value)}, which is not a number; write a number in {unit_name(unit)}")
+        raise InputError(field, f"is {quoted(value)}, which is not a number; write a {number_words(unit)}")
 
 
 def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:

@@ -310,9 +310,8 @@ class Demand:
             limit if isinstance(limit, Quantity) else _constant(number_in(limit, quantity.unit, quantity.words), quantity.unit)
         )
         if not same_unit(other.unit, quantity.unit):
-            raise InputError(
-                quantity.words, f"is in {quantity.unit or 'no unit'} and compared with {other.words} in {other.unit}"
-            )
+            units = [f"in {each.unit}" if each.unit else "without a unit" for each in (quantity, other)]
+            raise InputError(quantity.words, f"is {units[0]} and compared with {other.words} {units[1]}")
         shown = limit.strip() if isinstance(limit, str) else other.words
         return cls(quantity, other, sense, shown)
 

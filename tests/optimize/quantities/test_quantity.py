@@ -95,7 +95,7 @@ def test_units_and_names_of_expressions():
 
 @pytest.mark.parametrize("wrong", [True, float("inf"), None, [1.0]])
 def test_operands_that_are_not_numbers_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"the value combined with a is .*(write a number in|finite number|one number)"):
+    with pytest.raises(ValueError, match=r"the value combined with a is .*(a plain number|finite number|one plain number)"):
         A + wrong
     with pytest.raises(ValueError, match=r"is 3\.0; it must be a Quantity"):
         largest(A, 3.0)
