@@ -63,3 +63,14 @@ def test_channel_with_wrong_times_is_noted(typed, tmp_path):
     (tmp_path / "bad.csv").write_text("time (s),frame (g)\n" + "".join(f"{k // 2},{k % 3}\n" for k in range(40)))
     code, out, _ = typed("record", "bad.csv", "--json")
     assert code == 0 and "has the time 0 s twice, at samples 1 and 2" in json.loads(out)["notes"][0]
+
+
+def test_velocity_of_a_vibration_is_printed(typed, tmp_path):
+    t = np.arange(0.0, 4.0, 1e-3)
+    rows = "".join(f"{x:.3f};{np.sin(2.0 * np.pi * 20.0 * x):.4f}\n" for x in t).replace(".", ",")
+    (tmp_path / "bearing.csv").write_text("Zeit [s];Lager [g]\n" + rows)
+    code, out, _ = typed("record", "bearing.csv")
+    (line,) = [line for line in out.splitlines() if "0.7071 g" in line]
+    frequency, velocity = (float(line.split()[k]) for k in (-4, -2))
+    assert code == 0 and frequency == 20.0
+    np.testing.assert_allclose(velocity, 1e3 * 9.80665 / (2.0 * np.pi * 20.0 * np.sqrt(2.0)), rtol=1e-3)

@@ -81,3 +81,18 @@ def test_unusable_channels_of_the_rotor(pulses, speed, says):
     with pytest.raises(jv.InputError) as error:
         speed_of(CHANNELS, pulses, speed, 1)
     assert str(error.value).startswith(says)
+
+
+def test_vibrations_have_their_frequency_and_velocity():
+    """Two sines, 2 g at 20 Hz and 1 g at 5 Hz, which is below the band: v = 2 g / (2 pi 20 Hz sqrt 2)."""
+    t = np.arange(0.0, 4.0, 1e-3)
+    wave = 2.0 * np.sin(2.0 * np.pi * 20.0 * t) + np.sin(2.0 * np.pi * 5.0 * t) + 0.3
+    found = overview_of(Recorded("frame", "g", t, wave))
+    np.testing.assert_allclose(found.main_frequency, 20.0, rtol=1e-3)
+    np.testing.assert_allclose(found.rms, np.sqrt(2.5), rtol=1e-3)
+    velocity = 2.0 * 9.80665 / (2.0 * np.pi * 20.0 * np.sqrt(2.0))
+    np.testing.assert_allclose(found.velocity, velocity, rtol=1e-3)
+    as_velocity = overview_of(Recorded("frame", "mm/s", t, 1e3 * velocity * np.sqrt(2.0) * np.cos(2.0 * np.pi * 20.0 * t)))
+    np.testing.assert_allclose(as_velocity.velocity, velocity, rtol=1e-3)
+    assert np.isnan(overview_of(Recorded("key", "V", t, (np.sin(30.0 * t) > 0.0) * 5.0)).main_frequency)
+    assert np.isnan(overview_of(Recorded("bed", "N", t, wave)).velocity)

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from jaxvib.cli.app import Output, app, shared, table
 
+if TYPE_CHECKING:
+    from jaxvib.exchange.recordings.overview import ChannelOverview
+
 _SHOWN_TIMES = 9
 """Number of times in the table of the rotor's speed."""
+
+_VIBRATIONS = frozenset({"acceleration", "velocity", "displacement", "force"})
+"""Kinds of channels in the table of vibrations."""
 
 
 @app.command("record")
@@ -21,7 +29,7 @@ _SHOWN_TIMES = 9
 @shared
 def record(recording: Path, pulses: str | None, per_turn: int, speed: str | None, rate: str | None, output: Output) -> None:
     """Describe a RECORDING (CSV, TDMS, UFF, MAT, WAV, MF4): its channels with their units, rates, gaps and clipped readings,
-    and the speed of the rotor over time. --out adds the figure."""
+    RMS and main frequency of vibrations, and the speed of the rotor over time. --out adds the figure."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.display import speed_text
@@ -69,8 +77,21 @@ def record(recording: Path, pulses: str | None, per_turn: int, speed: str | None
         ]
         heads = ["channel", "unit", "rate, Hz", "readings", "time, s", "values", "missing", "clipped"]
         lines = [table(str(recording), heads, rows)]
+        if vibrations := _vibration_rows(overviews):
+            heads = ["channel", "RMS without mean", "main frequency, Hz", "velocity from 10 to 1000 Hz, mm/s RMS"]
+            lines.append(table("vibration, if the speed is constant", heads, vibrations))
         if rows_of_speed:
             lines.append(table("rotor speed", ["time, s", "speed"], rows_of_speed))
         return "\n".join([*lines, *notes])
 
     output.done(document, text, "recording")
+
+
+def _vibration_rows(overviews: Sequence[ChannelOverview]) -> list[list[str]]:
+    """Return the rows of the table of vibrations."""
+    rows = []
+    for each in overviews:
+        if each.main_frequency > 0.0 and not _VIBRATIONS.isdisjoint(each.kinds):
+            velocity = "" if each.velocity != each.velocity else f"{1e3 * each.velocity:.4g}"
+            rows.append([each.name, f"{each.rms:.4g} {each.unit}", f"{each.main_frequency:.4g}", velocity])
+    return rows

@@ -18,6 +18,10 @@ _TWO_LEVELS = 0.9
 """Share of readings at the two ends of the range above which a channel counts as a signal with two levels."""
 
 
+_BAND = (10.0, 1000.0)
+"""Frequencies, Hz, that the velocity of a vibration includes by ISO 20816."""
+
+
 class ChannelOverview(NamedTuple):
     """Overview of a channel, in the unit of the file.
 
@@ -25,7 +29,10 @@ class ChannelOverview(NamedTuple):
 
     - `name`, `unit`; `kinds`: the kinds of channels (see `Channel`) that can have this unit
     - `rate`: sampling rate, Hz, NaN without times; `samples`: number of readings; `start` and `end`: first and last time, s
-    - `low` and `high`: smallest and largest reading
+    - `low` and `high`: smallest and largest reading; `rms`: root mean square of the readings without their mean
+    - `main_frequency`, Hz: frequency of the largest line of the spectrum; `velocity`, m/s: root mean square of the velocity
+      from 10 to 1000 Hz, the band of ISO 20816, of a channel of acceleration or velocity. They describe a run at a constant
+      speed, and are NaN for channels without times, with gaps, or with two levels
     - `missing` and `clipped`: numbers of readings
     - `notes`: sentences about gaps, repairs and problems
     """
@@ -39,6 +46,9 @@ class ChannelOverview(NamedTuple):
     end: float
     low: float
     high: float
+    rms: float
+    main_frequency: float
+    velocity: float
     missing: int
     clipped: int
     notes: tuple[str, ...]
@@ -59,7 +69,7 @@ def overview_of(recorded: Recorded) -> ChannelOverview:
     count, nan = recorded.values.size, float("nan")
     missing, clipped = count - finite.size, 0
     notes: list[str] = []
-    rate, start, end = nan, nan, nan
+    rate, start, end, main_frequency, velocity = nan, nan, nan, nan, nan
     if recorded.time is not None and recorded.time.size:
         start, end = float(recorded.time[0]), float(recorded.time[-1])
         try:
@@ -72,13 +82,52 @@ def overview_of(recorded: Recorded) -> ChannelOverview:
             if clipped > _TWO_LEVELS * count:
                 notes.append(f"{field} has two levels, like the pulses of a tachometer")
                 clipped = 0
-            elif clipped:
+            elif not missing:
+                main_frequency, velocity = _lines_of(value, rate, recorded.unit)
+            if clipped:
                 notes.append(f"{field} is clipped at {' and '.join(f'{x:.4g}' for x in (bottom, top) if np.isfinite(x))}")
         except InputError as error:
             notes = [str(error)]
+    rms = float(np.std(finite)) if finite.size else nan
     return ChannelOverview(
-        recorded.name, recorded.unit, kinds, rate, count, start, end, low, high, missing, clipped, tuple(notes)
+        name=recorded.name,
+        unit=recorded.unit,
+        kinds=kinds,
+        rate=rate,
+        samples=count,
+        start=start,
+        end=end,
+        low=low,
+        high=high,
+        rms=rms,
+        main_frequency=main_frequency,
+        velocity=velocity,
+        missing=missing,
+        clipped=clipped,
+        notes=tuple(notes),
     )
+
+
+def _lines_of(value: np.ndarray, rate: float, unit: str) -> tuple[float, float]:
+    """Return the frequency of the largest line of a signal, Hz, and the root mean square of its velocity, m/s, see
+    `ChannelOverview`; NaN for a constant signal, and for another unit."""
+    window = np.hanning(value.size)
+    power = np.abs(np.fft.rfft((value - np.mean(value)) * window)) ** 2
+    frequency = np.fft.rfftfreq(value.size, 1.0 / rate)
+    if not np.any(power > 0.0):
+        return np.nan, np.nan
+    largest = int(np.argmax(power))
+    near = slice(max(largest - 1, 0), largest + 2)  # a line between two frequencies of the transform is in both
+    main_frequency = float(np.sum(frequency[near] * power[near]) / np.sum(power[near]))
+    band = (frequency >= _BAND[0]) & (frequency <= _BAND[1])
+    acceleration, velocity = (unit_factor(unit, si) if unit else None for si in ("m/s^2", "m/s"))
+    if acceleration is not None:
+        factor = acceleration / (2.0 * np.pi * frequency[band])
+    elif velocity is not None:
+        factor = np.full(np.count_nonzero(band), velocity)
+    else:
+        return main_frequency, np.nan
+    return main_frequency, float(np.sqrt(2.0 * np.sum(factor**2 * power[band]) / (value.size * np.sum(window**2))))
 
 
 def speed_of(recorded: Sequence[Recorded], pulses: str | None, speed: str | None, per_turn: int) -> MeasuredRun | None:
