@@ -39,6 +39,10 @@ from jaxvib.runtime.structure import Skeleton
 from jaxvib.steady.outcome import REFUSED, without_numbers
 from jaxvib.units import Number
 
+_EQUAL_SPEEDS, _SPEED_GAP, _MAX_SHOWN_GROUPS = 0.01, 0.03, 6
+"""Largest difference of the mean speeds of the masses of a run that count as equal, and smallest gap between two groups of
+runs, both relative to the largest speed; largest number of groups in the summary."""
+
 _MAX_RELATIVE_ROTATION = 0.5
 """Largest `Ensemble.relative_rotation` of a run whose masses turn at one speed, rad. The value lies between that of a small
 swing about constant phases and that of a slow drift of the phases."""
@@ -81,6 +85,7 @@ class Ensemble(Result):
     - `relative_rotation` (B,), rad: largest difference between the angles through which two masses turn, each in its
       direction, in the last quarter of the run. A mass is a load, or the rotor of an exciter without loads. The difference is 0
       for a scene with one exciter
+    - `speed_group` (B,): groups of runs by the speed of their masses, from 1, ascending; 0 for runs with different speeds
     - `error` (B,): estimated error of the final state, as for a `Run`, with displacements relative to the largest displacement
       of the same run; typical: below 1e-6 with the default steps. NaN if no estimate was requested or the motion did not stay
       finite; infinite for 4 steps or fewer, because a run with larger steps does not exist
@@ -126,8 +131,39 @@ class Ensemble(Result):
         """Share of `synchronous` runs, with its confidence interval of 95 %."""
         return estimate_share(self.synchronous)
 
+    @property
+    def speed_group(self) -> np.ndarray:
+        """Numbers (B,) of groups of runs in which all masses turn at about one speed, from 1 in the order of the speeds.
+
+        Speeds of two groups differ by at least 3 % of the largest speed. Runs with loads that are caught at a resonance, that
+        turn with the rotor, or that swing (speed 0), are thus in different groups. The number is 0 if the masses of a run turn
+        at different speeds, or if its motion did not stay finite.
+        """
+        speeds = np.abs(np.asarray(self.load_speed))
+        largest = np.max(speeds[np.asarray(self.finite)], initial=0.0)
+        is_one = np.asarray(self.finite) & (np.ptp(speeds, axis=1) <= _EQUAL_SPEEDS * largest)
+        mean = np.mean(speeds, axis=1)
+        order = np.flatnonzero(is_one)[np.argsort(mean[is_one], kind="stable")]
+        groups = np.zeros(mean.shape, int)
+        groups[order] = 1 + np.cumsum(np.diff(mean[order], prepend=mean[order[:1]]) > _SPEED_GAP * largest)
+        return groups
+
+    def _group_lines(self) -> list[str]:
+        """Return a line of text for each of the first groups of `speed_group`, none if all runs are in one."""
+        groups, speeds = self.speed_group, np.mean(np.abs(np.asarray(self.load_speed)), axis=1)
+        if np.min(groups) == np.max(groups):
+            return []
+        lines = []
+        for k in range(1, int(np.max(groups)) + 1)[:_MAX_SHOWN_GROUPS]:
+            low, high = np.min(speeds[groups == k]), np.max(speeds[groups == k])
+            text = speed_text([low] if np.isclose(low, high, rtol=1e-4) else [low, high], 5, " .. ")
+            lines.append(f"  {np.count_nonzero(groups == k)} of {groups.size} runs: all masses turn at {text}")
+        others = np.count_nonzero((groups == 0) & np.asarray(self.finite))
+        return lines + [f"  {others} of {groups.size} runs: masses turn at different speeds"] * bool(others)
+
     def summary(self) -> str:
-        """Return the outcomes, the load speeds, the share of synchronous runs and the errors of the runs as text."""
+        """Return the outcomes, the load speeds, the groups of runs by speed, the share of synchronous runs and the errors as
+        text."""
         finite = np.asarray(self.finite)
         head = f"{self.message}; {int(self.steps)} steps each, {float(self.seconds):.3g} s in all"
         if not np.any(finite):
@@ -135,6 +171,7 @@ class Ensemble(Result):
         speeds, error = np.asarray(self.load_speed)[finite], np.asarray(self.error)[finite]
         worst = "error not estimated" if np.all(np.isnan(error)) else f"error of the end states up to {np.nanmax(error):.1e}"
         lines = [head, f"  loads turn at {speed_text([np.min(speeds), np.max(speeds)], 6, ' .. ')}; {worst}"]
+        lines += self._group_lines()
         if np.any(np.asarray(self.relative_rotation) > 0.0):
             lines.append(f"  all masses of a run turn at one speed: {self.synchronous_share.text}")
         return "\n".join(lines)

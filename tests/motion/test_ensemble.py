@@ -1,5 +1,6 @@
 """Ensembles: many runs in batches, their errors and their seconds."""
 
+import dataclasses
 import logging
 
 import equinox as eqx
@@ -11,6 +12,7 @@ from scenes import published, some_state
 
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error
+from jaxvib.motion.ensemble import Ensemble
 from jaxvib.motion.plan import _build_scenes
 from jaxvib.runtime import cache
 
@@ -258,3 +260,29 @@ def test_batches_have_the_given_size(monkeypatch, batch, together):
     with pytest.raises(InterruptedError):
         jv.ensemble(make, values(), 5.0, stepsize_controller=jv.EqualSteps(8), batch=batch)
     assert seen == [together]
+
+
+def test_runs_are_grouped_by_the_speed_of_their_masses():
+    speeds = np.array([[27.0, 26.9], [60.0, 60.0], [0.0, 0.1], [26.8, 27.2], [27.0, 60.0], [np.nan, np.nan], [-60.0, 60.0]])
+    finite, none = np.all(np.isfinite(speeds), axis=1), np.zeros(7)
+    flags = {"allowed": np.ones(7, bool), "finite": finite, "resolved": np.ones(7, bool), "detached": np.zeros((7, 2), bool)}
+    runs = Ensemble(
+        state=jv.State(np.zeros((7, 1)), np.zeros((7, 1))),
+        load_speed=speeds,
+        relative_rotation=none,
+        error=none,
+        steps=np.asarray(8),
+        seconds=np.asarray(1.0),
+        **flags,
+    )
+    assert runs.speed_group.tolist() == [2, 3, 1, 2, 0, 0, 3]
+    assert runs.summary().splitlines()[2:] == [
+        "  1 of 7 runs: all masses turn at 0.47746 rpm",
+        "  2 of 7 runs: all masses turn at 257.35 .. 257.83 rpm",
+        "  2 of 7 runs: all masses turn at 572.96 rpm",
+        "  1 of 7 runs: masses turn at different speeds",
+    ]
+    equal = dataclasses.replace(runs, load_speed=np.full((7, 2), 60.0), finite=np.ones(7, bool))
+    assert equal.speed_group.tolist() == [1] * 7 and "of 7 runs:" not in equal.summary()
+    lost = dataclasses.replace(runs, finite=np.zeros(7, bool))
+    assert lost.speed_group.tolist() == [0] * 7
