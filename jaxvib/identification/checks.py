@@ -9,8 +9,8 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxvib.identification.directions import Information, eliminate, elimination, polar_unbalances
-from jaxvib.identification.fit import Fitted, angle_shares, prior_equations, run_equations
+from jaxvib.identification.directions import Information, eliminate, elimination
+from jaxvib.identification.fit import Fitted, angle_shares, polar_unbalances, prior_equations, run_equations
 from jaxvib.identification.records.orders import foreign_vibration
 from jaxvib.identification.torque import MAX_MISFIT
 

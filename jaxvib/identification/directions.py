@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxvib.identification.fit import Fitted
+from jaxvib.identification.fit import Fitted, polar_unbalances
 from jaxvib.identification.problem import Problem
 
 UNDETERMINED = 1.0
@@ -171,18 +171,6 @@ def in_polar_unbalances(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndar
     """
     jacobian, sizes = polar_unbalances(fitted.problem, fitted.linear)
     return jacobian.T @ fitted.information @ jacobian, jacobian.T @ fitted.prior @ jacobian, sizes
-
-
-def polar_unbalances(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives (p + L, p + L) of all unknowns with respect to the polar unknowns, and the sizes (E,) of the
-    unbalances. The polar unknowns have (logarithm of the size, angle) instead of the components (a, b) of each unbalance."""
-    p, exciters = problem.unknowns.count, len(problem.unbalances)
-    jacobian, sizes = np.eye(p + linear.size), np.zeros(exciters)
-    for k in range(exciters):
-        a, b = linear[2 * k : 2 * k + 2]
-        sizes[k] = float(np.hypot(a, b))
-        jacobian[p + 2 * k : p + 2 * k + 2, p + 2 * k : p + 2 * k + 2] = [[a, -b], [b, a]]
-    return jacobian, sizes
 
 
 def eliminate(matrix: np.ndarray, kept: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ the error of a rotor's angle is not small compared with the noise, the angle is 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -240,6 +241,18 @@ def nonlinear_columns(problem: Problem, x: np.ndarray, linear: np.ndarray) -> li
     return of_runs
 
 
+def polar_unbalances(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives (p + L, p + L) of all unknowns with respect to the polar unknowns, and the sizes (E,) of the
+    unbalances. The polar unknowns have (logarithm of the size, angle) instead of the components (a, b) of each unbalance."""
+    p, exciters = problem.unknowns.count, len(problem.unbalances)
+    jacobian, sizes = np.eye(p + linear.size), np.zeros(exciters)
+    for k in range(exciters):
+        a, b = linear[2 * k : 2 * k + 2]
+        sizes[k] = float(np.hypot(a, b))
+        jacobian[p + 2 * k : p + 2 * k + 2, p + 2 * k : p + 2 * k + 2] = [[a, -b], [b, a]]
+    return jacobian, sizes
+
+
 def prior_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the information (p + L, p + L) and the gradient (p + L,) of the known values."""
     p, size = x.size, x.size + linear.size
@@ -281,28 +294,40 @@ def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.nd
 
 
 def _minimize_nonlinear(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
-    """Return the same as `minimize` for a nonlinear motion, in which no unknown is linear."""
+    """Return the same as `minimize` for a nonlinear motion, in which no unknown is linear.
+
+    The size and the angle of the unbalance are damped separately, because its size may be known.
+    """
     p, columns = x.size, np.zeros((0, 0))
+
+    def in_polar(trial: _Trial, data: np.ndarray, prior: np.ndarray, gradient: np.ndarray) -> Equations:
+        turn, _ = polar_unbalances(problem, trial.linear)
+        return turn.T @ data @ turn, turn.T @ prior @ turn, turn.T @ gradient
 
     def equations(trial: _Trial) -> Equations:
         nonlocal columns
         columns = np.concatenate(nonlinear_columns(problem, trial.x, trial.linear))
-        return _joined(problem, trial.x, trial.linear, columns.T @ columns)
+        return in_polar(trial, *_joined(problem, trial.x, trial.linear, columns.T @ columns))
+
+    def moved(trial: _Trial, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        linear, unbalance = trial.linear + step[p:], complex(*trial.linear[:2]) * np.exp(complex(*step[p : p + 2]))
+        linear[:2] = unbalance.real, unbalance.imag
+        return trial.x + step[:p], linear
 
     def stepped(trial: _Trial, step: np.ndarray) -> _Trial:
-        step = limited_step(problem, step)
-        return _nonlinear_trial(problem, trial.x + step[:p], trial.linear + step[p:])
+        return _nonlinear_trial(problem, *moved(trial, limited_step(problem, step)))
 
     def bend(trial: _Trial, step: np.ndarray) -> np.ndarray:
-        new, linear = trial.x + step[:p], trial.linear + step[p:]
-        slopes = columns[:, :-1]
-        return slopes.T @ (nonlinear_differences(problem, new, linear) - columns[:, -1] + slopes @ step)
+        turn, slopes = polar_unbalances(problem, trial.linear)[0], columns[:, :-1]
+        change = nonlinear_differences(problem, *moved(trial, step)) - columns[:, -1] + slopes @ (turn @ step)
+        return turn.T @ (slopes.T @ change)
 
     start = project(problem, x)
     count = p + start.linear.size
     with np.errstate(over="ignore", invalid="ignore"):  # a trial may diverge; its cost is then infinite
-        best, (information, prior, _), converged = descend(start, equations, stepped, count, positive_indices(problem), bend)
-    return best, information, prior, converged
+        best, found, converged = descend(start, equations, stepped, count, positive_indices(problem), bend)
+    back = np.linalg.inv(polar_unbalances(problem, best.linear)[0])
+    return best, back.T @ found[0] @ back, back.T @ found[1] @ back, converged
 
 
 def positive_indices(problem: Problem) -> np.ndarray:
@@ -350,7 +375,7 @@ def descend(
         while True:
             damped, size = matrix.copy(), np.diagonal(matrix)[indices]
             damped[indices, indices] += damping * (size + 1e-12 * np.max(size))
-            step = _damped_step(best, damped, gradient, bend)
+            step = _damped_step(best, damped, gradient, bend, positive)
             trial = best if step is None else stepped(best, step)
             if trial.cost < best.cost:
                 best, damping = trial, max(0.1 * damping, 1e-12)
@@ -362,15 +387,28 @@ def descend(
 
 
 def _damped_step(
-    best: Any, damped: np.ndarray, gradient: np.ndarray, bend: Callable[[Any, np.ndarray], np.ndarray] | None
+    best: Any,
+    damped: np.ndarray,
+    gradient: np.ndarray,
+    bend: Callable[[Any, np.ndarray], np.ndarray] | None,
+    positive: np.ndarray,
 ) -> np.ndarray | None:
-    """Return a damped step with its second-order correction; None if the correction is longer than three quarters of the step
-    (each unknown is measured in its own scale)."""
-    step = solved(damped, gradient)
+    """Return a damped step with its second-order correction; None if the correction is longer than three quarters of the step,
+    in multiples of the scale of each unknown.
+
+    The logarithm of a number near 0 hardly changes the model, and its step is long. Such a step is shortened, and the other
+    unknowns adapt to it. If all steps were shortened together, the descent would stop.
+    """
+    size, step, free = np.sqrt(np.diagonal(damped)), solved(damped, gradient), np.ones(len(gradient), bool)
+    while np.max(np.abs(step[positive]), initial=0.0) > 1.001 * _LONGEST_STEP:
+        k = positive[np.argmax(np.abs(step[positive]))]
+        shorter, free[k] = math.copysign(_LONGEST_STEP, step[k]), False
+        gradient = gradient - damped[k] * shorter
+        damped[k], damped[:, k], damped[k, k], gradient[k] = 0.0, 0.0, 1.0, shorter
+        step = solved(damped, gradient)
     if bend is None:
         return step
-    correction = solved(damped, bend(best, _PROBE * step)) / _PROBE**2
-    size = np.sqrt(np.diagonal(damped))
+    correction = solved(damped, free * bend(best, _PROBE * step)) / _PROBE**2
     is_short = np.linalg.norm(size * correction) < _LONGEST_CORRECTION * np.linalg.norm(size * step)
     return step + correction if is_short else None
 

@@ -11,8 +11,8 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto
 from jaxvib.identification.checks import CHANCE, Disagreement, disagreement, pseudoinverse, residual_chance
-from jaxvib.identification.directions import eliminate, elimination, polar_unbalances
-from jaxvib.identification.fit import differences_of, linear_at, minimize, run_equations
+from jaxvib.identification.directions import eliminate, elimination
+from jaxvib.identification.fit import differences_of, linear_at, minimize, polar_unbalances, run_equations
 from jaxvib.identification.further_runs.planned import own_precisions, problem_of_run, shared_indices
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.jammed.start import with_first_motion

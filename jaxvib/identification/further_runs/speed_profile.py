@@ -13,8 +13,8 @@ from jax import Array
 
 from jaxvib.display import speed_text
 from jaxvib.errors import InputError
-from jaxvib.identification.directions import elimination, in_polar_unbalances, polar_unbalances
-from jaxvib.identification.fit import linear_indices
+from jaxvib.identification.directions import elimination, in_polar_unbalances
+from jaxvib.identification.fit import linear_indices, polar_unbalances
 from jaxvib.identification.further_runs.planned import Expected, PlannedRun
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.response import Samples, Unknowns, normal_equations

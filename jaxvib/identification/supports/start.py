@@ -30,6 +30,9 @@ _DECAY = 0.999
 """Factor by which the filter reduces the state at each sample. Without it the filter does not exist for a free mass between
 stops, whose displacement no accelerometer observes."""
 
+_FIRST_ANGLES = 8
+"""Number of angles of the unbalance of which the best one begins the fit. Contacts change the phase of the vibration."""
+
 _OPEN_GAP = 1.1
 """First value of a gap that is not touched, relative to the largest displacement."""
 
@@ -42,22 +45,33 @@ def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     """Return the problem of a motion on nonlinear supports, in which the first values of the linear unknowns are set, and the
     first values of x.
 
-    The linear response to the whole records gives the unbalance, and that to their first stretches gives the first states. If a
-    fit of the linear machine explains the records as well as the fit that begins with the guided motion, no stop is touched.
+    The linear response to the first record gives the size of the unbalance, and the responses to the first stretches of all
+    records give the first states. If a fit of the linear machine explains the records as well as the fit that begins with the
+    guided motion, no stop is touched.
     """
     noise = [[Noise(np.ones(1), size) for size in of_run] for of_run in channel_sizes(problem)]
     weighted, x = with_noise(problem, noise), np.zeros(problem.unknowns.count)
-    alone = [project(weighted._replace(runs=(samples,)), x).linear for samples in weighted.runs]
-    for samples, linear in zip(weighted.runs, alone, strict=True):
-        if samples.turn is not None:
-            index = problem.unknowns.first.shape[0] + len(problem.unknowns.gains) + samples.turn
-            x[index] = math.atan2(linear[1], linear[0]) - math.atan2(alone[0][1], alone[0][0])
-    begins = tuple(_beginning(samples) for samples in weighted.runs)
-    linear = linear_at(weighted._replace(runs=begins), x, project(weighted, x).linear[:2])
+    linear = project(weighted._replace(runs=weighted.runs[:1]), x).linear
+    angles, begins = 2.0 * np.pi / _FIRST_ANGLES * np.arange(_FIRST_ANGLES), tuple(map(_beginning, weighted.runs))
+    unbalances = np.hypot(*linear[:2]) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    linear = linear_at(weighted._replace(runs=begins), x, unbalances[0])
     guides = [jnp.asarray(_guide(weighted, r, x, linear)) for r in range(len(problem.runs))]
     runs = tuple(dataclasses.replace(samples, guide=guide) for samples, guide in zip(weighted.runs, guides, strict=True))
-    guided = weighted._replace(runs=runs, linear=_with_first_states(weighted, x, linear))
-    trial, free = minimize(guided, x)[0], minimize(weighted, x)[0]
+
+    def begun(chosen: slice, unbalance: np.ndarray) -> Problem:
+        linear = linear_at(weighted._replace(runs=begins[chosen]), x, unbalance)
+        guided = weighted._replace(runs=runs[chosen])
+        return guided._replace(linear=_with_first_states(guided, x, linear))
+
+    costs = np.array([[project(begun(slice(r, r + 1), each), x).cost for each in unbalances] for r in range(len(runs))])
+    turns = [samples.turn for samples in runs]
+    best_index = int(np.argmin(np.sum(costs[[turn is None for turn in turns]], axis=0)))
+    for turn, cost in zip(turns, costs, strict=True):
+        if turn is not None:
+            index = problem.unknowns.first.shape[0] + len(problem.unknowns.gains) + turn
+            x[index] = angles[np.argmin(cost)] - angles[best_index]
+    first = begun(slice(None), unbalances[best_index])
+    trial, free = minimize(first, x)[0], minimize(weighted, x)[0]
     trial = minimize(weighted._replace(linear=trial.linear), trial.x)[0]
     of_free = weighted._replace(linear=_with_first_states(weighted, free.x, free.linear))
     free = project(of_free, _with_open_stops(weighted, free.x, free.linear))

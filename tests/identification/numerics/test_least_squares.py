@@ -317,6 +317,15 @@ def test_longest_step_is_a_factor_of_two():
     np.testing.assert_allclose(fit.limited_step(problem, np.array([0.2, -0.6, 9.0, 5.0])), [0.2, -0.6, 9.0, 5.0])
 
 
+def test_long_step_of_one_logarithm_does_not_shorten_the_others():
+    matrix, gradient = np.array([[1e-4, 1e-3, 0.0], [1e-3, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.array([-1.0, 0.3, 5.0])
+    step = fit._damped_step(None, matrix.copy(), gradient, None, np.array([0, 1]))
+    np.testing.assert_allclose(step, [-0.7, 0.3 + 0.7e-3, 5.0], rtol=1e-9)
+    bent = fit._damped_step(None, matrix.copy(), gradient, lambda _, step: 0.001 * step, np.array([0, 1]))
+    np.testing.assert_allclose(bent, [-0.7, 0.3007 * 1.01, 5.05], rtol=1e-9)
+    assert gradient.tolist() == [-1.0, 0.3, 5.0]
+
+
 def test_delayed_values_are_interpolated():
     values = np.sin(0.1 * np.arange(60.0))
     np.testing.assert_allclose(fit._delayed(values, 2.3)[10:], np.sin(0.1 * (np.arange(60.0) - 2.3))[10:], atol=1e-8)
