@@ -299,18 +299,11 @@ def has_supports(scene: Scene) -> bool:
     return has_term(scene.effects, SupportForce)
 
 
-def require_unbalances_only(scene: Scene, function: str) -> None:
-    """Raise for a scene with loads in a `function` that does not include them."""
-    if has_loads(scene):
-        raise InputError("fit.scene", f"has loads that move on the rotor; {function} needs exciters with an unbalance only")
-
-
-def require_linear_supports(scene: Scene, function: str) -> None:
-    """Raise for a scene with nonlinear supports in a `function` that does not include them."""
-    for effect in scene.effects:
-        if has_term([effect], SupportForce):
-            problem = f"is a nonlinear support, which {function} does not include; use a fit of a scene with linear supports"
-            raise InputError(f"fit.scene.effects.{effect.kind}", problem)
+def require_linear_motion(scene: Scene, function: str) -> None:
+    """Raise for a scene with loads or nonlinear supports in a `function` that does not include them."""
+    if is_nonlinear(scene):
+        what = "loads that move on the rotor" if has_loads(scene) else "nonlinear supports"
+        raise InputError("fit.scene", f"has {what}; {function} needs linear supports and exciters with an unbalance only")
 
 
 def _require_included(scene: Scene, runs: Sequence[MeasuredRun]) -> None:

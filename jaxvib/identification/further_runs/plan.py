@@ -13,7 +13,7 @@ from jaxvib.errors import InputError
 from jaxvib.identification.further_runs.planned import PlannedRun, expected_errors, expected_information, expected_run
 from jaxvib.identification.further_runs.speed_profile import optimized_profile, read_limits, require_within
 from jaxvib.identification.identify import MachineFit
-from jaxvib.identification.problem import require_unbalances_only
+from jaxvib.identification.problem import require_linear_motion
 from jaxvib.machine.drives.controlled import SpeedProfile
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -83,7 +83,7 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
     - The model of the fit gives the expected readings. `change` of a candidate describes an added mass; its `channels` describe
       new sensors and sensors at other places
     - A run with loads on the rotor begins with the state at the first sample of the first run of the fit, and the loads must
-      stay jammed
+      stay jammed. All other runs begin at rest
     - With `limits`, the speeds of the best candidate at 9 evenly spaced times are optimized for the smallest errors, with
       gradients, by sequential quadratic programming. If the result is better than all candidates, it is one more candidate, of
       the same duration
@@ -96,7 +96,8 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
       {"speed": "1500 rpm", "acceleration": "10 rad/s^2"}; default: no run with an optimized speed
 
     **Returns** `RunPlan`, the candidates in the order of their `benefit`. **Raises** `InputError` for a channel whose noise is
-    unknown, for a candidate beyond the limits or in which the loads do not stay jammed, and for limits of a fit with loads.
+    unknown, for a candidate beyond the limits or in which the loads do not stay jammed, and for limits of a fit with loads or
+    nonlinear supports.
 
     >>> import numpy as np, jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
@@ -116,7 +117,7 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
         raise InputError("candidates", "is empty; give at least one PlannedRun")
     checked_limits = None if limits is None else read_limits(limits)
     if limits is not None:
-        require_unbalances_only(fit.scene, "the optimization of the speed within `limits`")
+        require_linear_motion(fit.scene, "the optimization of the speed within `limits`")
     if checked_limits is not None:
         for each in candidates:
             require_within(each, checked_limits)

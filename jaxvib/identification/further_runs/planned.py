@@ -16,7 +16,7 @@ from jaxvib.identification.directions import covariance_of, eliminate, in_polar_
 from jaxvib.identification.fit import Fitted, information_at, unknown_count
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.jammed.start import is_jammed, with_jam
-from jaxvib.identification.problem import MOTIONS, Problem, build_problem, require_linear_supports, with_noise
+from jaxvib.identification.problem import MOTIONS, Problem, build_problem, has_supports, with_noise
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive
@@ -106,12 +106,11 @@ class Expected(NamedTuple):
 def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     """Return a planned run, evaluated with the numbers of a fit.
 
-    A run with loads on the rotor begins with the state at the first sample of the first run of the fit.
+    A run with loads on the rotor begins with the state at the first sample of the first run of the fit, all others at rest.
 
     **Raises** `InputError` for a channel whose noise is unknown, for a scene with several exciters, and for loads that do not
     stay jammed.
     """
-    require_linear_supports(fit.scene, "plan_runs")
     noises = _noises(fit) | {name: (Noise(np.ones(1), each), 1.0 / planned.rate) for name, each in planned.noise.items()}
     vibration_channels = [channel for channel in planned.channels if channel.kind in MOTIONS]
     kinds = dict(pair for run in zip(fit.channels, fit.kinds, strict=True) for pair in zip(*run, strict=True))
@@ -146,6 +145,8 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
                 f"candidates: {planned.name}: drive",
                 "has a speed at which the loads do not stay jammed below the speed of the rotor; give a faster drive",
             )
+    elif has_supports(scene):
+        problem = problem._replace(linear=linear)
     fitted = information_at(problem, linear)
     has_mark = any(channel.kind in ("pulses", "angle") for channel in planned.channels)
     return Expected(fitted, *shared_indices(fit, problem, has_mark))

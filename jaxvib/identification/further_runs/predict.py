@@ -16,9 +16,10 @@ from jaxvib.identification.fit import differences_of, linear_at, minimize, polar
 from jaxvib.identification.further_runs.planned import own_precisions, problem_of_run, shared_indices
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.jammed.start import with_first_motion
-from jaxvib.identification.problem import EXACT, Known, Problem, require_linear_supports, with_noise
+from jaxvib.identification.problem import EXACT, Known, Problem, has_supports, is_nonlinear, with_noise
 from jaxvib.identification.records.decimation import filter_readings
 from jaxvib.identification.run import MeasuredRun
+from jaxvib.identification.supports.start import with_guided_motion
 from jaxvib.numerics.noise import Noise, noise_of
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -28,7 +29,7 @@ _NOISE_RATIO = 1.5
 `patterned`."""
 
 _NUMBER_ERROR = 1e-6
-"""Relative standard error of the numbers of a scene with loads, so small that a fit of the first state does not change them."""
+"""Relative standard error of the numbers in a nonlinear motion, so small that a fit of the first state does not change them."""
 
 
 _MIN_FILTERED = 64
@@ -92,12 +93,12 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     """Return the prediction of a run that the fit did not use, and its comparison with the readings.
 
     - The numbers and the gains are those of the fit. The motion at the first sample and the offsets are fitted to the run. The
-      zero of the rotor's angle is also fitted, unless the fit and the run both have the mark of a tachometer and no loads move
-      on the rotor, or the scene has several exciters
+      zero of the rotor's angle is also fitted, unless the fit and the run both have the mark of a tachometer and the scene has
+      neither loads nor nonlinear supports, or the scene has several exciters
     - A likelihood-ratio test compares two hypotheses: the machine has the same numbers in the run as in the fit, or it has
       other numbers. The test accounts for the errors of the fit and the noise of the run. If the chance of the deviation is
       below 1e-5, the run contradicts the fit, and a note names the number whose change explains most of the deviation. In a run
-      with loads, no number is named if the residuals are more than 1.5 times the noise
+      with loads or nonlinear supports, no number is named if the residuals are more than 1.5 times the noise
 
     **Arguments**: `fit` from `identify`; `run`: a `MeasuredRun`, with its own `change` of numbers.
 
@@ -129,8 +130,8 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     status = PredictionStatus.patterned if notes else PredictionStatus.predicted
     if deviation.chance < CHANCE:
         status = PredictionStatus.contradicted
-        is_far = at.problem.has_loads and bool(np.any(ratio > _NOISE_RATIO))
-        # Far from the fit, the linearized motion of the loads does not tell which number has changed.
+        is_far = at.problem.linear is not None and bool(np.any(ratio > _NOISE_RATIO))
+        # Far from the fit, the linearized motion does not tell which number has changed.
         too_far = (
             f"the run deviates from the fit by more than its errors (chance {deviation.chance:.1g}), too much to name a number"
         )
@@ -188,26 +189,26 @@ class _Predicted(NamedTuple):
 
 
 def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
-    require_linear_supports(fit.scene, "predict_run")
     problem = problem_of_run(fit, fit.scene, run)
     unbalances = [1.0 if exciter.unbalance is None else exciter.unbalance for exciter in fit.scene.exciters]
     sizes = np.array([float(np.asarray(each, float)) for each in unbalances])
     problem = problem._replace(unbalances=tuple(Known(size, EXACT * size) for size in sizes))
-    has_mark = len(sizes) == 1 and problem.marked and bool(fit.information[-1, -1] > 0.0) and not problem.has_loads
+    has_mark = len(sizes) == 1 and problem.marked and bool(fit.information[-1, -1] > 0.0) and not is_nonlinear(fit.scene)
     pairs = np.stack([sizes * np.cos(fit.phase), sizes * np.sin(fit.phase)], axis=1).ravel()
     x, first = np.zeros(problem.unknowns.count), len(problem.unknowns.numbers)
     for k, name in enumerate(problem.unknowns.gains):
         if name in fit.gain_names:
             x[first + k] = math.log(fit.gains[fit.gain_names.index(name)].value)
     fixed, means, precisions = pairs if has_mark or len(sizes) > 1 else None, problem.means, problem.precisions
-    if problem.has_loads:  # the first state has a nonlinear effect and is searched for; the numbers are held by their priors
-        problem = with_first_motion(problem._replace(means=x, precisions=np.full(x.size, _NUMBER_ERROR**-2)))[0]
+    if is_nonlinear(fit.scene):  # the first state has a nonlinear effect; the numbers are held by their priors
+        held = problem._replace(means=x, precisions=np.full(x.size, _NUMBER_ERROR**-2))
+        problem = (with_guided_motion if has_supports(fit.scene) else with_first_motion)(held)[0]
 
     def with_filters(
         problem: Problem, noise: list[Noise], differences: list[np.ndarray] | None
     ) -> tuple[Problem, np.ndarray, np.ndarray]:
         filtered = with_noise(problem, [[each._replace(deviation=each.deviation or 1.0) for each in noise]], differences)
-        if filtered.has_loads:
+        if filtered.linear is not None:
             linear = minimize(filtered, x)[0].linear
             filtered = filtered._replace(linear=linear)
         else:

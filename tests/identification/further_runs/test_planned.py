@@ -205,7 +205,7 @@ def planned_as(monkeypatch, errors, better=None, limits=None):
     table = {name: np.diag(1.0 / np.asarray(each) ** 2) for name, each in errors.items()}
     if better is not None:
         table["optimized"] = np.diag(1.0 / np.asarray(better) ** 2)
-    names, scene = ("mass", "stiffness", "damping"), SimpleNamespace(exciters=())
+    names, scene = ("mass", "stiffness", "damping"), SimpleNamespace(exciters=(), effects=())
     fit = SimpleNamespace(names=names, information=np.diag([25.0, 0.0, 100.0]), scene=scene)
     speed = jv.SpeedProfile([0.0, 1.0], [7.0, 8.0])
     monkeypatch.setattr(

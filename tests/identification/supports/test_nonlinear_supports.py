@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from repeated_records.fits import NAMES, SUPPORT_CASES, repeated
 from repeated_records.supports import STOP, TIMES, motion, scene_of, support_record, truth
-from run_ups_by_scipy import Ramp
+from run_ups_by_scipy import Ramp, ramp
 
 import jaxvib as jv
 from jaxvib.equations.dynamics import dynamics_of
@@ -182,18 +182,70 @@ def first_scene(factors):
     return scene_of({name: value * next((f for word, f in factors.items() if word in name), 1.0) for name, value in numbers})
 
 
+@functools.cache
+def fitted():
+    return jv.identify(first_scene(FACTORS), short_record("stop", LOW_NOISE), unknown=UNKNOWN)
+
+
 def test_numbers_of_a_stop_and_the_machine_are_found():
-    run = short_record("stop", LOW_NOISE)
-    fit = jv.identify(first_scene(FACTORS), run, unknown=UNKNOWN)
+    fit = fitted()
     assert fit.status_name == "found"
     away = [(each.value - truth("stop")[name]) / each.error for name, each in zip(fit.names, fit.estimates, strict=True)]
     assert np.max(np.abs(away)) < 3.5
     assert fit.estimate("effects.stop[0].gap").error < 2e-5
-    planned = jv.PlannedRun("again", jv.ConstantSpeed(30.0), 4.0, run.channels, rate=62.5)
-    with pytest.raises(jv.InputError, match=r"effects.stop is a nonlinear support, which plan_runs does not include"):
-        jv.plan_runs(fit, [planned])
-    with pytest.raises(jv.InputError, match=r"effects.stop is a nonlinear support, which predict_run does not include"):
-        jv.predict_run(fit, run)
+
+
+def slower(t):
+    return tuple(0.8 * each for each in ramp(t))
+
+
+class Slower(Ramp):
+    """`slower` as a prescribed drive."""
+
+    def angle_at(self, t):
+        return slower(t)[0]
+
+    def speed_at(self, t):
+        return slower(t)[1]
+
+    def acceleration_at(self, t):
+        return slower(t)[2]
+
+
+def slower_record(seed, **changes):
+    clean = motion(truth("stop") | changes, times=SHORT, turning=slower)
+    return support_record("stop", LOW_NOISE, np.random.default_rng(seed), times=SHORT, clean=clean, turning=slower)
+
+
+def planned(name, drive):
+    channels = [jv.Channel(name, "acceleration", at=k + 1, gain_error=0.0) for k, name in enumerate(("a1", "a2"))]
+    return jv.PlannedRun(name, drive(jnp.asarray(100.0)), SHORT[-1] + SHORT[1], channels, rate=62.5)
+
+
+def test_plan_repeats_a_run_on_a_stop():
+    """The candidate has the speed of the record: the error of each number is divided by sqrt(2)."""
+    plan = jv.plan_runs(fitted(), [planned("again", Ramp)])
+    np.testing.assert_allclose(plan.errors[0] / plan.now, np.sqrt(0.5), rtol=0.05)
+    with pytest.raises(jv.InputError, match=r"fit\.scene has nonlinear supports; the optimization of the speed"):
+        jv.plan_runs(fitted(), [planned("again", Ramp)], limits={"speed": 130.0, "acceleration": 15.0})
+
+
+@pytest.mark.slow
+def test_expected_errors_on_a_stop_are_those_of_a_later_fit():
+    plan = jv.plan_runs(fitted(), [planned("slower", Slower)])
+    both = jv.identify(first_scene(FACTORS), [short_record("stop", LOW_NOISE), slower_record(1)], unknown=UNKNOWN)
+    assert both.status_name == "found", both.notes
+    np.testing.assert_allclose(plan.errors[0], [each.error / each.value for each in both.estimates], rtol=0.1)
+
+
+@pytest.mark.slow
+def test_further_run_on_a_stop_is_predicted():
+    """The angle of the unbalance of the linear response differs from the true one by 1.6 rad."""
+    found = jv.predict_run(fitted(), slower_record(1))
+    assert found.status_name == "predicted" and found.chance > 1e-3, found.notes
+    np.testing.assert_allclose(found.ratio, 1.0, atol=0.15)
+    other = jv.predict_run(fitted(), slower_record(2, **{"effects.stop[0].gap": 1.02e-3}))
+    assert other.status_name == "contradicted" and other.notes[-1].endswith("too much to name a number")
 
 
 def test_stop_that_no_run_touches_is_not_determined():
