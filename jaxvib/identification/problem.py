@@ -447,8 +447,14 @@ def _samples(
                 f"{run.source}: channel {channel.name!r}",
                 f"is not sampled on the even grid of the others ({1.0 / step:.6g} Hz); resample it to this grid",
             )
-        used = np.isfinite(values) & (index >= 0) & (index < count)
+        earliest = max(math.ceil(channel.delay / step - _MAX_UNEVENNESS), 0)  # the motion before the first sample is unknown
+        used = np.isfinite(values) & (index >= earliest) & (index < count)
         raw[index[used], k], mask[index[used], k] = values[used], ~clipped[used]
+        if not np.any(mask[:, k]):
+            problem = (
+                "has no reading that is not clipped while the motion is known; correct `range` or `delay`, or leave it out"
+            )
+            raise InputError(f"{run.source}: channel {channel.name!r}", problem)
         bounded_by = index[used & clipped]
         bounds[bounded_by, k] = np.sign(raw[bounded_by, k] - np.median(values[used] if np.any(used) else 0.0))
     numbers, actions, amounts = _changes(scene, run)

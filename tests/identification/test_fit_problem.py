@@ -204,6 +204,15 @@ def test_unknowns_with_their_known_values():
     np.testing.assert_allclose(found.runs[1].scene(found.scene).machine.link_stiffness, [9e4])
 
 
+def test_readings_of_the_motion_before_the_record_do_not_count():
+    run = run_with({"a": np.sin(T), "b": np.sin(T)}, channels=[channel("a", delay=0.0695), channel("b")])
+    (mask,) = build_problem(scene_of(), [run], ["machine.stiffness"], {}).masks
+    assert np.flatnonzero(~mask[:, 0]).tolist() == [*range(7)] and np.all(mask[:, 1])
+    run = run_with({"a": np.sin(T), "b": np.sin(T)}, channels=[channel("a"), channel("b", delay=4.1)])
+    with pytest.raises(jv.InputError, match=r"channel 'b' has no reading that is not clipped while the motion is known"):
+        build_problem(scene_of(), [run], ["machine.stiffness"], {})
+
+
 def test_silent_channels_and_long_delays_are_refused():
     run = run_with({"a": np.sin(T)}, channels=[channel("a", direction="across")])
     with pytest.raises(jv.InputError, match=r"channel 'a': direction is \(1.0, 0.0\), but the machine moves vertically only"):
