@@ -159,7 +159,7 @@ def _noises(fit: MachineFit) -> dict[str, tuple[Noise, float]]:
         step, residuals = float(fit.time[r][1] - fit.time[r][0]), (fit.readings[r] - fit.fitted[r]).T
         for name, deviation, each in zip(fit.channels[r], fit.noise[r], residuals, strict=True):
             noise = noise_of(each)
-            noises[name] = (noise if len(noise.taps) > 1 else Noise(noise.taps, float(deviation)), step)
+            noises[name] = (noise if len(noise.taps) > 1 or noise.outliers else Noise(noise.taps, float(deviation)), step)
     return noises
 
 

@@ -97,6 +97,16 @@ def test_coloured_noise_keeps_its_density_at_other_rates(rate):
         assert found == pytest.approx(density(taps, 0.01, 1e-3), rel=0.15)
 
 
+def test_outliers_of_the_fit_are_no_noise_of_a_plan():
+    left = 1e-3 * np.random.default_rng(0).normal(size=20000)
+    left[::50] *= 20.0
+    parts = {"time": (0.01 * np.arange(20000),), "readings": (left[:, None],), "fitted": (np.zeros((20000, 1)),)}
+    parts |= {"channels": (("frame",),), "kinds": (("velocity",),), "noise": ([np.std(left)],)}
+    other = SimpleNamespace(**vars(fit()) | parts)
+    samples = expected_run(other, ramp()).fitted.problem.runs[0]
+    np.testing.assert_allclose(samples.weights[0, :, 0], 1.0 / 1e-3, rtol=0.05)
+
+
 def test_information_of_a_run_is_in_the_units_of_the_fit():
     """If the scale of the damping is halved, a relative change of 1 changes the readings half as much."""
     other = SimpleNamespace(**vars(fit()) | {"scale": np.array([4e4, 0.05, 150.0])})
