@@ -17,6 +17,7 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.angle import RotorAngle, rotor_angles
 from jaxvib.identification.records.agreement import ROTOR_KINDS
+from jaxvib.identification.records.channel import Channel
 from jaxvib.identification.records.decimation import MIN_SAMPLES, decimated
 from jaxvib.identification.response import BLOCK, STRETCH, Samples, Unknowns, rows_of_channel, state_count
 from jaxvib.identification.run import MeasuredRun
@@ -436,27 +437,7 @@ def _samples(
     stretch = min(STRETCH, max(BLOCK, 2 ** math.ceil(math.log2(count))))
     stretches = -(-count // stretch)
     time = origin + step * (first + np.arange(count))
-    raw, mask = np.zeros((count, len(channels))), np.zeros((count, len(channels)), bool)
-    bounds = np.zeros((count, len(channels)), np.int8)
-    for k, channel in enumerate(channels):
-        values, clipped = run.values[channel.name], run.clipped[channel.name]
-        position = (run.times[channel.name] - origin) / step - first
-        index = np.rint(position).astype(int)
-        if np.max(np.abs(position - index)) > _MAX_UNEVENNESS:
-            raise InputError(
-                f"{run.source}: channel {channel.name!r}",
-                f"is not sampled on the even grid of the others ({1.0 / step:.6g} Hz); resample it to this grid",
-            )
-        earliest = max(math.ceil(channel.delay / step - _MAX_UNEVENNESS), 0)  # the motion before the first sample is unknown
-        used = np.isfinite(values) & (index >= earliest) & (index < count)
-        raw[index[used], k], mask[index[used], k] = values[used], ~clipped[used]
-        if not np.any(mask[:, k]):
-            problem = (
-                "has no reading that is not clipped while the motion is known; correct `range` or `delay`, or leave it out"
-            )
-            raise InputError(f"{run.source}: channel {channel.name!r}", problem)
-        bounded_by = index[used & clipped]
-        bounds[bounded_by, k] = np.sign(raw[bounded_by, k] - np.median(values[used] if np.any(used) else 0.0))
+    raw, mask, bounds = _on_grid(run, channels, time)
     numbers, actions, amounts = _changes(scene, run)
     samples = Samples(
         drives=tuple(angle.without_errors() for angle in angles),
@@ -475,6 +456,31 @@ def _samples(
         guide=jnp.zeros((state_count(scene, channels), len(channels))) if has_supports(scene) else None,
     )
     return samples, mask, raw, bounds, time, np.stack([angle.at(time) for angle in angles], axis=1)
+
+
+def _on_grid(run: MeasuredRun, channels: Sequence[Channel], time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the readings (n, C) of channels at even times (n,), the mask of those that count, and their bounds."""
+    count, step = time.size, (time[-1] - time[0]) / (time.size - 1)
+    raw, mask = np.zeros((count, len(channels))), np.zeros((count, len(channels)), bool)
+    bounds = np.zeros((count, len(channels)), np.int8)
+    for k, channel in enumerate(channels):
+        values, clipped = run.values[channel.name], run.clipped[channel.name]
+        position = (run.times[channel.name] - time[0]) / step
+        index = np.rint(position).astype(int)
+        if np.max(np.abs(position - index)) > _MAX_UNEVENNESS:
+            raise InputError(
+                f"{run.source}: channel {channel.name!r}",
+                f"is not sampled on the even grid of the others ({1.0 / step:.6g} Hz); resample it to this grid",
+            )
+        earliest = max(math.ceil(channel.delay / step - _MAX_UNEVENNESS), 0)  # the motion before the first sample is unknown
+        used = np.isfinite(values) & (index >= earliest) & (index < count)
+        raw[index[used], k], mask[index[used], k] = values[used], ~clipped[used]
+        if not np.any(mask[:, k]):
+            problem = "has no reading that is not clipped while the motion is known; correct range or delay, or leave it out"
+            raise InputError(f"{run.source}: channel {channel.name!r}", problem)
+        bounded_by = index[used & clipped]
+        bounds[bounded_by, k] = np.sign(raw[bounded_by, k] - np.median(values[used]))
+    return raw, mask, bounds
 
 
 def _stretches(scene: Scene, count: int, step: float) -> tuple[int, int, int]:
