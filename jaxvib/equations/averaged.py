@@ -77,6 +77,10 @@ LATE = 1e30
 """Time after all changes of the drives, s, at which steady motions are computed. It is finite, because derivatives of products
 with an infinite time are NaN also where they are not selected."""
 
+_MIN_DAMPING = 1e-9
+"""Decay rate, relative to the speed, below which a motion is not called stable: smaller computed rates can be rounding
+errors."""
+
 _CIRCLE = (1.0, -1.0j)
 
 
@@ -497,6 +501,14 @@ def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: A
     y = jnp.concatenate([displacement, 1j * omega * displacement])
     matrix = jax.jacfwd(flow)(jnp.concatenate([y.real, y.imag, jnp.full_like(phase[free], omega), phase]))
     return largest_growth(matrix, neutral)
+
+
+def decays(growth: Array, omega: Array) -> Array:
+    """Return True if disturbances with a growth rate, 1/s, of a motion at the speed `omega`, rad/s, decay.
+
+    The rate must be more negative than a limit, because small computed rates can be rounding errors.
+    """
+    return growth < -max(_MIN_DAMPING, 100.0 * float(jnp.finfo(growth.dtype).eps)) * omega
 
 
 def largest_growth(matrix: Array, neutral: Array | int) -> Array:

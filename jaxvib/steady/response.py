@@ -14,7 +14,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit, quantity_text, speed_text
-from jaxvib.equations.averaged import AVERAGED_TERMS, require_rotating_masses
+from jaxvib.equations.averaged import AVERAGED_TERMS, decays, require_rotating_masses
 from jaxvib.equations.linear import peak_force
 from jaxvib.equations.torque_balance import UnbalancedModel, common_speeds, common_torques, unbalanced_model
 from jaxvib.errors import InputError
@@ -30,7 +30,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Pieces, branch_pieces, branch_root, grid_near_poles, resampled_grid, scanned_speed
 from jaxvib.steady.measures import Vibration, acceleration_of, rms_velocity_of
 from jaxvib.steady.outcome import REFUSED, outcome
-from jaxvib.steady.regimes.local import decays, regime_growth
+from jaxvib.steady.regimes.local import regime_growth
 from jaxvib.steady.regimes.synchronous import require_one_speed
 from jaxvib.units import Number, Numbers, count, number, numbers
 from jaxvib.units.known import when_known

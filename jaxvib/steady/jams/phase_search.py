@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text
-from jaxvib.equations.averaged import averaged_growth
+from jaxvib.equations.averaged import averaged_growth, decays
 from jaxvib.equations.torque_balance import TorqueBalance, assemble_for_search, assemble_torque_balance, response_of
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
@@ -276,7 +276,7 @@ def _follow_pattern(scene: Scene, phase: Array, omega: Array, restart: Array) ->
         braked = eqx.tree_at(lambda field: field.drag, balance.averaged, factor * balance.drag)
         growth = averaged_growth(braked, w, angles, w**2 * response_of(balance, w) @ (balance.unbalance * jnp.exp(1j * angles)))
         factor, growth = (jnp.where(good, value, jnp.nan) for value in (factor, growth))
-        return jnp.where(good, angles, start), (factor, jnp.where(good, angles, jnp.nan), growth, good & (growth < 0.0))
+        return jnp.where(good, angles, start), (factor, jnp.where(good, angles, jnp.nan), growth, good & decays(growth, w))
 
     return jax.lax.scan(step, phase, (omega, restart))[1]
 

@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, speed_text
-from jaxvib.equations.averaged import averaged_growth
+from jaxvib.equations.averaged import averaged_growth, decays
 from jaxvib.equations.linear import JAM_TERMS, peak_force, require_drag, turning_loads
 from jaxvib.equations.torque_balance import (
     TorqueBalance,
@@ -70,7 +70,7 @@ class AbstractPhaseJam(Result):
     - `omega` and `rotor_speed`, rad/s
     - `phase` (count,), rad; 0 for the first load
     - `pattern`: a `PhasePattern`
-    - `growth`: growth rate of the fastest growing small disturbance, 1/s, and `stable`: True if it is negative
+    - `growth`: growth rate of the fastest growing small disturbance, 1/s, and `stable`: True if it is negative beyond rounding
     - `displacement` (nd,): complex amplitudes of q = Re(displacement exp(i Omega t)), m (rad for tilts)
     - `amplitude` (nd,), m (rad for tilts), zero to peak
     - `foundation_force`, N, zero to peak; for two directions the root of the sum of the squares of their peaks, which is sqrt
@@ -212,7 +212,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
         phase=or_nan(angles),
         pattern=phase_pattern(angles),
         growth=or_nan(growth),
-        stable=there & (growth < 0.0),
+        stable=there & decays(growth, w),
         displacement=or_nan(z),
         amplitude=or_nan(magnitude(z)),
         foundation_force=or_nan(peak_force(force)),

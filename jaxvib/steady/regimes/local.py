@@ -28,10 +28,6 @@ _LARGEST_FACTOR = 1e6
 _LONGEST_STEP = 0.3
 """Largest change of a phase in a step of the search for a fold, rad."""
 
-_MIN_DAMPING = 1e-9
-"""Decay rate, relative to the speed, below which a motion is not called stable: smaller computed rates can be rounding
-errors."""
-
 
 class Slopes(NamedTuple):
     """Singular value decomposition of the Jacobian of the balance, whose rows and columns are multiplied by factors.
@@ -92,14 +88,6 @@ def regime_growth(balance: TorqueBalance, omega: Array, phase: Array, neutral: A
     """Return the growth rate of small disturbances of a regime according to the averaged equations, 1/s."""
     vibration = omega**2 * response_of(balance, omega) @ (balance.unbalance * jnp.exp(1j * phase))
     return averaged_growth(balance.averaged, omega, phase, vibration, balance.averaged.free_shifts + neutral)
-
-
-def decays(growth: Array, omega: Array) -> Array:
-    """Return True if disturbances with a growth rate, 1/s, of a motion at the speed `omega`, rad/s, decay.
-
-    The rate must be more negative than a limit, because small computed rates can be rounding errors.
-    """
-    return growth < -max(_MIN_DAMPING, 100.0 * float(jnp.finfo(growth.dtype).eps)) * omega
 
 
 def quasi_static_growth(balance: TorqueBalance, omega: Array, phase: Array, neutral: Array | int) -> Array:

@@ -13,7 +13,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, Onto, speed_text
-from jaxvib.equations.averaged import require_rotating_masses
+from jaxvib.equations.averaged import decays, require_rotating_masses
 from jaxvib.equations.linear import linear_model, natural_frequencies, peak_force
 from jaxvib.equations.torque_balance import (
     TorqueBalance,
@@ -48,7 +48,6 @@ from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.steady.regimes.local import (
     Slopes,
-    decays,
     implicit_step,
     margin_of,
     quasi_static_growth,

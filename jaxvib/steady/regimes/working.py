@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.averaged import require_rotating_masses
+from jaxvib.equations.averaged import decays, require_rotating_masses
 from jaxvib.equations.torque_balance import (
     TorqueBalance,
     assemble_torque_balance,
@@ -23,7 +23,7 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.outcome import outcome, without_numbers
-from jaxvib.steady.regimes.local import Slopes, decays, regime_growth, slopes_of
+from jaxvib.steady.regimes.local import Slopes, regime_growth, slopes_of
 from jaxvib.steady.regimes.search import is_balanced, relaxed, sets_of_phases
 from jaxvib.steady.regimes.synchronous import RegimeStatus, SynchronousRegime, fields_at, require_one_speed
 

@@ -313,3 +313,14 @@ def test_every_jam_is_listed_once_and_in_order():
     omega = np.asarray(jams.omega)
     assert omega.size == 6 and np.all(np.diff(omega) < 0.0) and np.min(-np.diff(omega)) > 0.5
     assert jams.stable.tolist() == [False] * 5 + [True] and int(jnp.sum(jams.starts)) > 100
+
+
+@pytest.mark.parametrize("stiffness", [1e5, 3e5])
+def test_an_undamped_motion_apart_from_the_loads_is_not_stable(stiffness):
+    """Its growth is 0 up to rounding of either sign."""
+    damping, springs = np.diag([843.0, 843.0, 0.0]), np.diag([1.16e6, 1.16e6, stiffness])
+    machine = jv.from_matrices(37.0 * np.eye(3), damping, springs, places=[[0, 1]])
+    loads = jv.pendulums(count=1, mass=0.05, radius=0.08, drag=0.04)
+    scene = jv.Scene(machine, exciters=[jv.Exciter(loads, jv.ConstantSpeed(460.0), at=1)])
+    jam = jv.phase_jams(scene, near=(165.0, np.zeros(1)))
+    assert abs(float(jam.growth)) < 1e-9 and not jam.stable
