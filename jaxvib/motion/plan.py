@@ -26,7 +26,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns, validate_scene
 from jaxvib.motion.integrate import MIN_SAMPLES_PER_TURN, IntegrationPlan, StepControl, frequency_bounds
 from jaxvib.motion.start import Start, initial_state, require_start, start_state, with_spin, with_spin_up_drive
-from jaxvib.motion.stiffness import equal_step_length, fastest_decay, stiff_solver
+from jaxvib.motion.stiffness import equal_step_length, fastest_decay, fastest_motion, stiff_solver
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.runtime.devices import known as numpy_of_known
 from jaxvib.runtime.programs import cached
@@ -438,7 +438,7 @@ def _start_speed(states: State) -> np.ndarray:
 @cached
 def _rates(scenes: Scene) -> tuple[Array, Array]:
     """Return the fastest rates of the motion, rad/s, and of the decay, 1/s, of each scene."""
-    return jax.vmap(lambda scene: (frequency_bounds(scene)[0], fastest_decay(scene)))(scenes)
+    return jax.vmap(lambda scene: (fastest_motion(scene), fastest_decay(scene)))(scenes)
 
 
 def with_settled_drives(scene: Scene, start: Start | State | None, problem: str) -> Scene:

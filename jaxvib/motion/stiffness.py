@@ -12,6 +12,8 @@ from jax import Array
 from jaxvib.equations.linear import linear_model
 from jaxvib.equations.sliding import kinematics
 from jaxvib.equations.state import State
+from jaxvib.machine.effects.base import terms_of
+from jaxvib.machine.effects.terms import SupportForce
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import frequency_bounds
@@ -72,6 +74,25 @@ def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rod
     """Return the implicit method if the decay of a scene is too fast for explicit steps, otherwise None."""
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(state))
     return Rodas4() if size <= _MAX_IMPLICIT_SIZE and float(fastest_decay(scene)) > _STIFF_RATE_RATIO * float(fastest) else None
+
+
+def fastest_motion(scene: Scene, per_contact: float = 1.0) -> Array:
+    """Return the fastest rate that equal steps must resolve, rad/s: that of `frequency_bounds`, or that of a machine on a stop.
+
+        w^2 = fastest^2 + k max(P M^-1 P^T)
+
+    k is the stiffness of the stop and P maps q to its displacements. The rate on a stop is multiplied by `per_contact`.
+    """
+    scene = jax.lax.stop_gradient(scene)
+    fastest = frequency_bounds(scene)[0]
+    if not (stiffnesses := [term.stiffness for term in terms_of(scene.effects, SupportForce)]):
+        return fastest
+    linear, rates = linear_model(scene), [fastest]
+    for stiffness, rows in zip(stiffnesses, linear.supports, strict=True):
+        if stiffness is not None:
+            accelerance = jnp.max(jnp.diagonal(rows @ jnp.linalg.solve(linear.mass, rows.T)))
+            rates.append(per_contact * jnp.sqrt(fastest**2 + stiffness * accelerance))
+    return functools.reduce(jnp.maximum, rates)
 
 
 def equal_step_length(fastest: float, decay: float, per_radian: float, step: float | None = None) -> tuple[float, bool]:

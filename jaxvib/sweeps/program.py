@@ -16,7 +16,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.batch import PARTS_OF_RUN, BatchPlan, run_in_batch
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state
-from jaxvib.motion.stiffness import equal_step_length, fastest_decay
+from jaxvib.motion.stiffness import equal_step_length, fastest_decay, fastest_motion
 from jaxvib.runtime.operations import program_digest
 from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Axis, Target, extreme_cases, put, put_start
@@ -35,6 +35,10 @@ _SLOW_PERIODS = 20
 
 _CASES_PER_BLOCK = 64
 """Number of cases whose rates are computed together in the search for the fastest and the slowest case."""
+
+_STEPS_PER_RADIAN_OF_CONTACT = 4.0
+"""Number of steps for each radian of the vibration on a stop: about 12 in a contact. Other motions have one, because they are
+smooth."""
 
 _MAX_STEPS = 1e9
 """Maximum number of steps of a run, about an hour of computation."""
@@ -111,7 +115,7 @@ def _rates(scene: Scene, values: Array, targets: tuple[Target, ...]) -> Array:
 
     def rates_of_case(value: Array) -> Array:
         varied = put(scene, targets, value)
-        fastest, slowest = frequency_bounds(varied)
+        fastest, slowest = fastest_motion(varied, _STEPS_PER_RADIAN_OF_CONTACT), frequency_bounds(varied)[1]
         total = jnp.sum(estimated_frequencies(varied) ** 2)
         return jnp.stack([fastest, -slowest, fastest_decay(varied), varied.top_speed, total])
 

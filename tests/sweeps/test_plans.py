@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.motion.batch import PARTS_OF_RUN
 from jaxvib.sweeps.axes import Axis, Target, extreme_cases
 from jaxvib.sweeps.study import study
 
@@ -91,3 +92,13 @@ def test_a_plan_does_not_depend_on_further_single_values():
     many = {**few, **{name: value for name, value in SINGLE.items() if name != "drive.speed"}}
     plans = [study(SCENE, axes, ["run.load_speed"], until=2.0).plan for axes in (few, many)]
     assert plans[0] == plans[1]
+
+
+def test_the_stiffest_stop_sets_the_steps():
+    exciter = jv.Exciter(drive=jv.ConstantSpeed("60 rad/s"), unbalance=0.08)
+    scene = jv.Scene(SCENE.machine, exciters=[exciter], effects=[jv.Stop(1e6, gap=2e-3)])
+    plan = study(scene, {"effects.stop[0].stiffness": [1e5, 1e7]}, ["run.amplitude"], until=2.0).plan
+    fastest = float(jnp.maximum(60.0, jv.natural_frequencies(scene)[0]))
+    rate = 4.0 * np.sqrt(fastest**2 + 1e7 / float(SCENE.machine.mass[0]))
+    part = (2.0 - plan.window) / PARTS_OF_RUN
+    assert plan.each == np.ceil(part * rate) and plan.each > 10 * part * fastest

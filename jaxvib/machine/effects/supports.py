@@ -164,7 +164,7 @@ class Stop(_Support):
 
     def terms(self) -> tuple[Term, ...]:
         """Return the force of spring and damper."""
-        return (SupportForce(self.rows, self.energy, self.resistance),)
+        return (SupportForce(self.rows, self.energy, self.resistance, stiffness=self.stiffness),)
 
     def rows(self, machine: Machine) -> Array:
         """Return the matrix (1, nd) or (2, nd) that gives the displacement of the place on a `machine` with nd coordinates.

@@ -234,12 +234,14 @@ class SupportForce:
     - `energy`, J: function of x
     - `resistance`: function of x and its rate, the dissipative force on the foundation, (k,) N; or None
     - `is_smooth`: True if the force has all derivatives
+    - `stiffness`: largest stiffness of the support, N/m, whose vibration equal steps must resolve; None if it has no limit
     """
 
     rows: Callable[[Machine], Array]
     energy: Callable[[Array], Array]
     resistance: Callable[[Array, Array], Array] | None = None
     is_smooth: bool = False
+    stiffness: Array | None = None
 
     def force(self, displacement: Array, velocity: Array) -> Array:
         """Return the force on the foundation, (k,) N. The force on the carrier has the opposite sign."""
