@@ -158,16 +158,15 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
                 continue
             if has_fit and vibration.order is None and np.nanvar(values) < _NOISE_LIKE * np.nanvar(readings):
                 continue
-            what = "residuals" if has_fit else "readings"
-            yield (
-                f"{vibration.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is "
-                f"{vibration.frequency_text}, but an unbalance turns with the rotor: use the tachometer of the shaft that "
-                "causes the vibration, or leave out the part of the record in which loads are jammed or another machine runs"
-                if not problem.has_loads
-                else f"{vibration.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is "
-                f"{vibration.frequency_text}: the motion of the loads is not that of the scene, or the fit has ended at a "
-                "wrong minimum"
-            )
+            if problem.has_loads:
+                reason = ": the motion of the loads is not that of the scene, or the fit has ended at a wrong minimum"
+            else:
+                reason = (
+                    ", but an unbalance turns with the rotor: use the tachometer of the shaft that causes the vibration, or "
+                    "leave out the part of the record in which loads are jammed or another machine runs"
+                )
+            what = f"the {'residuals' if has_fit else 'readings'} of channel {channel.name!r} in run {k + 1}"
+            yield f"{vibration.share:.0%} of the power of {what} is {vibration.frequency_text}{reason}"
 
 
 def residual_chance(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray, fitted_count: int) -> float:
