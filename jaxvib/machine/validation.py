@@ -130,6 +130,13 @@ _MAX_RADIUS, _MAX_SAG, _MIN_MASS = 5.0, 1.0, 10.0
 whose sag is examined. Machines with dimensionless parameters have masses of about 1."""
 
 
+_MAX_SUPPORT_DISTANCE = 100.0
+"""Largest usual coordinate of a support, m."""
+
+_MIN_AMPLITUDE, _MAX_AMPLITUDE = 1e-5, 0.2
+"""Smallest and largest usual amplitude above the resonances of a machine that unbalances excite, the sum of the unbalances
+divided by the mass, m."""
+
 _MIN_POWER = 0.02
 """Smallest usual rated power of a motor for each kg of the machine, W; usual values are about 1."""
 
@@ -171,8 +178,19 @@ def implausible_numbers(scene: Scene) -> list[str]:
             value = f"{far:.4g} m from the centre of mass, the supports at most {lever:.4g} m"
             note(f"{place}at", value, "m", f"{float(np.max(np.abs(at))):g} mm")
     for k, support in enumerate(getattr(scene.machine, "supports", ())):
+        if (far := float(np.max(np.abs(getattr(support, "at", 0.0))))) > _MAX_SUPPORT_DISTANCE:
+            note(f"machine.supports[{k}].at", f"{far:g} m from the centre of mass", "m", f"{far:g} mm")
         if (angle := abs(float(getattr(support, "angle", 0.0)))) > 2.0 * np.pi:
             note(f"machine.supports[{k}].angle", f"{angle:g} rad", "rad", f"{angle:g} deg")
+    moments = [0.0 if each.unbalance is None else float(each.unbalance) for each in scene.exciters]
+    if min(mass, *moments) > 0.0:  # only unbalances excite the machine
+        amplitude = sum(moments) / mass
+        if amplitude > _MAX_AMPLITUDE:
+            value = f"{mass:g} kg, and the unbalances would move the machine by {amplitude:.3g} m"
+            note("machine.mass", value, "kg", f"{mass:g} t")
+        if amplitude < _MIN_AMPLITUDE:
+            value = f"so small that it moves the machine by {1e6 * amplitude:.3g} µm"
+            note("exciters.unbalance", value, "kg m, a plain force in N", "kN")
     if mass > _MAX_MASS:
         note("machine.mass", f"{mass / 1e3:g} t", "kg", f"{mass / 1e3:g} kg")
     supports = [each.stiffness for each in getattr(scene.machine, "supports", ())]

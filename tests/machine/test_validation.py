@@ -1,5 +1,7 @@
 """Messages about numbers that `equinox.tree_at` puts into a scene, and about implausible numbers."""
 
+import re
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -194,3 +196,20 @@ def test_implausible_bodies_in_a_plane_are_noted():
     turned = SCREENS["linear_screen"].replace('# angle = "0 deg"', "angle = 15.0     #", 1)
     (note,) = implausible_numbers(jv.scene_from_toml(turned))
     assert note == "machine.supports[0].angle is 15 rad; a plain number is in rad: did you mean '15 deg'?"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("[-1.6, -0.3]", "[-1600, -300]", r"machine.supports\[0\].at is 1600 m from the centre of mass; .*'1600 mm'\?$"),
+        (
+            "mass = 2600.0",
+            "mass = 2.6",
+            r"machine.mass is 2.6 kg, and the unbalances would move the machine by 3.51 m; .*'2.6 t'",
+        ),
+        ('force = "50 kN"', "force = 50", r"exciters.unbalance is so small that it moves the machine by 3.51 µm; .*'kN'\?$"),
+    ],
+)
+def test_units_of_screens_that_were_confused_are_noted(old, new, says):
+    (note,) = implausible_numbers(jv.scene_from_toml(SCREENS["linear_screen"].replace(old, new)))
+    assert re.match(says, note)
