@@ -207,6 +207,8 @@ def plan_run(
         raise InputError("accuracy", "repeats the run and cannot be used inside jit, grad or vmap; use Tolerance(...)")
     if max_steps is None:
         max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_STEPS_FACTOR) * fastest, end)
+        if isinstance(steps, EqualSteps):  # rounding errors may add a step
+            max_steps = max(max_steps, 2 ** math.ceil(math.log2(steps.number + 1)))
     if (solver := stiff if solver is None else solver) is None and not known and end.dtype.itemsize >= 8:
         solver = _solver_for_derivatives(adjoint)
     saved_samples, step_limit = samples if save == "all" else 0, min(count(max_steps, "max_steps"), MAX_STEPS)

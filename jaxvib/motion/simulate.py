@@ -81,9 +81,9 @@ def simulate(
       `UnrolledDopri8`, or `LoopDopri8` for large scenes and under JAX transformations. The default adjoint gives reverse
       derivatives of exactly the steps that were taken. Forward derivatives, `diffrax.ForwardMode()`, take less time for up to
       about ten parameters
-    - `max_steps`: the run fails after this number of steps; default: 500 for each turn of the fastest motion, and 2^20 under a
-      JAX transformation of the scene. A reverse derivative stores a time for each of these steps: use a smaller value for large
-      batches
+    - `max_steps`: the run fails after this number of steps; default: 500 for each turn of the fastest motion, 2^20 under a JAX
+      transformation of the scene, and at least the number of `EqualSteps`. A reverse derivative stores a time for each of these
+      steps: use a smaller value for large batches
     - `progress_meter` of diffrax, which shows the finished share of the time
     - `throw`: True to raise `ComputationError` if the run fails; otherwise, and under a JAX transformation, its status shows
       the failure

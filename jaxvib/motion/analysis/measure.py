@@ -84,7 +84,8 @@ class AbstractMeasured(Readable):
     The three changes are
 
     - the change of an amplitude from the first to the second half of the window, relative to the largest amplitude, or to 1e-4
-      of the unbalance radius S/M if that is larger (the amplitude of a balanced rotor is almost zero)
+      of the unbalance radius S/M if that is larger (the amplitude of a balanced rotor is almost zero). In this comparison the
+      amplitude of a tilt, 1 rad, counts as 1 m
     - the change of the foundation force from the first to the second half, relative to the largest force, or to 1e-4 of S n^2
       (n: rotor speed) if that is larger
     - the difference between the mean speeds of a load in the second half and in the whole window, relative to `omega`
