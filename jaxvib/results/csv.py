@@ -100,6 +100,9 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
             for part, numbers in parts:
                 table[f"{part}{head}" + (f" ({column_unit})" if column_unit else "")] = numbers
     if not table:
+        if (batch := next((values.ndim - len(axes) for _, axes, values, _ in columns(result)), 0)) > 0:
+            problem = f"is a batch with {batch} outer {'axis' if batch == 1 else 'axes'}; take one of its results, "
+            raise InputError("result", f"{problem}jax.tree.map(lambda x: x[0], result), or use to_xarray()")
         known = sorted({axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes)})
         raise InputError("axis", f"is {quoted(axis)}; the axes of {type(result).__name__} are: {', '.join(known) or 'none'}")
     return table

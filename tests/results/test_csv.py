@@ -127,3 +127,9 @@ def test_main_axis_of_one_spectrum_is_its_frequency(segments, axis):
         coordinates=("y1", "y2"), units=("m", "m"),
     )  # fmt: skip
     assert main_axis(spectrum) == axis and len(table_along(spectrum, axis)) > 3
+
+
+def test_table_of_a_batch_is_refused():
+    batch = Readings(*(np.zeros((2, 3)) for _ in range(3)))
+    with pytest.raises(jv.InputError, match=r"^result is a batch with 1 outer axis; take one of its results, "):
+        table_along(batch, "load")
