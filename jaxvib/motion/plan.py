@@ -206,9 +206,7 @@ def plan_run(
     if isinstance(steps, Accuracy) and not known:
         raise InputError("accuracy", "repeats the run and cannot be used inside jit, grad or vmap; use Tolerance(...)")
     if max_steps is None:
-        max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_STEPS_FACTOR) * fastest, end)
-        if isinstance(steps, EqualSteps):  # rounding errors may add a step
-            max_steps = max(max_steps, 2 ** math.ceil(math.log2(steps.number + 1)))
+        max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_STEPS_FACTOR) * fastest, end, steps)
     if (solver := stiff if solver is None else solver) is None and not known and end.dtype.itemsize >= 8:
         solver = _solver_for_derivatives(adjoint)
     saved_samples, step_limit = samples if save == "all" else 0, min(count(max_steps, "max_steps"), MAX_STEPS)
@@ -251,8 +249,9 @@ def plan_stretch(scene: Scene, length: float, state: State, steps: StepChoice, *
     )  # fmt: skip
 
 
-def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:
-    """Return a maximum number of steps: 500 for each turn of the `fastest` motion, rad/s, rounded up to a power of 2.
+def enough_steps(fastest: Array | np.ndarray, end: Array, chosen: StepChoice | None = None) -> int:
+    """Return a maximum number of steps: 500 for each turn of the `fastest` motion, rad/s, and at least the number of `chosen`
+    equal steps, rounded up to a power of 2.
 
     The number can be a static argument of a program; with powers of 2, few programs are compiled. **Raises** `InputError` for a
     run that would need too many steps.
@@ -266,7 +265,8 @@ def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:
         return min(2 ** math.ceil(math.log2(steps)), MAX_STEPS)
 
     steps = when_known(count_steps, fastest, end)
-    return _UNKNOWN_STEPS if steps is None else steps
+    equal = chosen.number + 1 if isinstance(chosen, EqualSteps) else 1  # rounding errors may add a step
+    return max(_UNKNOWN_STEPS if steps is None else steps, 2 ** math.ceil(math.log2(equal)))
 
 
 def _enough_samples(speed: Array, end: Array) -> int:
