@@ -312,8 +312,9 @@ _MAX_TURNS = 1e15
 def whole_turns(scene: Scene, stretch: float) -> float:
     """Return the longest time within `stretch`, s, that is a whole number of turns of all rotors, but at least one turn.
 
-    The rotors of motors are ignored, because their angles are part of the state. If there are several rotors, only those with
-    an unbalance are considered. **Raises** `InputError` for rotors with an unbalance at different speeds.
+    The rotors of motors are ignored, because their angles are part of the state; a period of their supply counts as a turn. If
+    there are several rotors, only those with an unbalance are considered. **Raises** `InputError` for rotors with an unbalance
+    at different speeds.
     """
     is_single = len(scene.exciters) == 1
     counted = [
@@ -321,11 +322,12 @@ def whole_turns(scene: Scene, stretch: float) -> float:
         for e in scene.exciters
         if e.drive.ideal and (is_single or e.carries != ("loads",) or has_term(e.effects, RotorImbalance))
     ]
-    speeds = sorted({float(exciter.drive.speed) for exciter in counted})
+    supplies = [frequency for e in scene.exciters if (frequency := e.drive.supply_frequency()) is not None]
+    speeds = sorted({float(w) for w in (*(exciter.drive.speed for exciter in counted), *supplies)})
     if not speeds:
         return stretch
     if len(speeds) > 1:
-        problem = f"turn unbalances at {speeds} rad/s and have no common period; use simulate, or motors"
+        problem = f"have unbalances or supplies at {speeds} rad/s and no common period; use simulate, or other motors"
         raise InputError("exciters", problem)
     turn = 2.0 * math.pi / speeds[0]
     turns = stretch / turn

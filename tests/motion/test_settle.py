@@ -50,6 +50,21 @@ def test_a_stretch_goes_on_where_the_last_one_ended():
     np.testing.assert_allclose(np.sin(twice.angle[0][-1]), np.sin(once.angle[0][-1]), atol=1e-6)
 
 
+def test_a_stretch_is_a_whole_number_of_periods_of_the_supply():
+    circuit = dict(stator_resistance=1.2, rotor_resistance=1.0, stator_leakage=6e-3, rotor_leakage=6e-3)
+
+    def motor(frequency):
+        return jv.InductionMotorElectrical(400.0, frequency, 2, **circuit, magnetizing_inductance=0.15, inertia=0.05)
+
+    def screen(*frequencies):
+        body = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+        return jv.Scene(body, exciters=[jv.Exciter(drive=motor(each), unbalance=0.1) for each in frequencies])
+
+    np.testing.assert_allclose(whole_turns(screen("50 Hz", "50 Hz"), 0.99), 0.98, rtol=1e-12)
+    with pytest.raises(jv.InputError, match=r"^exciters have unbalances or supplies at .* and no common period"):
+        whole_turns(screen("50 Hz", "60 Hz"), 0.99)
+
+
 def test_balls_that_touch_settle_side_by_side():
     """They start beside each other, however large they are, and go on in their order: nothing presses them apart."""
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)

@@ -78,6 +78,9 @@ class Drive(Part):
         """Return the time derivatives of the `states` of a motor at time `t` (s) and the rotor's `speed` (rad/s)."""
         return ()
 
+    def supply_frequency(self) -> Array | None:
+        """Return the angular frequency of the supply, rad/s, if the torque depends on its phase; otherwise None."""
+
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the times at which the acceleration jumps, which must be ends of steps."""
         return ()

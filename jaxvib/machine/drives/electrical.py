@@ -352,6 +352,10 @@ class InductionMotorElectrical(InductionMotorCircuit):
         ix, iy, *_ = self.currents(states)
         return 1.5 * self.pole_pairs * (states[0] * iy - states[1] * ix)
 
+    def supply_frequency(self) -> Array:
+        """Return the frequency of the supply, at whose phase the fluxes continue."""
+        return self.frequency
+
     def state_units(self) -> tuple[Array, ...]:
         """Return the flux linkage at the voltage of the supply, the typical magnitude of each state."""
         return (self._voltage_amplitude / self.frequency,) * 4

@@ -170,5 +170,5 @@ def test_two_half_motors_settle_as_one():
 
 def test_settle_refuses_unbalances_at_different_speeds():
     exciters = [jv.Exciter(drive=jv.ConstantSpeed(speed), unbalance=0.1) for speed in (40.0, 30.0)]
-    with pytest.raises(jv.InputError, match=r"exciters turn unbalances at \[30.0, 40.0\] rad/s"):
+    with pytest.raises(jv.InputError, match=r"exciters have unbalances or supplies at \[30.0, 40.0\] rad/s"):
         jv.settle(jv.Scene(MACHINE, exciters=exciters))
