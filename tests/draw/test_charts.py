@@ -99,6 +99,10 @@ def test_the_smaller_of_two_bands_lies_in_front_of_the_larger():
     axis = time_histories(arrays, arrays, names=("y1", "y2"), directions=("up",)).axes[0]
     depths = {line.get_label(): line.get_zorder() for line in axis.lines}
     assert depths["y1"] > depths["y2"] > axis.xaxis.get_zorder()  # of the grid
+    assert axis.texts[0].get_text() == "the whole run: bands between peaks"
+    short = [values[:400] for values in arrays]
+    axis = time_histories(short, short, names=("y1", "y2"), directions=("up",)).axes[0]
+    assert not axis.collections and axis.texts[0].get_text() == "the whole run"
 
 
 def test_growth_has_the_exponent_over_its_second_half():
