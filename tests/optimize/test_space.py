@@ -51,6 +51,13 @@ def test_catalogues_are_sorted_and_unique():
     assert counts.choices == () and counts.size == 1
 
 
+def test_columns_are_interpolated_between_rows():
+    rows = {"machine.stiffness[0]": [1e4, 2e4, 4e4], "machine.damping[0]": [30.0, 90.0, 50.0]}
+    space = DesignSpace(SCENE, {}, choices={"spring": rows})
+    for stiffness, damping in ((1e4, 30.0), (1.5e4, 60.0), (3e4, 70.0), (4e4, 50.0)):
+        np.testing.assert_allclose(space.scene_of(jnp.array([stiffness])).machine.damping[0], damping, rtol=1e-12)
+
+
 def test_ties_follow_in_order():
     ties = {"machine.stiffness[1]": ("machine.stiffness[0]", 2.0), "machine.link_stiffness": ("machine.stiffness[1]", "keep")}
     space = DesignSpace(THREE, {"machine.stiffness[0]": (1e4, 9e4)}, ties=ties)

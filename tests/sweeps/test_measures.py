@@ -10,6 +10,7 @@ import pytest
 import jaxvib as jv
 from jaxvib.motion.batch import BatchPlan, run_in_batch
 from jaxvib.motion.start import initial_state
+from jaxvib.sweeps import measures
 from jaxvib.sweeps.measures import RUN_MEASURES
 from jaxvib.sweeps.study import study
 
@@ -42,6 +43,16 @@ def test_settling_ends_with_the_last_part_that_is_away(second, settled):
     np.testing.assert_allclose(measure(watched(speeds)), settled)
     np.testing.assert_allclose(measure(watched(speeds[:, ::-1])), settled)
     np.testing.assert_allclose(measure(watched(speeds, change=0.02)), 10.0)
+
+
+@pytest.mark.parametrize(("gain", "settled"), [(0.0, 0.0), (4.0, 10.0)])
+def test_runs_of_exciters_settle_when_all_speeds_are_constant(gain, settled, monkeypatch):
+    """The speed of the second mass differs between the halves of the window."""
+    run = watched(np.full((5, 2), 27.0))
+    run.regime, run.scene, run.window.state = None, None, None
+    monkeypatch.setattr(measures, "turning_angles", lambda *_: ())
+    monkeypatch.setattr(measures, "mean_speeds", lambda *_, **__: (jnp.asarray([27.0, 27.0]), jnp.asarray([27.0, 27.0 + gain])))
+    np.testing.assert_allclose(RUN_MEASURES["run.settling_time"].function(run), settled)
 
 
 def test_measures_of_data_sheets_follow_from_a_run():

@@ -102,3 +102,9 @@ def test_the_stiffest_stop_sets_the_steps():
     rate = 4.0 * np.sqrt(fastest**2 + 1e7 / float(SCENE.machine.mass[0]))
     part = (2.0 - plan.window) / PARTS_OF_RUN
     assert plan.each == np.ceil(part * rate) and plan.each > 10 * part * fastest
+
+
+@pytest.mark.parametrize(("until", "window"), [(0.2, 0.1), (200.0, None)])
+def test_windows_take_at_most_half_of_a_run(until, window):
+    plan = study(SCENE, {"machine.mass": [50.0, 60.0]}, ["run.load_speed"], until=until).plan
+    assert plan.window == window if window else 1.0 < plan.window < 50.0

@@ -159,6 +159,15 @@ def test_least_torque_is_that_of_the_resonance_curve():
     np.testing.assert_allclose(least_torque()(shaft(5.0)), ratio.max(), rtol=1e-8)
 
 
+def test_negative_least_torque_is_that_of_the_worst_resonance():
+    machine = jv.two_mass(mass=(90.0, 60.0), stiffness=(3e4, 3e4), damping=(60.0, 90.0), link_stiffness=4e4, link_damping=30.0)
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.DCMotor(100.0, stall_torque=5.0, inertia=0.5), unbalance=0.2)])
+    peaks = least_torque().pieces(Evaluation(scene))
+    assert peaks.shape == (2,) and float(jnp.ptp(peaks)) > 0.01
+    np.testing.assert_allclose((-least_torque()).pieces(Evaluation(scene)), [-jnp.max(peaks)], rtol=1e-12)
+    np.testing.assert_allclose((-least_torque())(scene), -jnp.max(peaks), rtol=1e-12)
+
+
 @pytest.mark.parametrize("ratio", [0.02, 0.05, 0.1, 0.2])
 def test_least_torque_near_the_no_load_speed_is_positive(ratio):
     """A damping above 0.03 leaves no local maximum below the no-load speed; the value is then that at the resonance."""

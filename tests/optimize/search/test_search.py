@@ -55,6 +55,13 @@ def test_inactive_demand_has_no_multiplier():
     assert not best.limits[0].active and best.limits[0].multiplier == 0.0
 
 
+def test_machines_that_differ_in_one_spring_are_not_the_same():
+    """The second stiffness has no effect on the objective."""
+    best = found(DesignSpace(SCENE, FREE), plain("first", lambda x, y: (x - 6.0) ** 2 + 0.0 * y))
+    assert best.converged == 4 and best.same == 1
+    assert np.ptp(best.designs[:, 0]) < 1e-6 and np.ptp(best.designs[:, 1]) > 0.1
+
+
 def test_contradictory_demands_are_named_with_their_excess():
     space, demands = DesignSpace(SCENE, FREE), [SUM > "120 N/mm", FIRST < 2e4]
     best = found(space, NEAREST, subject_to=demands, throw=False)  # 2e4 + 9e4 at most
