@@ -83,10 +83,11 @@ def fastest_motion(scene: Scene, per_contact: float = 1.0) -> Array:
 
     k is the stiffness of the stop and P maps q to its displacements. The rate on a stop is multiplied by `per_contact`.
     """
-    scene = jax.lax.stop_gradient(scene)
     fastest = frequency_bounds(scene)[0]
-    if not (stiffnesses := [term.stiffness for term in terms_of(scene.effects, SupportForce)]):
+    if not terms_of(scene.effects, SupportForce):
         return fastest
+    scene = jax.lax.stop_gradient(scene)
+    stiffnesses = [term.stiffness for term in terms_of(scene.effects, SupportForce)]
     linear, rates = linear_model(scene), [fastest]
     for stiffness, rows in zip(stiffnesses, linear.supports, strict=True):
         if stiffness is not None:
