@@ -33,7 +33,8 @@ def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
     """Return the largest foundation force, N, of a run from rest (full equations).
 
     The force is read at 4000 times of the run. The value is therefore too small by up to some per cent if the run is long and
-    the peak short, as that of a collision with a `Stop`; the measure `run.peak_force` of sweeps has no such error.
+    the peak short, as that of a collision with a `Stop`. The measure `run.peak_force` of sweeps reads each step; its error is
+    that of the steps.
 
     **Arguments**
 
@@ -62,7 +63,7 @@ def peak_displacement(
     *, until: Number, at: int | Sequence[Number] | None = None, body: int = 0, spin_up: Number | None = None
 ) -> Quantity:
     """Return the largest displacement, m, of a point during a run from rest (full equations), for example while motors pass
-    the resonances.
+    the resonances. It is read at 4000 times of the run, see `peak_force`.
 
     **Arguments**
 
