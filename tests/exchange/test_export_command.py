@@ -47,7 +47,7 @@ def test_universal_files_are_exported(machine, tmp_path, capsys):
         (["--to", "uff", "--out", "m.unv", "--fmi", "2.0"], "--fmi cannot be used with --to uff; leave it out"),
         (["--to", "fmu", "--out", "m.fmu", "--rotor-speed", "9"], "--rotor-speed cannot be used with --to fmu"),
         (["--to", "state-space", "--out", "m.mat", "--mode", "9"], "--mode is 9; "),
-        (["--to", "state-space", "--out", "m.mat", "--rotor-speed", "-3"], "--rotor-speed is "),
+        (["--to", "state-space", "--out", "m.mat", "--rotor-speed", "3 kg"], "--rotor-speed is "),
     ],
 )
 def test_wrong_options_raise_clear_errors(words, says, machine, capsys):

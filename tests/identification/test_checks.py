@@ -242,7 +242,7 @@ def test_foreign_vibration_in_words(monkeypatch, fits, share, order, size, words
     def foreign(values, angle, step):
         np.testing.assert_array_equal(values, [size, -size, np.nan] if fits else [1.0, -1.0, np.nan])
         assert angle.tolist() == [1.0, 2.0, 3.0] and step == 0.5
-        return SimpleNamespace(share=share, order=order, place="at 9 Hz")
+        return SimpleNamespace(share=share, order=order, frequency_text="at 9 Hz")
 
     monkeypatch.setattr(checks, "foreign_vibration", foreign)
     samples = SimpleNamespace(channels=(channel("a"),), step=0.5)

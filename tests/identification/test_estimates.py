@@ -206,7 +206,7 @@ def test_status_of_a_prediction(monkeypatch, size, chances, deviation, status, w
     channels = [SimpleNamespace(name="a"), SimpleNamespace(name="new")]
     problem = SimpleNamespace(
         runs=[SimpleNamespace(channels=channels)], angles=[np.array([[3.0, 4.0]])], masks=[mask], raw=[raw],
-        times=[np.arange(4.0)], notes=("first",), has_loads=False,
+        times=[np.arange(4.0)], notes=("first",), linear=None,
     )  # fmt: skip
     at = SimpleNamespace(problem=problem, residuals=left, taps=["taps a", "taps new"])
     found = SimpleNamespace(chance=deviation, sentence=lambda run: f"{run} deviates")
