@@ -167,7 +167,8 @@ def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[
     amplitude_of_mode = amplitude(mode=mode, of=of)
     amplitude_of_mode(scene)  # refuses a mode and a platform that the machine does not have
     space = DesignSpace(scene, {"loads.mass": (float(mass) / 10.0, float(mass) * 10.0)})
-    return Design(space, total_mass(), subject_to=(amplitude_of_mode > _positive(least, "m", "least"),))
+    _positive(least, "m", "least")
+    return Design(space, total_mass(), subject_to=(amplitude_of_mode > least,))
 
 
 def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[int, int] | None = None) -> Design:
