@@ -6,7 +6,9 @@ import pytest
 from two_springs import FREE, SCENE, plain, point_of
 
 from optimize import DesignSpace, hold, largest
-from optimize.search.polish import _merit, draw_starts, optimality, polish, restore, violation
+from optimize.search import polish as polishing
+from optimize.search.model import Step
+from optimize.search.polish import _merit, _move, _Searches, draw_starts, optimality, polish, restore, violation
 from optimize.search.problem import evaluate, find_speeds, problem_of
 
 SUM = plain("sum", lambda x, y: x + y)
@@ -211,6 +213,21 @@ def test_step_with_decrease_below_rounding_is_accepted():
     ended = polish(problem, start, 4, lambda *_: None)
     np.testing.assert_allclose(xy(ended.point), 3.5, rtol=1e-13)
     assert np.all(ended.violation < 1e-14)
+
+
+def test_step_to_a_feasible_design_is_accepted(held, monkeypatch):
+    """The objective rises from 2 to 10, and the penalty is too small for the violation to count."""
+    here, feasible = at(held, (6.0, 5.0)), at(held, (4.0, 3.0))
+    one, none = np.ones(1), np.zeros((1, 1))
+    model = Step(np.full((1, 2), -0.25), none, none, np.ones((1, 1)))
+    for start, trial, accepted in ((here, feasible, True), (feasible, here, False)):
+        searches = _Searches(start, one, 1e-6 * one, 0.3 * one, np.zeros((1, 2)), none, none, one > 0.0, one > 0.0, one)
+        if not accepted:
+            searches.penalty = 1e3 * one
+        monkeypatch.setattr(polishing, "_trial_point", lambda *_, trial=trial: trial)
+        _move(held, searches, np.array([0]), start, [model], one < 0.0)
+        np.testing.assert_allclose(xy(searches.point), [[4.0, 3.0]])
+        assert searches.changed.tolist() == [accepted]
 
 
 def test_trust_radius_doubles_after_full_steps():
