@@ -77,7 +77,7 @@ def test_exact_motion_exists_without_a_light_jam():
     by_tier = {row.tier: row.error for row in cost.rows}
     assert by_tier.keys() == {"exact orbit", "envelope", "full"} and by_tier["full"] < 1e-4 < by_tier["envelope"]
     (reason,) = cost.left_out
-    assert reason.startswith("leading order: this mode does not exist at this rotor speed; runs start on the exact motion")
+    assert reason.startswith("leading order: this mode does not exist at this rotor speed; runs start from the exact jam")
 
 
 def test_a_run_up_is_measured_at_its_end():
