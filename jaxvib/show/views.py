@@ -251,8 +251,8 @@ class ShaftView(RotorView):
         self._rows = functools.cache(lambda s: np.asarray(scene.machine.rows_at(s)))
         loads = scene.exciter.loads
         self.stations = np.asarray(self.mount.distances(1 if loads is None else loads.count), float)
-        all_indices = [0.0, *self.stations, *(s for s, _, _ in self.shaft_supports)]
-        low, high = min(all_indices), max(all_indices)
+        distances = [0.0, *self.stations, *(s for s, _, _ in self.shaft_supports)]
+        low, high = min(distances), max(distances)
         half = 0.5 * (high - low) or 0.1
         self.middle, self.along = 0.5 * (low + high), 2.6 / half
         self.front = 5.0
