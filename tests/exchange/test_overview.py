@@ -96,3 +96,5 @@ def test_vibrations_have_their_frequency_and_velocity():
     np.testing.assert_allclose(as_velocity.velocity, velocity, rtol=1e-3)
     assert np.isnan(overview_of(Recorded("key", "V", t, (np.sin(30.0 * t) > 0.0) * 5.0)).main_frequency)
     assert np.isnan(overview_of(Recorded("bed", "N", t, wave)).velocity)
+    slow = overview_of(Recorded("bed", "g", t[::100], np.sin(9.0 * t[::100])))  # 10 Hz, below the band
+    assert slow.main_frequency > 1.0 and np.isnan(slow.velocity)

@@ -110,7 +110,7 @@ def overview_of(recorded: Recorded) -> ChannelOverview:
 
 def _lines_of(value: np.ndarray, rate: float, unit: str) -> tuple[float, float]:
     """Return the frequency of the largest line of a signal, Hz, and the root mean square of its velocity, m/s, see
-    `ChannelOverview`; NaN for a constant signal, and for another unit."""
+    `ChannelOverview`; NaN for a constant signal. The velocity is NaN for another unit, and for a rate below 20 Hz."""
     window = np.hanning(value.size)
     power = np.abs(np.fft.rfft((value - np.mean(value)) * window)) ** 2
     frequency = np.fft.rfftfreq(value.size, 1.0 / rate)
@@ -121,6 +121,8 @@ def _lines_of(value: np.ndarray, rate: float, unit: str) -> tuple[float, float]:
     main_frequency = float(np.sum(frequency[near] * power[near]) / np.sum(power[near]))
     band = (frequency >= _BAND[0]) & (frequency <= _BAND[1])
     acceleration, velocity = (unit_factor(unit, si) if unit else None for si in ("m/s^2", "m/s"))
+    if not np.any(band):
+        return main_frequency, np.nan
     if acceleration is not None:
         factor = acceleration / (2.0 * np.pi * frequency[band])
     elif velocity is not None:
