@@ -388,6 +388,11 @@ def owners_of(counts: Sequence[int]) -> np.ndarray:
     return np.repeat(np.arange(len(counts)), [max(count, 1) for count in counts])
 
 
+def mass_owners(scene: Scene) -> np.ndarray:
+    """Return the exciter of each rotating mass."""
+    return owners_of([0 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters])
+
+
 def _motor_torque(averaged: Averaged) -> Array:
     """Return the largest torque of each mass's motor, see `TorqueBalance`."""
     shares, each = jnp.linspace(0.0, 1.0, _TORQUE_POINTS, dtype=averaged.drag.dtype), []

@@ -18,7 +18,7 @@ from jaxvib.display import Drawn, Onto, quantity_text, speed_text
 from jaxvib.equations.forces import drive_torques
 from jaxvib.equations.linear import require_terms
 from jaxvib.equations.state import State
-from jaxvib.equations.torque_balance import owners_of
+from jaxvib.equations.torque_balance import mass_owners
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drives.drive import SwitchedOff
 from jaxvib.machine.effects.base import has_term
@@ -324,7 +324,7 @@ def _phases_of_exciters(scene: Scene, regime: HasSpeedAndPhases) -> Array:
 
     **Raises** `InputError` for a regime of some of the masses, and for loads of one exciter at different phases.
     """
-    owners = owners_of([0 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters])
+    owners = mass_owners(scene)
     phases, masses = jnp.asarray(regime.phases), getattr(regime, "masses", None)
     if masses is not None and masses.shape != owners.shape:
         raise InputError(

@@ -26,7 +26,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.averaged import require_rotating_masses
-from jaxvib.equations.torque_balance import assemble_for_search, assemble_torque_balance, influence_of
+from jaxvib.equations.torque_balance import assemble_for_search, assemble_torque_balance, influence_of, mass_owners
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -43,7 +43,6 @@ from jaxvib.steady.regimes.synchronous import (
     RegimeSearchStatus,
     SynchronousRegime,
     SynchronousRegimes,
-    mass_owners,
     synchronous_regimes,
 )
 

@@ -23,6 +23,7 @@ from jaxvib.equations.torque_balance import (
     balance_residuals,
     can_start,
     influence_of,
+    mass_owners,
     motion_of,
     owners_of,
     response_of,
@@ -364,11 +365,6 @@ def synchronous_regimes(
     search = RegimeSearchStatus.done if order.size else RegimeSearchStatus.none
     search = RegimeSearchStatus.sampled if count > MAX_COMPLETE and not balance.is_prescribed.all() else search
     return SynchronousRegimes(**on_device(jax.tree.map(lambda leaf: leaf[order], fields)), scene=scene, search=search)
-
-
-def mass_owners(scene: Scene) -> np.ndarray:
-    """Return the exciter of each rotating mass."""
-    return owners_of([0 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters])
 
 
 def _read_group(masses: Sequence[int] | None, count: int) -> tuple[int, ...] | None:
