@@ -208,7 +208,7 @@ class Output:
         self.files.append(str(path))
 
     def table(self, name: str, columns: Mapping[str, np.ndarray]) -> None:
-        """Write columns by their heads to the CSV file `name` if --out is used."""
+        """Write columns by their headers to the CSV file `name` if --out is used."""
         path = self.file(name)
         if path is not None:
             from jaxvib.results.csv import write_table  # slow import, which --help does not need

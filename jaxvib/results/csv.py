@@ -51,8 +51,8 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
 def write_table(
     table: Mapping[str, np.ndarray], path: str | Path, *, decimal_comma: bool = False, unique: bool = False
 ) -> Path:
-    """Write columns by their heads to a CSV file. With `unique`, equal rows that follow each other are one row, because a point
-    at which two pieces of a curve meet occurs twice."""
+    """Write columns by their headers to a CSV file. With `unique`, equal rows that follow each other are one row, because a
+    point at which two pieces of a curve meet occurs twice."""
     path = Path(path)
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n", delimiter=";" if decimal_comma else ",")
