@@ -42,6 +42,7 @@ test-versions:
 	.venv-highest/bin/python -m pytest -n 2 --dist loadfile $(VERSION_TESTS)
 
 check: $(VENV)/installed-dev
+	! git grep -nE '^(<<<<<<<|>>>>>>>) '
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
