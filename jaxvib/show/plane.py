@@ -11,12 +11,12 @@ from jaxvib.draw.machine.parts import Part, Text, circle, ground, turning_arrow
 from jaxvib.draw.style import COLORS, Look
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.plane_body import PlaneBody
-from jaxvib.show.view import BODY, FOUNDATION, View, tie_parts
+from jaxvib.show.view import BODY, FOUNDATION, View, spring_and_damper
 from jaxvib.show.wheel import Pose, Wheel, value_text
 
 _WIDTH = 6.0
-"""Width in the drawing of the rectangle around all points to which something is attached; for a tall one 1.6 times its
-height."""
+"""Size, in units of the drawing, of the rectangle around all points to which something is attached: the larger of its width and
+1.6 times its height."""
 
 _OUTLINE_MARGIN = 0.32
 """Distance of the outline of a body from its centre of mass, the points of its supports, and the rims of its exciters."""
@@ -108,7 +108,7 @@ class PlaneView(View):
             end = strut.start + strut.way
             side = 0.4 * np.array([strut.way[1], -strut.way[0]]) / _SPRING_LENGTH
             parts.append(Part(ground(tuple(end - side), tuple(end + side)), FOUNDATION))
-            parts += tie_parts(tuple(ends[strut.support]), tuple(end), strut.stiffness, strut.damping, _SPRING_LENGTH)
+            parts += spring_and_damper(tuple(ends[strut.support]), tuple(end), strut.stiffness, strut.damping, _SPRING_LENGTH)
         parts.append(Part(corners, BODY, True))
         parts += [Part(circle(tuple(at), 0.06, 15), {"fc": "black", "ec": "none", "zorder": 2.8}, True) for at in ends]
         parts += _centre_mark(centre)

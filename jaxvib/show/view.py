@@ -17,7 +17,7 @@ BODY: Look = {"fc": "#c9d7e8", "ec": "black", "lw": 1.3, "zorder": 2.5}
 FORCE: Look = {"fc": COLORS[1], "ec": "none", "zorder": 5.0}
 
 
-def tie_parts(
+def spring_and_damper(
     start: tuple[float, float], end: tuple[float, float], stiffness: float, damping: float, length: float = 1.5
 ) -> list[Part]:
     """Return a spring and a damper side by side. An element with the value 0 is omitted.

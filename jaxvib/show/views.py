@@ -12,16 +12,16 @@ from jaxvib.draw.style import COLORS, GUIDE, Look
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.plane import PlaneView
-from jaxvib.show.view import BODY, FOUNDATION, RotorView, View, spring_text, tie_parts
+from jaxvib.show.view import BODY, FOUNDATION, RotorView, View, spring_and_damper, spring_text
 from jaxvib.show.wheel import Pose, places_of, value_text
 
 
-class Tie(NamedTuple):
+class Connection(NamedTuple):
     """Link between two platforms, or support of a platform.
 
     **Attributes**: `low` and `high`: numbers of the platforms at its ends, counted from the bottom, 0 for the foundation;
-    `stiffness` N/m and `damping` N s/m. The exciter is represented by a tie from its platform to the same platform, without
-    stiffness and damping.
+    `stiffness` N/m and `damping` N s/m. The exciter is represented by a connection from its platform to the same platform,
+    without stiffness and damping.
     """
 
     low: int
@@ -31,30 +31,31 @@ class Tie(NamedTuple):
 
     @property
     def is_exciter(self) -> bool:
-        """True if the tie represents the exciter."""
+        """True if the connection represents the exciter."""
         return self.low == self.high
 
 
-def order_of_ties(ties: list[Tie], levels: int) -> list[int]:
-    """Return an order of the ties from left to right in which few ties cross other platforms, and the platforms are short.
+def order_of_connections(connections: list[Connection], levels: int) -> list[int]:
+    """Return an order of the connections from left to right in which few connections cross other platforms, and the platforms
+    are short.
 
-    Pairs of ties are swapped until no swap is an improvement.
+    Pairs of connections are swapped until no swap is an improvement.
 
-    >>> order_of_ties([Tie(0, 1), Tie(0, 2), Tie(1, 2)], 2)
+    >>> order_of_connections([Connection(0, 1), Connection(0, 2), Connection(1, 2)], 2)
     [0, 2, 1]
     """
-    order = list(range(len(ties)))
+    order = list(range(len(connections)))
 
     def cost(order: list[int]) -> float:
-        place = {tie: x for x, tie in enumerate(order)}
+        place = {each: x for x, each in enumerate(order)}
         spans = []
         for level in range(1, levels + 1):
-            places = [place[k] for k, tie in enumerate(ties) if level in (tie.low, tie.high)]
+            places = [place[k] for k, each in enumerate(connections) if level in (each.low, each.high)]
             spans.append((min(places), max(places)) if places else (0, 0))
         crossed = sum(
             spans[level - 1][0] < place[k] < spans[level - 1][1]
-            for k, tie in enumerate(ties)
-            for level in range(tie.low + 1, tie.high)
+            for k, each in enumerate(connections)
+            for level in range(each.low + 1, each.high)
         )
         return 100.0 * crossed + sum(high - low for low, high in spans)
 
@@ -82,22 +83,25 @@ class PlatformView(RotorView):
         n = self.mass.shape[0]
         self.rows = [np.asarray(scene.machine.rows_at(level))[0] for level in range(1, n + 1)]
         self.exciter_level = int(np.argmax(self.rows @ np.asarray(self.mount.rows[0])[0])) + 1
-        self.ties = [
-            Tie(0, i + 1, float(self.foundation_stiffness[0, i]), float(self.foundation_damping[0, i])) for i in range(n)
+        self.connections = [
+            Connection(0, i + 1, float(self.foundation_stiffness[0, i]), float(self.foundation_damping[0, i])) for i in range(n)
         ]
-        self.ties += [
-            Tie(i + 1, j + 1, float(-self.stiffness[i, j]), float(-self.damping[i, j])) for j in range(n) for i in range(j)
+        self.connections += [
+            Connection(i + 1, j + 1, float(-self.stiffness[i, j]), float(-self.damping[i, j]))
+            for j in range(n)
+            for i in range(j)
         ]
-        self.ties = [tie for tie in self.ties if tie.stiffness > 0.0 or tie.damping > 0.0] + [
-            Tie(self.exciter_level, self.exciter_level)
-        ]
-        order = order_of_ties(self.ties, n)
-        widths = [2.0 * self.wheel.rim + 0.2 if self.ties[k].is_exciter else self.lane for k in order]
+        self.connections = [each for each in self.connections if each.stiffness > 0.0 or each.damping > 0.0]
+        self.connections.append(Connection(self.exciter_level, self.exciter_level))
+        order = order_of_connections(self.connections, n)
+        widths = [2.0 * self.wheel.rim + 0.2 if self.connections[k].is_exciter else self.lane for k in order]
         starts = np.concatenate([[0.0], np.cumsum(widths)])
-        self.x = {k: float(starts[p] + (0.5 * widths[p] if self.ties[k].is_exciter else 0.45)) for p, k in enumerate(order)}
+        self.x = {
+            k: float(starts[p] + (0.5 * widths[p] if self.connections[k].is_exciter else 0.45)) for p, k in enumerate(order)
+        }
         self.spans = []
         for level in range(1, n + 1):
-            places = [p for p, k in enumerate(order) if level in (self.ties[k].low, self.ties[k].high)]
+            places = [p for p, k in enumerate(order) if level in (self.connections[k].low, self.connections[k].high)]
             self.spans.append((float(starts[places[0]]), float(starts[places[-1] + 1])) if places else (0.0, self.lane))
         self.width = float(starts[-1])
         self.limits = (-0.3, max(self.width + 1.3, 6.5), -0.9, (n + 0.55) * self.pitch + 0.2)
@@ -108,31 +112,31 @@ class PlatformView(RotorView):
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """Return the foundation, the springs and dampers, the platforms, the exciter."""
         parts = [Part(ground((-0.2, 0.0), (self.width, 0.0)), FOUNDATION)]
-        for k, tie in enumerate(self.ties):
-            if not tie.is_exciter:
-                low, high = (self._height(level, pose, reach) for level in (tie.low, tie.high))
-                low += 0.5 * self.thick if tie.low else 0.0
-                length = (tie.high - tie.low) * self.pitch - self.thick
+        for k, each in enumerate(self.connections):
+            if not each.is_exciter:
+                low, high = (self._height(level, pose, reach) for level in (each.low, each.high))
+                low += 0.5 * self.thick if each.low else 0.0
+                length = (each.high - each.low) * self.pitch - self.thick
                 ends = (self.x[k], low), (self.x[k], high - 0.5 * self.thick)
-                parts += tie_parts(*ends, tie.stiffness, tie.damping, length)
+                parts += spring_and_damper(*ends, each.stiffness, each.damping, length)
         for level, (left, right) in enumerate(self.spans, start=1):
             y = self._height(level, pose, reach)
             parts.append(Part(box(left, right, y - 0.5 * self.thick, y + 0.5 * self.thick), BODY, True))
         return parts + self.wheel.parts(
-            (self.x[len(self.ties) - 1], self._height(self.exciter_level, pose, reach)), pose.rotors[0]
+            (self.x[len(self.connections) - 1], self._height(self.exciter_level, pose, reach)), pose.rotors[0]
         )
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Return the masses on the platforms and the values beside the springs."""
         texts = []
-        for k, tie in enumerate(self.ties):
-            if not tie.is_exciter:
-                middle = 0.5 * self.pitch * (tie.low + tie.high if tie.high - tie.low == 1 else 2 * tie.high - 1)
+        for k, each in enumerate(self.connections):
+            if not each.is_exciter:
+                middle = 0.5 * self.pitch * (each.low + each.high if each.high - each.low == 1 else 2 * each.high - 1)
                 place = (self.x[k] + 0.42, middle)
-                texts.append(Text(*place, spring_text(tie.stiffness, tie.damping), {"va": "center", "fontsize": "small"}))
+                texts.append(Text(*place, spring_text(each.stiffness, each.damping), {"va": "center", "fontsize": "small"}))
         for level, (left, right) in enumerate(self.spans, start=1):
             # The text is on the longer piece of the platform beside the exciter.
-            x = self.x[len(self.ties) - 1]
+            x = self.x[len(self.connections) - 1]
             edges = (
                 [(left, x - self.wheel.rim), (x + self.wheel.rim, right)] if level == self.exciter_level else [(left, right)]
             )
@@ -144,12 +148,12 @@ class PlatformView(RotorView):
 
     def supports(self) -> list[tuple[float, float]]:
         """Return the lower ends of the supports."""
-        return [(self.x[k], 0.0) for k, tie in enumerate(self.ties) if tie.low == 0]
+        return [(self.x[k], 0.0) for k, each in enumerate(self.connections) if each.low == 0]
 
     def support_forces(self, pose: Pose) -> np.ndarray:
         """Return k_i y_i + b_i y_i' of each support, upward."""
         force = self.foundation_stiffness[0] * pose.displacement + self.foundation_damping[0] * pose.velocity
-        return np.array([[0.0, force[tie.high - 1]] for tie in self.ties if tie.low == 0])
+        return np.array([[0.0, force[each.high - 1]] for each in self.connections if each.low == 0])
 
 
 class FrontView(RotorView):
@@ -179,8 +183,8 @@ class FrontView(RotorView):
         x, y = self._centre(pose, reach)
         across, up = self._supports()
         parts = [Part(ground((-1.2, -2.4), (1.6, -2.4)), FOUNDATION), Part(ground((-2.7, 1.2), (-2.7, -1.6)), FOUNDATION)]
-        parts += tie_parts((x, -2.4), (x, y - self.wheel.rim), *up)
-        parts += tie_parts((-2.7, y), (x - self.wheel.rim, y), *across)
+        parts += spring_and_damper((x, -2.4), (x, y - self.wheel.rim), *up)
+        parts += spring_and_damper((-2.7, y), (x - self.wheel.rim, y), *across)
         parts += self.wheel.parts((x, y), pose.rotors[0])
         return parts + (self._section(pose) if self.section else [])
 
@@ -268,7 +272,7 @@ class ShaftView(RotorView):
         """Return foundation, supports, shaft and body, a disc with loads at each station, and the rotor seen along its axis."""
         parts = [Part(ground((-3.2, -2.2), (3.2, -2.2)), FOUNDATION)]
         for s, k, c in self.shaft_supports:
-            parts += tie_parts((self._x(s), -2.2), (self._x(s), self._y(s, pose, reach)), k, c)
+            parts += spring_and_damper((self._x(s), -2.2), (self._x(s), self._y(s, pose, reach)), k, c)
         ends = [self.middle - 3.1 / self.along, self.middle + 3.1 / self.along]
         line = np.array([[self._x(s), self._y(s, pose, reach)] for s in ends])
         parts.append(Part(line, {"color": "black", "lw": 3.5, "zorder": 2.6, "solid_capstyle": "round"}))

@@ -14,7 +14,7 @@ from jaxvib.machine.files import TEMPLATES
 from jaxvib.show import moving
 from jaxvib.show.animate import motion_of_orbit, motion_of_run
 from jaxvib.show.sketch import _INCHES_PER_UNIT
-from jaxvib.show.views import Tie, order_of_ties, view_of
+from jaxvib.show.views import Connection, order_of_connections, view_of
 from jaxvib.show.wheel import Pose, RotorPose, at_rest
 
 SCENE = jv.Scene(
@@ -59,12 +59,13 @@ def test_every_machine_has_a_sketch_with_its_numbers(kind):
 
 
 def test_springs_cross_no_platform_without_an_attachment():
-    ties = [Tie(0, 1), Tie(0, 2), Tie(0, 3), Tie(1, 2), Tie(1, 3), Tie(2, 3), Tie(2, 2)]
-    order = order_of_ties(ties, 3)
+    ends = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3), (2, 2)]
+    connections = [Connection(low, high) for low, high in ends]
+    order = order_of_connections(connections, 3)
     place = {k: x for x, k in enumerate(order)}
-    for k, tie in enumerate(ties):
-        for level in range(tie.low + 1, tie.high):
-            own = [place[j] for j, other in enumerate(ties) if level in (other.low, other.high)]
+    for k, each in enumerate(connections):
+        for level in range(each.low + 1, each.high):
+            own = [place[j] for j, other in enumerate(connections) if level in (other.low, other.high)]
             assert not min(own) < place[k] < max(own)
 
 

@@ -122,8 +122,10 @@ def test_both_views_of_a_rotor_have_its_loads_at_one_height():
 @pytest.mark.parametrize("kind", ["one_mass", "planar_rotor"])
 def test_a_spring_and_its_damper_lie_beside_each_other(kind):
     scene = jv.scene_from_toml(TEMPLATES[kind])
-    ties = [part.points for part in view_of(scene).parts(at_rest(scene), 0.0) if part.look.get("lw") == 1.2 and not part.filled]
-    spring, damper = (each[np.all(np.isfinite(each), axis=1)] for each in ties[:2])
+    lines = [
+        part.points for part in view_of(scene).parts(at_rest(scene), 0.0) if part.look.get("lw") == 1.2 and not part.filled
+    ]
+    spring, damper = (each[np.all(np.isfinite(each), axis=1)] for each in lines[:2])
     across = (spring[0] + spring[-1]) / 2.0 - (np.min(damper, axis=0) + np.max(damper, axis=0)) / 2.0
     along = spring[-1] - spring[0]
     assert np.hypot(*across) == pytest.approx(0.34) and abs(along @ across) < 1e-9 * np.hypot(*along)
