@@ -25,7 +25,8 @@ Points = Array | np.ndarray
 class JammedBodies(eqx.Module):
     """Scene whose loads are G rigid bodies. It is assembled once for each analysis and passed on.
 
-    Identical loads are coincident and form one body. If loads differ, each load is a separate body with a separate angle.
+    Identical loads form one body: they are coincident or, if they have a `ball_radius`, side by side. If loads differ, each
+    load is a separate body with its own angle.
 
     **Attributes**
 
@@ -107,7 +108,7 @@ class JammedBodies(eqx.Module):
 
 
 def jammed_bodies(linear: JammedModel) -> JammedBodies:
-    """Return the coincident loads as bodies on their carrier. **Raises** `InputError` for an unbalanced rotor."""
+    """Return the jammed loads as bodies on their carrier. **Raises** `InputError` for an unbalanced rotor."""
     loads, effects = linear.loads, linear.scene.all_effects
     _require_balance(effects)
     inertia = loads.inertia_factor() * loads.mass * loads.radius**2
@@ -137,8 +138,8 @@ def _require_balance(effects: tuple[Effect, ...]) -> None:
 def friction_on_light_loads(loads: CircularLoads, effects: tuple[Effect, ...], omega: Array, speed: Array) -> Array:
     """Return the torques of dry friction on light loads that turn at `omega` in a rotor of this `speed`, (count,) N m.
 
-    The motion of the carrier is too small to change the normal force on the loads, and the mean contribution of the weight over
-    a turn is 0.
+    The motion of the carrier is too small to change the normal force on the loads. The mean contribution of the weight over a
+    turn is 0 if the normal force does not change its sign (R omega^2 > g); this is assumed at all speeds.
     """
     phi, rate = (jnp.zeros((loads.count,)),), (jnp.full((loads.count,), omega),)
     frictions = (term.friction(loads, phi, rate, speed, {}) for term in terms_of(effects, ContactFriction))

@@ -19,7 +19,8 @@ _TWO_LEVELS = 0.9
 
 
 _BAND = (10.0, 1000.0)
-"""Frequencies, Hz, that the velocity of a vibration includes by ISO 20816."""
+"""Frequencies, Hz, that the velocity of a vibration includes by ISO 20816 for machines above 600 rpm (for slower ones from 2
+Hz)."""
 
 
 class ChannelOverview(NamedTuple):
@@ -31,8 +32,8 @@ class ChannelOverview(NamedTuple):
     - `rate`: sampling rate, Hz, NaN without times; `samples`: number of readings; `start` and `end`: first and last time, s
     - `low` and `high`: smallest and largest reading; `rms`: root mean square of the readings without their mean
     - `main_frequency`, Hz: frequency of the largest line of the spectrum; `velocity`, m/s: root mean square of the velocity
-      from 10 to 1000 Hz, the band of ISO 20816, of a channel of acceleration or velocity. They describe a run at a constant
-      speed, and are NaN for channels without times, with gaps, or with two levels
+      from 10 to 1000 Hz, the band of ISO 20816 for machines above 600 rpm, of a channel of acceleration or velocity. They
+      describe a run at a constant speed, and are NaN for channels without times, with gaps, or with two levels
     - `missing` and `clipped`: numbers of readings
     - `notes`: sentences about gaps, repairs and problems
     """

@@ -81,16 +81,17 @@ def work_precision(
 
     - "amplitude" and "foundation_force" of a jam mode, if exact jams of the scene can be computed. The tiers are leading order,
       exact orbit, averaged equations and full equations; the last two are integrated from the leading-order motion. The
-      reference is the exact orbit with 32 points; its error is the difference from the orbit with 24 points. For other scenes
-      (run-ups, imbalance, loads at different stations), the quantity is measured at the end of a run from rest. The reference
-      is then the full equations with a tolerance of 1e-13; its error is the difference from a run with a tolerance of 1e-11
+      reference is the exact orbit with 32 points on half a period (65 on a period without half-turn symmetry); its error is the
+      difference from the orbit with 24 (49) points. For other scenes (run-ups, imbalance, loads at different stations), the
+      quantity is measured at the end of a run from rest. The reference is then the full equations with a tolerance of 1e-13;
+      its error is the difference from a run with a tolerance of 1e-11
     - "final_state": the state of the full equations at `until`, from rest, by every solver, in double and in single precision.
       The reference is a run with a tolerance of 1e-13, with the estimated error of this run
     - "gradient" of the largest amplitude of the jam with respect to the stiffnesses of the machine: implicit derivatives of
       leading order and exact orbit; forward mode, reverse mode and finite differences through time integration
 
-    Single precision is used for the leading order and for the default method of time integration. A tier that cannot compute
-    the quantity is left out, and the result states the reason.
+    The leading order and the default method of time integration are computed in single precision too. A tier that cannot
+    compute the quantity is left out, and the result states the reason.
 
     **Arguments**
 
@@ -100,7 +101,7 @@ def work_precision(
       loads turn almost with the rotor)
     - `until`: end of the runs, s or text; default: 20 times the longest natural period of the carrier. For a jam, the runs are
       longer: deviations of the start must decay to the tolerance of the run. The largest Floquet multiplier gives the
-      additional time; the total is at most 2000 times this period
+      additional time; the total is at most 2000 times the longest natural period
     - `tolerances` of time integration, at least one; typical: 1e-3 to 1e-11 (the default)
     - `solvers`: names of methods from `SOLVERS`
     - `repeats`: number of timings of each method, fewer if a call takes seconds; the shortest time is reported; typical: 3 (the
