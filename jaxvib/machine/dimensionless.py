@@ -1,5 +1,5 @@
-"""Dimensionless forms of the equations in the two papers on platform machines. A form builds a scene and converts its
-results."""
+"""Machines in the dimensionless parameters of the two papers on platform machines, and conversion of results to these
+parameters."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ class Dimensionless(Readable):
 
     @property
     def length_units(self) -> Array:
-        """Unit rho_i y~ of each platform's v_i, (n,) m."""
+        """Unit rho_i y~ of each platform's v_i, (p,) m."""
         return self._by_platform(self.rho, 1.0) * self.length_unit
 
     @property

@@ -43,11 +43,11 @@ chosen."""
 
 def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     """Return the problem of a motion on nonlinear supports, in which the first values of the linear unknowns are set, and the
-    first values of x.
+    first values of the other unknowns, x.
 
-    The linear response to the first record gives the size of the unbalance, and the responses to the first stretches of all
-    records give the first states. If a fit of the linear machine explains the records as well as the fit that begins with the
-    guided motion, no stop is touched.
+    The linear response to the first record gives the size of the unbalance. The linear responses to the beginnings of all
+    records (their first stretches, see `Samples`) give the first states. If a fit of the linear machine explains the records as
+    well as the fit that begins with the guided motion, no stop is touched.
     """
     noise = [[Noise(np.ones(1), size) for size in of_run] for of_run in channel_sizes(problem)]
     weighted, x = with_noise(problem, noise), np.zeros(problem.unknowns.count)
@@ -80,8 +80,8 @@ def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
 
 
 def _with_first_states(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """Return the linear unknowns of a linear response with the displacements of the first states in m. Those of the response
-    are multiplied by a frequency."""
+    """Return the linear unknowns with the displacements of the first states in m. In the linear response these unknowns are
+    displacements times a frequency."""
     first = linear.copy()
     for samples, indices in zip(problem.runs, linear_indices(problem), strict=True):
         states = model_states(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear[indices]))
@@ -90,7 +90,7 @@ def _with_first_states(problem: Problem, x: np.ndarray, linear: np.ndarray) -> n
 
 
 def _beginning(samples: Samples) -> Samples:
-    """Return the samples, of which only those of the first stretch count."""
+    """Return the samples with the weight 0 for all samples after the first stretch."""
     index = jnp.arange(samples.weights.shape[0] * samples.weights.shape[1]).reshape(samples.weights.shape[:2])
     weights = jnp.where(index[:, :, None] < samples.stretches[1], samples.weights, 0.0)
     return dataclasses.replace(samples, weights=weights)

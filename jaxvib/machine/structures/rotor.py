@@ -117,7 +117,8 @@ class Rotor(Machine):
     def rows_at(self, place: Place, name: str = "place") -> Array:
         """Return the matrix that gives the displacement of the point of the axis at a distance from the centre of mass, m.
 
-        None is the common station of the loads, or the centre of mass if each load has a separate station.
+        If `place` is None, the point is the common station of the loads, or the centre of mass if each load has its own
+        station.
         """
         if isinstance(place, (int, np.integer)):
             raise InputError(
@@ -156,7 +157,8 @@ class Rotor(Machine):
         return np.array([0.0, 1.0, 0.0, 0.0])
 
     def shaft_supports(self) -> list[tuple[float, float, float]]:
-        """Return the two supports with their vertical values; if terms replace these, the values with the same total force."""
+        """Return the place, vertical stiffness and vertical damping of both supports; if terms replace these, the values that
+        have the same c1, c2, b1 and b2."""
         position = np.asarray(self.position)
 
         def vertical(across: Array, up: Array | None, terms: Array | None) -> list[float]:
@@ -201,12 +203,12 @@ def rotor(
     - `damping` (2,) of the supports, N s/m; typical: 100 to 1000; also a ratio "5 %" or a loss factor, see `one_mass`. With
       "5 %" at both supports the translation of the rotor without tilt has this ratio (without `stiffness_terms`)
     - `position` (2,) of the supports along the axis, m from the centre of mass, one side negative; typical: 0.1 to 0.5
-    - `stations` of the loads along the axis, m from the centre of mass, one number or one for each load; a list of equal
-      numbers is one number; typical: -0.3 to 0.3, default 0
+    - `stations` of the loads along the axis, m from the centre of mass, one number for all loads or one for each load (a list
+      of equal numbers counts as one number); typical: -0.3 to 0.3, default 0
     - `stiffness_terms` (c1, c2, c3) in N/m, N, N m: a list of three in place of the terms that follow from the supports;
-      typical: 1e6, up to 2e4, 3e4
+      typical: c1 1e6, c2 -2e4 to 2e4, c3 3e4
     - `damping_terms` (b1, b2, b3) in N s/m, N s, N m s: a list of three in place of the terms that follow from the supports;
-      typical: 800, up to 10, 20
+      typical: b1 800, b2 -10 to 10, b3 20
     - `stiffness_up` (2,), N/m, and `damping_up` (2,), N s/m: vertical values of the supports; `stiffness` and `damping` are
       then the horizontal values; typical: 0.5 to 2 times the horizontal values; default: the horizontal values
 
@@ -217,7 +219,7 @@ def rotor(
     - wrong units and values that are not allowed
     - supports at one place
     - a polar inertia above twice the transverse one
-    - terms that no supports can have (negative ones, or c2^2 > c1 c3), or terms together with vertical values
+    - terms that no supports can have (a negative c1 or c3, or c2^2 > c1 c3), or terms together with vertical values
 
     >>> import jaxvib as jv
     >>> machine = jv.rotor(mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(0.604e6, 0.555e6),
