@@ -181,9 +181,9 @@ def tolerance_table(ranges: Sequence[ToleranceRange], tolerances: Sequence[str])
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
-    """Return a table with a title, column heads and lines; the first column is aligned to the left, the others to the right.
+    """Return a table with a title, column headers and lines; the first column is aligned to the left, the others to the right.
 
-    Empty columns are omitted. The table fits into a terminal of 80 columns; longer heads and texts continue on a new line.
+    Empty columns are omitted. The table fits into a terminal of 80 columns; longer headers and texts continue on a new line.
     """
     from rich.console import Console  # slow import, which --json does not need
     from rich.table import Table

@@ -160,7 +160,7 @@ def misplaced_name(name: str, tables: Tables, kind: str, allowed: list[str]) -> 
     own, other = (f"{'an' if each == 'identification' else 'a'} {each} file" for each in (kind, found))
     if found == kind or not present[found]:
         is_outside = kind == "scene" and not isinstance(tables[name], (Mapping, list))
-        advice = "write it below the head of its table, such as [machine]" if is_outside else suggest_name(name, allowed)
+        advice = "write it below the header of its table, such as [machine]" if is_outside else suggest_name(name, allowed)
         return InputError(name, f"is not part of {own}; {advice}")
     taken = f"`jaxvib {_COMMANDS[found]}`" if found in _COMMANDS else "commands such as modes and regimes"
     new = f"`jaxvib new {'sweep' if kind == 'study' else kind}` prints {own}"
@@ -176,7 +176,8 @@ def load_scene(path: str | Path) -> Scene:
     drive of the kind `torque_table` may have `file`, a CSV file with speeds and torques, relative to the scene file, in place
     of its lists.
 
-    **Returns** `Scene`. **Raises** `InputError` for a file that cannot be read, and for each error in it, naming the field.
+    **Returns** `Scene`. **Raises** `InputError` for a file that cannot be read, and for the first error in it; the message
+    names the field.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES

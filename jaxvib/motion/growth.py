@@ -126,21 +126,23 @@ def growth(
       unstable if it returns to its former state within three turns of its rotor and loads. An unstable jam is an example; its
       exponent is ln|multiplier| divided by the period of `jam_orbit`. An unstable motion that repeats itself only after more
       turns is called chaotic
-    - "regular": G + 3 s < ln 1000 and G < 2 s; or G < ln 2.1 with rates that decrease as for growth proportional to time
+    - "regular": G + 3 s < ln 1000, and one of two conditions: G is not larger than 2 s or ln 1.01, the growth that errors of
+      integration can cause; or G < ln 2.1 with rates that decrease as for growth proportional to time
     - "undecided": all other cases, for example if the rate is certain but the run is too short to reach ln 1000
 
     Rounding makes every run leave an unstable motion after some time. The result then belongs to the motion that it reaches.
 
     **Arguments**
 
-    - `scene` with a drive of constant speed, or with several exciters, whose drives may be motors
+    - `scene` with drives of constant speed or motors; a single exciter with loads needs a constant speed
     - `until`, s or text: approximate length of all stretches together; each stretch is a whole number of turns of the rotor;
       typical: 20 to 200
     - `start`, `mode`, `separation`: as for `simulate`, except "spin_up"
     - `stretches`: number of stretches, at least 8; typical: 40 (the default). One stretch must be so short that two motions
       with the initial distance d_0 are still close to each other at its end
 
-    **Returns** `Growth`. **Raises** `InputError` for a rotor whose speed changes; `ComputationError` for a run that fails.
+    **Returns** `Growth`. **Raises** `InputError` for a drive whose prescribed speed changes, and for the motor of a
+    single exciter with loads; `ComputationError` for a run that fails.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

@@ -21,8 +21,8 @@ from jaxvib.results.fields import Labels, columns, labels_of
 def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool = False, decimal_comma: bool = False) -> Path:
     """Write all quantities of a result along an axis into a CSV file, a row for each point of the axis.
 
-    The head of a column consists of the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have 9
-    digits. Complex numbers have one column for the real part and one for the imaginary part. A point at which two pieces of a
+    The header of a column consists of the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have
+    9 digits. Complex numbers have one column for the real part and one for the imaginary part. A point at which two pieces of a
     curve meet has one row.
 
     **Arguments**
@@ -76,7 +76,7 @@ def main_axis(result: eqx.Module) -> str:
 
 
 def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict[str, np.ndarray]:
-    """Return the columns of the table of `write_csv` by their heads. **Raises** `InputError` for an unknown axis."""
+    """Return the columns of the table of `write_csv` by their headers. **Raises** `InputError` for an unknown axis."""
     labels = labels_of(result)
     units = labels.get("unit", ())
     table: dict[str, np.ndarray] = {}

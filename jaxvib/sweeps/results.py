@@ -22,7 +22,7 @@ _MAX_READ = 1_000_000
 
 
 def results_table(store: str | Path) -> tuple[str, list[str], list[list[str]]]:
-    """Return the results of a study as title, heads and rows of a table, in display units.
+    """Return the results of a study as title, headers and rows of a table, in display units.
 
     A study with at most 40 cases has a row for each finished case, in which absent quantities are empty. For more cases the
     table has a row for each measure with numbers: least value, median and largest value. The table of more than a million cases

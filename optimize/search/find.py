@@ -222,10 +222,11 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
 
     In each bounded problem the parameters vary continuously between two values of their catalogues. The problem with the best
     design is divided next. The search ends when the best design of such a problem has catalogue values only. Since each search
-    is local, the global optimum is not guaranteed. An interrupt (KeyboardInterrupt) ends the search with the nearest choice.
+    is local, the global optimum is not guaranteed. An interrupt (KeyboardInterrupt) ends the search with the design of the
+    nearest catalogue values.
 
-    **Returns** a choice with a violation if no choice meets all demands, a choice that has not converged after the largest
-    number of nodes, and None if the objective does not exist.
+    **Returns** the best design with catalogue values; a design with a violation if no such design meets all demands; a design
+    marked as not converged if the maximum number of nodes was reached; None if the objective does not exist.
     """
     root = find(problem, options, lambda what, share: report(what, 0.5 * share))
     choices = problem.space.choices
@@ -284,9 +285,9 @@ def _split_bounds(node: SearchResult, choice: Choice, numbers: np.ndarray) -> It
 
 
 def _interrupted(problem: Problem, root: SearchResult) -> SearchResult:
-    """Return the nearest choice to the best design of an interrupted search.
+    """Return the design with the catalogue values nearest to the best design of an interrupted search.
 
-    **Raises** `KeyboardInterrupt` if the objective does not exist for this choice.
+    **Raises** `KeyboardInterrupt` if the objective does not exist for this design.
     """
     result = _nearest_choice(problem, root)
     if result is None:

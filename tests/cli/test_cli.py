@@ -293,7 +293,7 @@ WRONG = [
     (("[machine]", "[machin]"), "machin is not part of a scene file; did you mean 'machine'"),
     (("[machine]", "[machine"), "is not a TOML file"),
     (("drag = 1.5", "drag = 1,5"), "; write decimals with a point, not with a comma"),
-    (("[machine]", "mass = 5.0\n[machine]"), "mass is not part of a scene file; write it below the head of its table"),
+    (("[machine]", "mass = 5.0\n[machine]"), "mass is not part of a scene file; write it below the header of its table"),
 ]
 
 
