@@ -25,8 +25,8 @@ from jaxvib.cli.output import csv_options
 @csv_options
 @shared
 def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: Path | None, output: Output) -> None:
-    """List the whirl speeds of the rotor in SCENE, forward, backward or straight (the axis moves on a straight line), and its
-    critical speeds; --out adds the Campbell diagram."""
+    """List the whirl frequencies of the rotor in SCENE, forward, backward or straight (the axis moves on a straight line), and
+    its critical speeds; --out adds the Campbell diagram."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.units import number
@@ -57,7 +57,7 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: 
         whirl_speeds = [[sense(w), f"{scale * w['speed']:.6g}", f"{w['decay']:.4g}"] for w in whirls]
         return "\n".join(
             [
-                table("critical speeds: whirl speed = rotor speed", ["", unit], rows),
+                table("critical speeds: whirl frequency = rotor speed", ["", unit], rows),
                 table(f"whirl at {speed_text(rotor_speed)}", ["", unit, "decay, 1/s"], whirl_speeds),
             ]
         )

@@ -26,15 +26,15 @@ def campbell_diagram(
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw whirl speeds over the rotor speed: lines of forward whirls are solid, of backward whirls dashed, of straight motions
-    dash-dotted.
+    """Draw whirl frequencies over the rotor speed: lines of forward whirls are solid, of backward whirls dashed, of straight
+    motions dash-dotted.
 
     **Arguments** (ns rotor speeds, nd whirls at each)
 
-    - `rotor_speed` (ns,), `speed` (ns, nd): rotor speed and whirl speeds, rad/s, drawn in `unit`
+    - `rotor_speed` (ns,), `speed` (ns, nd): rotor speed and whirl frequencies, rad/s, drawn in `unit`
     - `sense` (ns, nd): "forward", "backward" or "straight"
-    - `critical`: critical speeds (k,), rad/s, and their senses (k,), marked with their values on the line whirl speed = rotor
-      speed
+    - `critical`: critical speeds (k,), rad/s, and their senses (k,), marked with their values on the line whirl frequency =
+      rotor speed
     - `at`: operating speed, rad/s; default: the rotor speed if there is only one, otherwise none
 
     >>> import numpy as np
@@ -52,20 +52,20 @@ def campbell_diagram(
     found = np.zeros(0) if critical is None else critical[0][np.isfinite(critical[0])]
     right = scale * max(float(np.max(rotor_speed)), 0.0 if at is None else 1.05 * at)
     top = 1.12 * scale * max(float(np.nanmax(speed)), *(w for w in found if scale * w <= right), 1e-300)
-    axis.plot([0.0, top], [0.0, top], color=GUIDE, lw=0.9, ls=":", label="whirl speed = rotor speed")
+    axis.plot([0.0, top], [0.0, top], color=GUIDE, lw=0.9, ls=":", label="whirl frequency = rotor speed")
     if critical is not None:
         _critical_marks(axis, scale * critical[0], critical[1], right, top)
         axis.plot([], [], "o", ms=6.0, mfc="white", mec="black", label=f"critical speeds (no damping), {unit}", ls="")
     if at is not None:
         axis.axvline(scale * at, label="operating speed", **OPERATING)
     left = scale * float(np.min(rotor_speed)) if len(rotor_speed) > 1 else 0.0
-    axis.set(xlim=(left, right), ylim=(0.0, top), xlabel=f"rotor speed, {unit}", ylabel=f"whirl speed, {unit}")
+    axis.set(xlim=(left, right), ylim=(0.0, top), xlabel=f"rotor speed, {unit}", ylabel=f"whirl frequency, {unit}")
     legend_above(axis, 3)
     return figure if ax is None else ax
 
 
 def _critical_marks(axis: Axes, speed: np.ndarray, sense: np.ndarray, right: float, top: float) -> None:
-    """Draw critical speeds as points on the line whirl speed = rotor speed, with their values beside vertical lines.
+    """Draw critical speeds as points on the line whirl frequency = rotor speed, with their values beside vertical lines.
 
     Close critical speeds share a text.
     """
@@ -83,7 +83,7 @@ def _critical_marks(axis: Axes, speed: np.ndarray, sense: np.ndarray, right: flo
 def whirl_lines(speed: np.ndarray, has_sense: np.ndarray) -> np.ndarray:
     """Return the lines (k, ns) of the whirls of one sense over ns rotor speeds.
 
-    **Arguments**: `speed` (ns, nd): all whirl speeds; `has_sense` (ns, nd): True for whirls of the requested sense.
+    **Arguments**: `speed` (ns, nd): all whirl frequencies; `has_sense` (ns, nd): True for whirls of the requested sense.
 
     Line k has the k-th lowest speed of this sense, and is therefore continuous if lines of different sense cross. The line is
     NaN at rotor speeds with fewer whirls of this sense.

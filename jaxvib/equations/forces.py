@@ -217,7 +217,7 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     - M_j is the torque of the rotor on load j; `friction` is the torque of contact friction
     - T is the torque with which an ideal drive turns its rotor against the loads, the unbalance S with the other imbalances (d,
       see `energy`) and the weight of the unbalance; g is the gravity in the plane of the rotor
-    - `speed` is the speed of the rotor. If the housing of the drive turns with the machine, the speed in P_in is that of the
+    - `speed` is the rotor speed. If the housing of the drive turns with the machine, the speed in P_in is that of the
       rotor relative to the housing
     - the effects that dissipate power are those on supports, contacts between loads, and resistances to the motion of the loads
     - loads that slide also dissipate the power -F_t.c of the contact force F_t at the sliding velocity c, and P_in includes the

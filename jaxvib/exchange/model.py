@@ -217,7 +217,7 @@ def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
 
 
 def without_motor_states(state: State) -> State:
-    """Return a state, or its units, without the states of motors other than the angle and the speed of the rotor."""
+    """Return a state, or its units, without the states of motors other than the angle and the rotor speed."""
     exciters = [replace(exciter, rotor=None if exciter.rotor is None else exciter.rotor[:2]) for exciter in state.exciters]
     return replace(state, exciters=exciters)
 

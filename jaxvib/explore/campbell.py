@@ -27,7 +27,7 @@ _LETTER_WIDTH = 0.11
 _LEGEND = {
     "forward whirl": _SENSE_STYLES["forward"],
     "backward whirl": _SENSE_STYLES["backward"],
-    "whirl speed = rotor speed": ROTOR,
+    "whirl frequency = rotor speed": ROTOR,
     "operating speed": OPERATING,
     "critical speeds (no damping), rpm": _CRITICAL,
 }
@@ -35,9 +35,9 @@ _LEGEND = {
 
 
 def campbell(result: Whirl, at: float) -> str:
-    """Draw the whirl speeds over the rotor speed, with the critical speeds, in rpm, like `Whirl.plot`.
+    """Draw the whirl frequencies over the rotor speed, with the critical speeds, in rpm, like `Whirl.plot`.
 
-    **Arguments**: `result`: whirl speeds of one scene at several rotor speeds; `at`: the operating speed, rad/s.
+    **Arguments**: `result`: whirl frequencies of one scene at several rotor speeds; `at`: the operating speed, rad/s.
 
     **Returns** the text of an SVG file.
 
@@ -46,7 +46,7 @@ def campbell(result: Whirl, at: float) -> str:
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
     >>> scene = jv.scene_from_toml(TEMPLATES["planar_rotor"])
-    >>> "whirl speed, rpm" in campbell(jv.whirl(scene, np.linspace(0.0, 600.0, 31)), at=460.0)
+    >>> "whirl frequency, rpm" in campbell(jv.whirl(scene, np.linspace(0.0, 600.0, 31)), at=460.0)
     True
     """
     scale, rotor_speed = speed_unit("rpm")[1], np.asarray(result.rotor_speed)
@@ -56,7 +56,7 @@ def campbell(result: Whirl, at: float) -> str:
     groups = critical_groups(critical, critical_sense, right)
     shown = [k for group, _ in groups for k in group]
     top = 1.12 * max(scale * float(np.nanmax(speed)), *critical[shown].tolist(), 1e-300)
-    panel = Panel(FIRST, "whirl speed, rpm", (0.0, right), (0.0, top), wide=3.0 * WIDE + 2.0 * APART)
+    panel = Panel(FIRST, "whirl frequency, rpm", (0.0, right), (0.0, top), wide=3.0 * WIDE + 2.0 * APART)
     parts, texts = panel.frame(), panel.texts()
     for word, look in _SENSE_STYLES.items():
         parts += [panel.line(scale * rotor_speed, scale * values, look) for values in whirl_lines(speed, sense == word)]

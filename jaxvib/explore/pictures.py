@@ -25,7 +25,7 @@ from jaxvib.steady.whirl import critical_speeds, whirl
 _ABOUT_SLIDERS = """The sliders of masses, springs, dampers, radii, drags, unbalances and torques range from a tenth to ten
 times the value in the file. The arrow keys move a slider by one step; the field above the sliders sets one to a number."""
 
-_ABOUT_LOADS = """Each number of loads needs its own compiled program. The programs for the seven numbers next to the number
+_ABOUT_LOADS = """Each number of loads needs its own compiled program. The programs for the seven numbers closest to the number
 in the file are compiled while the page is open; any other takes one or two seconds the first time and is then stored.
 
 Amplitudes and forces are zero to peak. The page shows the theory of light loads. For exact results, save the machine and run
@@ -38,7 +38,7 @@ _CAMPBELL_SPEEDS = 81
 """Number of rotor speeds of a Campbell diagram."""
 
 _PREPARED_COUNTS = 7
-"""Number of further numbers of loads for which programs are compiled while the page is open."""
+"""Programs are compiled for this many other numbers of loads while the page is open."""
 
 
 class SceneOrProblem(NamedTuple):
@@ -150,9 +150,9 @@ def heading(scene: Scene) -> str:
             "speed are those of the jam modes at this rotor speed."
         )
     return (
-        "Whirl speeds of the rotor over the rotor speed (Campbell diagram), with the masses of the loads fixed to the rotor, "
-        "and critical speeds. There is no branch diagram and no force chart, because the loads of a machine that moves in two "
-        "directions can jam at any phases; `jaxvib modes` finds these jams."
+        "Whirl frequencies of the rotor over the rotor speed (Campbell diagram), with the masses of the loads fixed to the "
+        "rotor, and critical speeds. There is no branch diagram and no force chart, because the loads of a machine that moves "
+        "in two directions can jam at any phases; `jaxvib modes` finds these jams."
     )
 
 
@@ -168,7 +168,7 @@ def diagram(scene: Scene, max_speed: float) -> str:
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
-    >>> "whirl speed, rpm" in diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), max_speed=600.0)
+    >>> "whirl frequency, rpm" in diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), max_speed=600.0)
     True
     """
     from jaxvib.explore.campbell import campbell  # slow import

@@ -21,7 +21,7 @@ status `patterned` with this probability for each channel."""
 _ANGLE_NAMES = ("the rotor's angle", "the angle of the jammed loads")
 
 _WINDOWS, _ORDERS = 16, 3
-"""Number of stretches of a record, and number of orders of the rotor's speed, at which residuals are compared with noise."""
+"""Number of stretches of a record, and number of orders of the rotor speed, at which residuals are compared with noise."""
 
 _CONTRADICTION = 4.0
 """Distance of a fitted value from its known value, in standard errors, above which the records contradict the known value."""
@@ -34,7 +34,7 @@ _COARSE_ANGLE = 0.3
 """Standard error of the rotor's angle, rad, above which the response is not linear in it."""
 
 _DECAY_TIMES = 2.0
-"""Duration of a run, in decay times of the slowest mode, below which a note says that it is short."""
+"""Duration of a run, in decay times of the mode that decays most slowly, below which a note says that it is short."""
 
 _UNEXPLAINED = 0.5
 """Standard deviation of a channel's residuals, relative to that of its readings, above which the model does not resemble the
@@ -141,7 +141,7 @@ def resembles(fitted: Fitted) -> bool:
 
 
 def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
-    """Yield sentences about vibrations that are not at the speed of the rotor: in the residuals, or in the readings if there is
+    """Yield sentences about vibrations that are not at the rotor speed: in the residuals, or in the readings if there is
     no fit."""
     problem = fitted.problem
     # Readings of jammed loads and of contacts are not at that speed.
@@ -170,9 +170,9 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
 
 
 def residual_chance(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray, fitted_count: int) -> float:
-    """Return the probability that pure noise has vibrations at orders of the rotor's speed as strong as those of the residuals.
+    """Return the probability that pure noise has vibrations at orders of the rotor speed as strong as those of the residuals.
 
-    The residuals are filtered to white noise and compared with vibrations at the first orders of the rotor's speed in each
+    The residuals are filtered to white noise and compared with vibrations at the first orders of the rotor speed in each
     stretch of the record, by an F test.
 
     **Arguments**: `residuals` (n,), NaN for samples that do not count; `taps` of the filter; `angle` (n,) rad; `fitted_count`:
@@ -230,7 +230,7 @@ def coverage_notes(fitted: Fitted, frequency: np.ndarray, damping_ratio: np.ndar
         if lasts < _DECAY_TIMES * longest:
             each = f"{longest:.3g} s each" if math.isfinite(longest) else "which does not decay"
             yield (
-                f"run {k + 1} lasts {lasts:.3g} s, less than two decay times of the slowest mode ({each}): its "
+                f"run {k + 1} lasts {lasts:.3g} s, less than two decay times of the mode that decays most slowly ({each}): its "
                 "response cannot be distinguished from the free vibration at its start; record a longer run"
             )
 

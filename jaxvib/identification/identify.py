@@ -77,7 +77,7 @@ class MachineFit(Result):
       the loads, their speeds and the angle of the rotor at the first sample; empty without loads
     - `channels`: names of the compared channels of each run, and their `kinds`
     - `noise`: standard deviation of the residuals of each run's channels, SI
-    - `chance`: probability that pure noise has vibrations at orders of the rotor's speed that are as strong as those of the
+    - `chance`: probability that pure noise has vibrations at orders of the rotor speed that are as strong as those of the
       residuals; the smallest one of all channels
     - `time`, s, `readings`, and `fitted` (readings of the fitted model), SI: arrays for each run, NaN for samples that do not
       count
@@ -213,7 +213,7 @@ def identify(
     - `throw`: True (the default) to raise an error if there is no fit
 
     **Returns** `MachineFit`, or `Identified` for a pendulum. **Raises** `InputError` for records that cannot be fitted,
-    `ComputationError` "not_converged", or "contradicted" if the records contain a vibration that is not at the rotor's speed.
+    `ComputationError` "not_converged", or "contradicted" if the records contain a vibration that is not at the rotor speed.
 
     >>> import numpy as np, jaxvib as jv
     >>> rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625)

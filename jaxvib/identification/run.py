@@ -178,7 +178,7 @@ class MeasuredRun(Readable):
         return 1.0 / float(np.median(np.diff(self.times[name])))
 
     def rotor_speed(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return times, s, and the speed of the rotor, rad/s, from pulses, else from angle or speed; None without such a
+        """Return times, s, and the rotor speed, rad/s, from pulses, else from angle or speed; None without such a
         channel.
 
         The speed from pulses is the average over each turn.

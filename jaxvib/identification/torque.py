@@ -187,7 +187,7 @@ class _Trial(NamedTuple):
 def fit_with_torques(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
     """Return the fit of a problem from the unknowns `starts`.
 
-    If a number of a motor is unknown, the vibrations and the speed of the rotor are fitted together. The fit is then repeated
+    If a number of a motor is unknown, the vibrations and the rotor speed are fitted together. The fit is then repeated
     with the predicted angle of the rotor, which contains its ripple within each turn.
     """
     fitted = fit_from(problem, starts)

@@ -135,8 +135,8 @@ class Whirl(Result):
     def plot(self, *, at: float | None = None, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot the Campbell diagram: speeds of forward, backward and straight whirls over the rotor speed.
 
-        Critical speeds are marked on the line on which the whirl speed is equal to the rotor speed. A vertical line marks the
-        operating speed `at` if it is given.
+        Critical speeds are marked on the line on which the whirl frequency is equal to the rotor speed. A vertical line marks
+        the operating speed `at` if it is given.
 
         **Arguments**: `at`, rad/s; `unit` of the speeds.
         """
@@ -151,11 +151,11 @@ class Whirl(Result):
 
 @validated
 def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: LoadMasses = "fixed") -> Whirl:
-    """Return the whirl speeds of the scene's rotor, with its damping, at one or several rotor speeds.
+    """Return the whirl frequencies of the scene's rotor, with its damping, at one or several rotor speeds.
 
         (K + i w (C + n G) - w^2 M) X = 0,      q = Re(X exp(i w t)),  w complex
 
-    The eigenvalues are those of the first-order form; n is the rotor's speed.
+    The eigenvalues are those of the first-order form; n is the rotor speed.
 
     **Arguments**
 

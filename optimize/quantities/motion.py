@@ -33,8 +33,8 @@ def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
     """Return the largest foundation force, N, of a run from rest (full equations).
 
     The force is read at 4000 times of the run. The value is therefore too small by up to some per cent if the run is long and
-    the peak short, as that of a collision with a `Stop`. The measure `run.peak_force` of sweeps reads each step; its error is
-    that of the steps.
+    the peak is short, such as the peak of a collision with a `Stop`. The measure `run.peak_force` of sweeps reads each step;
+    its error is that of the steps.
 
     **Arguments**
 

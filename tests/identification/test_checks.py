@@ -142,7 +142,7 @@ def runs_of(time, speeds):
             ["passes through a resonance: the rotors turn at 10 to 50 rad/s", "are 60, 80 rad/s;"],
         ),
         ([9.0], 40.0, ["no run passes through a resonance"]),
-        ([30.0], 6.5, ["run 1 lasts 6.5 s, less than two decay times of the slowest mode (3.33 s each)"]),
+        ([30.0], 6.5, ["run 1 lasts 6.5 s, less than two decay times of the mode that decays most slowly (3.33 s each)"]),
         ([], 10.0, []),
     ],
 )

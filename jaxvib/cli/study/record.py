@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from jaxvib.exchange.recordings.overview import ChannelOverview
 
 _SHOWN_TIMES = 9
-"""Number of times in the table of the rotor's speed."""
+"""Number of times in the table of the rotor speed."""
 
 _VIBRATIONS = frozenset({"acceleration", "velocity", "displacement", "force"})
 """Kinds of channels in the table of vibrations."""
@@ -29,7 +29,7 @@ _VIBRATIONS = frozenset({"acceleration", "velocity", "displacement", "force"})
 @shared
 def record(recording: Path, pulses: str | None, per_turn: int, speed: str | None, rate: str | None, output: Output) -> None:
     """Describe a RECORDING (CSV, TDMS, UFF, MAT, WAV, MF4): its channels with their units, rates, gaps and clipped readings,
-    RMS and main frequency of vibrations, and the speed of the rotor over time. --out adds the figure."""
+    RMS and main frequency of vibrations, and the rotor speed over time. --out adds the figure."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.display import speed_text

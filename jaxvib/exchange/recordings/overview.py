@@ -1,4 +1,4 @@
-"""Overview of a recording: rate, gaps, missing and clipped readings of each channel, and the speed of the rotor."""
+"""Overview of a recording: rate, gaps, missing and clipped readings of each channel, and the rotor speed."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
         if not is_jammed(problem, linear):
             raise InputError(
                 f"candidates: {planned.name}: drive",
-                "has a speed at which the loads do not stay jammed below the speed of the rotor; give a faster drive",
+                "has a speed at which the loads do not stay jammed below the rotor speed; give a faster drive",
             )
     elif has_supports(scene):
         problem = problem._replace(linear=linear)

@@ -38,7 +38,7 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.numerics.noise import Noise
 
 _BELOW_ROTOR = 0.95
-"""Largest speed of a jam relative to the smallest speed of the rotor."""
+"""Largest speed of a jam relative to the lowest rotor speed."""
 
 _BAND_HALF_WIDTH = 0.25
 """Relative half-width of the band of frequencies about the speed of a jam from which the angle of the loads follows."""
@@ -48,7 +48,7 @@ _EDGE_TURNS = 3
 
 _BINS_PER_LINE, _MIN_LINE_POWER = 5, 4.0
 """Number of bins of a spectrum that are averaged, and smallest power of the jam in them relative to the mean power below the
-speed of the rotor."""
+rotor speed."""
 
 _MIN_TURNS = 8
 """Smallest number of turns of jammed loads in a record."""
@@ -103,7 +103,7 @@ def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     If the motion with the first values of the scene does not resemble the records, it is computed again with other stiffnesses,
     see `_stiffnesses_of_jam`.
 
-    **Raises** `InputError` for a run without a vibration below the speed of the rotor.
+    **Raises** `InputError` for a run without a vibration below the rotor speed.
     """
     noise = [[Noise(np.ones(1), size) for size in of_run] for of_run in channel_sizes(problem)]
     weighted_problem, jams = with_noise(problem, noise), [_jam_of(problem, r) for r in range(len(problem.runs))]
@@ -201,7 +201,7 @@ def load_spread_of(problem: Problem, linear: np.ndarray) -> np.ndarray:
 
 
 def _jam_of(problem: Problem, r: int) -> _Jam:
-    """Return the jam of a run, from the strongest vibration below the speed of the rotor."""
+    """Return the jam of a run, from the strongest vibration below the rotor speed."""
     samples, raw, mask, time = problem.runs[r], problem.raw[r], problem.masks[r], problem.times[r]
     step = float(samples.step)
     speed = np.abs(np.gradient(problem.angles[r][:, 0], step))
@@ -217,7 +217,7 @@ def _jam_of(problem: Problem, r: int) -> _Jam:
     if not np.max(power) > _MIN_LINE_POWER * np.sum(power) / max(np.count_nonzero(in_range), 1):
         raise InputError(
             f"records[{r}]",
-            f"has no vibration of jammed loads below {high:.3g} rad/s, {_BELOW_ROTOR:.0%} of the smallest speed of the rotor; "
+            f"has no vibration of jammed loads below {high:.3g} rad/s, {_BELOW_ROTOR:.0%} of the lowest rotor speed; "
             "identify needs records in which the loads of the scene are jammed from the first sample to the last, for at least "
             "8 turns",
         )

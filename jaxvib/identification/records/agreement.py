@@ -66,7 +66,7 @@ def check_agreement(
     """Compare the channels of a run with one another, and return notes about clocks and aliasing.
 
     **Raises** `InputError` for a wrong unit, a reversed sign, swapped channels, different shafts, and a sampling rate that is
-    too low for the speed of the rotor.
+    too low for the rotor speed.
     """
     signals = [_Signal(channel, times[channel.name], values[channel.name]) for channel in channels]
     speeds = [_Signal(each.channel, *rotor_speed(*each)) for each in signals if each.channel.kind in ROTOR_KINDS]
@@ -81,7 +81,7 @@ def check_agreement(
 
 
 def rotor_speed(channel: Channel, time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return times, s, and the speed of the rotor, rad/s, from a channel of pulses (`value`: their numbers), angle or speed.
+    """Return times, s, and the rotor speed, rad/s, from a channel of pulses (`value`: their numbers), angle or speed.
 
     For pulses the speed is the average over each turn, because marks may be unevenly spaced.
     """
@@ -248,7 +248,7 @@ def _aliasing(motion: _Signal, speeds: Sequence[_Signal], source: str) -> list[s
     where = f"{source}: channel {quoted(motion.channel.name)}"
     fastest_hertz = max((float(np.quantile(np.abs(each.value), 0.99)) for each in speeds), default=0.0) / (2.0 * np.pi)
     if fastest_hertz > 0.5 * rate:
-        problem = f"is sampled at {rate:.4g} Hz, less than twice the largest speed of the rotor, {fastest_hertz:.4g} Hz"
+        problem = f"is sampled at {rate:.4g} Hz, less than twice the highest rotor speed, {fastest_hertz:.4g} Hz"
         raise InputError(where, f"{problem}: its vibration is aliased; record at more than {2.56 * fastest_hertz:.3g} Hz")
     length = min(motion.value.size, _ALIASING_LENGTH)
     starts = np.unique(np.linspace(0, motion.value.size - length, _ALIASING_PIECES).astype(int))

@@ -21,9 +21,9 @@ _MIN_TURNS, _MIN_SAMPLES = 16, 512
 
 
 class ForeignVibration(NamedTuple):
-    """Vibration that is not at the speed of the rotor.
+    """Vibration that is not at the rotor speed.
 
-    **Attributes**: `order`: frequency relative to the rotor's speed, None for a vibration of constant frequency; `frequency`,
+    **Attributes**: `order`: frequency relative to the rotor speed, None for a vibration of constant frequency; `frequency`,
     Hz, None for a vibration whose frequency follows the rotor; `share` of the power of the signal.
     """
 
@@ -34,11 +34,11 @@ class ForeignVibration(NamedTuple):
     @property
     def frequency_text(self) -> str:
         """Frequency of the vibration, in words."""
-        return f"at {self.frequency:.3g} Hz" if self.order is None else f"at {self.order:.3g} times the rotor's speed"
+        return f"at {self.frequency:.3g} Hz" if self.order is None else f"at {self.order:.3g} times the rotor speed"
 
 
 def foreign_vibration(values: np.ndarray, angle: np.ndarray, step: float) -> ForeignVibration | None:
-    """Return the vibration that has most of the power of a signal if it is not at the speed of the rotor, otherwise None.
+    """Return the vibration that has most of the power of a signal if it is not at the rotor speed, otherwise None.
 
     The spectra over the rotor's angle and over time are compared: a vibration that follows the rotor is a line in the first
     one, a vibration of constant frequency in the second one.

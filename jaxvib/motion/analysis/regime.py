@@ -266,7 +266,7 @@ def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
 def _is_rotor_caught(scene: Scene, natural: Array, rotor: Array) -> Array:
     """Return True if the rotor of a motor is caught at a resonance.
 
-    The speed of the rotor is then at most 15 % below or 2 % above the resonance, and more than 5 % below the no-load speed of
+    The rotor speed is then at most 15 % below or 2 % above the resonance, and more than 5 % below the no-load speed of
     the motor.
     """
     if scene.drive.ideal:

@@ -214,7 +214,7 @@ class JamModes(AbstractJam):
 
 
 def modes_table(jams: JamModes, growth: Mapping[int, float]) -> list[list[str]]:
-    """Return the heads and the rows of the table of all jam modes that exist.
+    """Return the headers and the rows of the table of all jam modes that exist.
 
     **Arguments**: `growth`: growth rates of disturbances that separate the loads, 1/s, by mode number; missing if unknown.
     """
@@ -299,7 +299,7 @@ def jam_modes(scene: Scene) -> JamModes:
     **Raises** `InputError` for
 
     - loads without drag or at different stations
-    - a machine whose coordinates couple through the rotor's speed
+    - a machine whose coordinates couple through the rotor speed
     - a motor in place of a prescribed speed
     - effects that this function does not include (`CubicSupport`, `Stop`)
 

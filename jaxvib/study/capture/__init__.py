@@ -1,1 +1,1 @@
-"""Capture: initial speeds from which the balls of a torus reach the speed of the rotor."""
+"""Capture: initial speeds from which the balls of a torus reach the rotor speed."""

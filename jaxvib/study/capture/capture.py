@@ -124,7 +124,7 @@ class Capture(Result):
         if np.isnan(self.threshold):
             return head
         below = self.fraction[self.speed < float(self.threshold)]
-        threshold_text = f"threshold {float(self.threshold):.4f} +- {float(self.uncertainty):.1e} of the rotor's speed"
+        threshold_text = f"threshold {float(self.threshold):.4f} +- {float(self.uncertainty):.1e} of the rotor speed"
         captures_below = f"; below it {100.0 * np.mean(below):.3g} % are also captured" if np.any(below > 0.0) else ""
         return f"{head}\n  {threshold_text}{captures_below}"
 
@@ -174,7 +174,7 @@ def capture(
     doublings: int = DOUBLINGS,
     equations: Equations = vector_field,
 ) -> Capture:
-    """Find the initial speeds from which the balls of a torus reach the speed of the rotor, and the threshold of these speeds.
+    """Find the initial speeds from which the balls of a torus reach the rotor speed, and the threshold of these speeds.
 
     - For each speed, runs start from `starts` positions of the loads along the ring. Each run is integrated to its end, because
       a capture may occur late

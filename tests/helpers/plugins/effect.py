@@ -10,7 +10,7 @@ from jaxvib.machine.numbers import read_numbers, unit
 
 
 class SealFriction(Effect):
-    """A torque `torque` tanh(slip / `width`), N m, of the rotor on each load, slip = the rotor's speed less the load's."""
+    """A torque `torque` tanh(slip / `width`), N m, of the rotor on each load, slip = the rotor speed less the load's."""
 
     torque: Array = eqx.field(metadata=unit("N m", low=0.0))
     width: Array = eqx.field(metadata=unit("rad/s", low=0.0, open_low=True))

@@ -194,7 +194,7 @@ def test_run_below_the_resonance_and_a_short_run_are_named():
     (low,) = notes_of(20.0, 12.0)
     assert "no run passes through a resonance: the rotors turn at" in low and "the natural frequencies are 28 rad/s" in low
     (short,) = notes_of(60.0, 9.0)
-    assert "run 1 lasts 9 s, less than two decay times of the slowest mode (5 s each)" in short
+    assert "run 1 lasts 9 s, less than two decay times of the mode that decays most slowly (5 s each)" in short
     assert notes_of(60.0, 12.0) == []
 
 

@@ -178,7 +178,7 @@ def test_rotor_above_half_the_sampling_rate_is_refused():
     times = {"tacho": pulse_times(), "acceleration1": t}
     with pytest.raises(jv.InputError) as error:
         jv.MeasuredRun.from_arrays([TACHO[0], sensor("acceleration")], times, {"acceleration1": np.sin(t)})
-    assert "is sampled at 20 Hz, less than twice the largest speed of the rotor, 16" in str(error.value)
+    assert "is sampled at 20 Hz, less than twice the highest rotor speed, 16" in str(error.value)
     assert "its vibration is aliased; record at more than 41" in str(error.value)
 
 

@@ -95,7 +95,7 @@ def test_loads_at_one_station_cannot_balance_a_moment(effects, label):
     ],
 )
 def test_a_run_that_starts_in_a_mode_and_stays_has_that_mode(speed, damping, mode, near):
-    """Close to the rotor's speed it is the mode that rises there, not the unstable one that falls from the resonance below."""
+    """Close to the rotor speed it is the mode that rises there, not the unstable one that falls from the resonance below."""
     s = published(speed=speed, damping=damping, eps=0.01).scene()
     run = jv.simulate(s, 300.0, start="jam", mode=mode, save="window", stepsize_controller=jv.Tolerance(1e-6), estimate=False)
     np.testing.assert_allclose(run.omega, jv.jam_modes(s).select(mode).omega, rtol=0.03)

@@ -108,7 +108,7 @@ def test_a_final_state_has_natural_units():
     cost = jv.work_precision(scene, "final_state", until=2.0, tolerances=(1e-5,), solvers=["default"], repeats=1)
     run = jv.simulate(scene, 2.0, save="window", stepsize_controller=jv.Tolerance(1e-11), estimate=False)
     last = jax.tree.map(lambda leaf: float(np.ravel(leaf[-1])[0]), run.window.state)
-    np.testing.assert_allclose(cost.reference[2:], [last.angle[0], last.rate[0] / 60.0], rtol=1e-7)  # rad, in the rotor's speed
+    np.testing.assert_allclose(cost.reference[2:], [last.angle[0], last.rate[0] / 60.0], rtol=1e-7)  # rad, in the rotor speed
     np.testing.assert_array_equal(np.sign(cost.reference[:2]), np.sign([last.displacement, last.velocity]))
 
 

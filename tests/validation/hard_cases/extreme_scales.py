@@ -27,7 +27,7 @@ _UNTIL = 40.0
 
 
 def begun(scene: Scene) -> np.ndarray:
-    """The state that these runs start from: platforms displaced by S/M, loads 0.7 rad apart, at 0.3 of the rotor's speed."""
+    """The state that these runs start from: platforms displaced by S/M, loads 0.7 rad apart, at 0.3 of the rotor speed."""
     return away(scene, displacement=1.0, rate=0.3)
 
 

@@ -270,7 +270,7 @@ CASES = (
         _hanging(1.2),
         8.0,
         _dry,
-        (2e-2, 5e-2),  # creep of the width 1e-4 rad/s for 8 s, times 10 rad/s of the swing, is 0.16 of the rotor's speed
+        (2e-2, 5e-2),  # creep of the width 1e-4 rad/s for 8 s, times 10 rad/s of the swing, is 0.16 of the rotor speed
     ),
     _bent(
         "friction, sticking to a rotor that runs up",

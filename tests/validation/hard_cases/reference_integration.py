@@ -78,7 +78,7 @@ def is_stiff(p: ReferenceModel) -> bool:
 
 def natural_sizes(p: ReferenceModel) -> np.ndarray:
     """The natural unit of each number of a state, of which absolute tolerances are shares: the loads' unbalance radius S/M for
-    displacements, that times the rotor's speed for velocities, 1 rad, the rotor's speed."""
+    displacements, that times the rotor speed for velocities, 1 rad, the rotor speed."""
     nd, n = p.mass.shape[0], p.m.size
     length = np.sum(p.m * p.radius) / np.sum(p.whole_mass)
     speed = number_of(p.drive, "speed")

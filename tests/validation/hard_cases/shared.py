@@ -159,7 +159,7 @@ def away(scene: Scene, *, displacement: float = 0.0, angle: float = -1.0, rate: 
     """A state away from rest, its numbers those of single precision so that both precisions start alike.
 
     Platforms are displaced by so many natural units S/M, load j is at `angle` + 0.7 j rad and turns at the share `rate` of the
-    rotor's speed.
+    rotor speed.
     """
     p = reference_model(scene)
     nd, n = p.mass.shape[0], p.m.size

@@ -27,7 +27,7 @@ from papers.printed import Misprint, PrintedNumber
 __all__ = ["NUMBERS"]
 
 _MASS, _LENGTH, _ROTOR, _JAM = 0.05, 0.08, 460.0, 169.6
-"""The pendulum of the rotor paper, its rotor's speed and its first jam: this paper prints no machine of its own."""
+"""The pendulum of the rotor paper, its rotor speed and its first jam: this paper prints no machine of its own."""
 
 _MASS_LENGTH = _MASS * _LENGTH
 

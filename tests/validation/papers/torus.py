@@ -1,4 +1,4 @@
-"""Numbers of the torus paper: least initial speeds from which two balls reach the rotor's speed, and equations for them."""
+"""Numbers of the torus paper: least initial speeds from which two balls reach the rotor speed, and equations for them."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ class TorusTables(NamedTuple):
 
     @property
     def converged(self) -> np.ndarray:
-        """True if the last doubling of the steps moved the nearer border by 0.011 of the rotor's speed at most, (M, P)."""
+        """True if the last doubling of the steps moved the nearer border by 0.011 of the rotor speed at most, (M, P)."""
         return self._nearer(self.last_change) <= TABLE_TOLERANCE
 
     def _nearer(self, values: np.ndarray) -> np.ndarray:
@@ -200,7 +200,7 @@ def published_tables(
     speeds below -0.7 are gone, but for lone ones, and thresholds at p = 0.003 and 0.005 lie 0.2 to 0.7 above the paper's: the
     paper counts the ball's own rotation with f'^2 and not with f' (f' - w). "spinning", tried for eight points of all gaps, is
     captured from rest at seven and from -0.967 at the other: a free spin that begins at the bottom takes the balls up by as
-    much as 0.35 of the rotor's speed. "contact" moves the thresholds of "derived" by -0.07 to 0.07, a quarter of them by more
+    much as 0.35 of the rotor speed. "contact" moves the thresholds of "derived" by -0.07 to 0.07, a quarter of them by more
     than 0.03, mostly up.
 
     Source: Strautmanis et al. 2018, tables 1 and 2, where each speed has one start.
