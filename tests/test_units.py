@@ -11,7 +11,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.display import shown_unit
-from jaxvib.units import count, known_number, number, numbers
+from jaxvib.units import Bounds, count, known_number, number, numbers
 from jaxvib.units.columns import unit_factor
 from jaxvib.units.reading import _FACTORS, in_own_unit, to_float, unit_ratio
 
@@ -104,6 +104,47 @@ def test_units_known_by_heart_are_those_of_the_library(unit, text):
         to_float(pint.get_application_registry().Quantity(3.0, text), unit, "field"),
         rtol=1e-15,
     )
+
+
+@pytest.mark.parametrize(
+    ("si", "spellings", "unit", "multiple"),
+    [
+        ("s", "sec с", "s", 1.0),
+        ("s", "msec мс", "ms", 1.0),
+        ("s", "usec µs μs", "us", 1.0),
+        ("s", "minutes", "min", 1.0),
+        ("rad", "rads рад", "rad", 1.0),
+        ("rad", "mrad", "rad", 1e-3),
+        ("rad", "DEG ° град", "deg", 1.0),
+        ("rad", "mdeg", "deg", 1e-3),
+        ("rad", "gon gradians", "turn", 1.0 / 400.0),
+        ("rad", "rev turns revolution", "turn", 1.0),
+        ("m/s^2", "m/s² mps2", "m/s^2", 1.0),
+        ("m/s^2", "mm/s2", "mm/s^2", 1.0),
+        ("m/s^2", "G gn", "standard_gravity", 1.0),
+        ("m/s^2", "mg", "standard_gravity", 1e-3),
+        ("m/s", "mm/s", "mm/s", 1.0),
+        ("m/s", "ips", "inch/s", 1.0),
+        ("m", "mm", "mm", 1.0),
+        ("m", "micron µm um", "um", 1.0),
+        ("m", "mils", "inch", 1e-3),
+        ("N", "kN", "kN", 1.0),
+        ("N", "lbf", "force_pound", 1.0),
+        ("rad/s", "rad/s rads", "rad/s", 1.0),
+        ("rad/s", "rpm 1/min U/min min^-1", "turn/min", 1.0),
+        ("rad/s", "Hz rps", "turn/s", 1.0),
+        ("rad/s", "deg/s", "deg/s", 1.0),
+        ("N m", "Nm N·m", "N*m", 1.0),
+        ("N m", "kNm", "kN*m", 1.0),
+        ("A", "mA", "mA", 1.0),
+        ("Hz", "Hz Sa/s", "Hz", 1.0),
+        ("Hz", "kHz kS/s", "kHz", 1.0),
+    ],
+)
+def test_units_of_columns_are_those_of_the_library(si, spellings, unit, multiple):
+    expected = multiple * pint.get_application_registry().Quantity(1.0, unit).m_as(si)
+    for spelling in spellings.split():
+        assert unit_factor(spelling, si) == pytest.approx(expected, rel=1e-14)
 
 
 def test_pint_quantities_come_in():
@@ -226,6 +267,16 @@ def test_a_count_ends_where_indices_and_memory_end():
         count(10**20, "samples", each=10**6)
 
 
+def test_bounds_without_ends_allow_every_finite_number():
+    assert Bounds().words == "" and Bounds().allow(np.asarray([-1e300, 1e300, np.inf, -np.inf, np.nan])).tolist() == [
+        1,
+        1,
+        0,
+        0,
+        0,
+    ]
+
+
 def test_an_angle_keeps_digits_within_a_turn():
     assert number(1e15, "rad", "separation") == 1e15 and number(1e16, "m", "radius") == 1e16
     with pytest.raises(jv.InputError, match=r"^separation is 1e\+16 rad; it must be below 4\.5e\+15 rad"):
@@ -240,6 +291,7 @@ def test_unknown_and_known_numbers_may_stand_in_one_list():
         jax.jit(lambda x: numbers([x, -1.0], "kg", "mass", 2, low=0.0))(1.0)
     with pytest.raises(jv.InputError, match=r"^mass\[1\] is .* too large; give a number below 1e308"):
         numbers([jnp.asarray(1.0), 10**400], "kg", "mass", 2)
+    assert numbers([jnp.asarray(1), 10**20], "kg", "mass", 2).tolist() == [1.0, 1e20]
 
 
 @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
