@@ -192,7 +192,7 @@ def audit_chart(
     place = np.arange(n)
     shown = np.concatenate([100.0 * values for values in changes.values()] or [np.zeros(0)])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
-    low = max(min([accuracy, *shown]) / 3.0, 1e-8)
+    low = max(min([100.0 * accuracy, *shown]) / 3.0, 1e-8)
     unresolved = np.maximum(100.0 * np.nan_to_num(uncertainty), low)
     left.hlines(place, low, unresolved, color=_FLOOR, lw=14, label="not resolved")
     for color, mark, (name, values) in zip(COLORS, "os^D", changes.items(), strict=False):

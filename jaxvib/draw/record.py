@@ -67,12 +67,11 @@ def _extremes(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
     size = -(-2 * values.size // _MAX_SHOWN_POINTS)
     if size <= 2:
         return time, values
-    count = values.size // size * size
-    parts = values[:count].reshape(-1, size)
-    low = np.min(parts, axis=1, where=np.isfinite(parts), initial=np.inf)
-    high = np.max(parts, axis=1, where=np.isfinite(parts), initial=-np.inf)
+    starts = np.arange(0, values.size, size)
+    low = np.minimum.reduceat(np.where(np.isfinite(values), values, np.inf), starts)
+    high = np.maximum.reduceat(np.where(np.isfinite(values), values, -np.inf), starts)
     pairs = np.stack([low, high], axis=1).ravel()
-    return np.repeat(time[:count:size], 2), np.where(np.isfinite(pairs), pairs, np.nan)
+    return np.repeat(time[starts], 2), np.where(np.isfinite(pairs), pairs, np.nan)
 
 
 def fit_chart(
