@@ -217,7 +217,7 @@ def _loss(ratio: Array) -> Array:
     under, over = jnp.where(ratio < 0.999, ratio, 0.5), jnp.where(ratio > 1.001, ratio, 2.0)
     below = 2.0 * jnp.arccos(under) * under / jnp.sqrt(1.0 - under**2)
     above = 2.0 * jnp.arccosh(over) * over / jnp.sqrt(over**2 - 1.0)
-    series = 2.0 + near * (4.0 / 3.0 - near * (4.0 / 15.0 - near * 16.0 / 105.0))
+    series = 2.0 + near * (4.0 / 3.0 - near * (2.0 / 5.0 - near * 16.0 / 105.0))
     return jnp.where(middle, series, jnp.where(near < 0.0, below, above))
 
 

@@ -109,6 +109,14 @@ def test_contact_damping_follows_from_the_restitution():
     np.testing.assert_allclose(slope, (damping_ratio(0.4 + step) - damping_ratio(0.4 - step)) / (2.0 * step), rtol=1e-7)
 
 
+@pytest.mark.parametrize("zeta", [0.9991, 0.9995, 1.0, 1.0005, 1.0009])
+def test_damping_ratio_is_accurate_near_critical_damping(zeta):
+    """Against x(t) = sin(w t) exp(-zeta t)/w with w^2 = 1 - zeta^2: the contact ends when -x - 2 zeta x' = 0, -x' is then e."""
+    duration = 2.0 if zeta == 1.0 else abs(2.0 * np.arccos(complex(zeta)) / np.sqrt(complex(1.0 - zeta**2)))
+    restitution = np.exp(-zeta * duration)
+    np.testing.assert_allclose(damping_ratio(jnp.asarray(restitution)), zeta, rtol=1e-11)
+
+
 def test_restitution_is_read_from_files_and_checked():
     s = plane(0.7)
     again = jv.scene_from_toml(jv.scene_to_toml(s))
