@@ -138,7 +138,7 @@ def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: in
     **Arguments**: `objective`: the quantity to minimize; `range_`: the factor by which a spring may differ; `starts` of each
     search.
 
-    **Returns** the springs' names with their results, the best first. **Raises** as `synthesize`.
+    **Returns** the springs' names with their results, the best first. **Raises** the errors of `synthesize`.
     """
     machine = _platforms(scene, 1)
     free = _springs(machine, range_, ("stiffness", "link_stiffness"))

@@ -4,7 +4,7 @@ The state is x = (s q, q') with a fixed frequency s. With the sampling step h, p
 
     x' = A x + B F(t),      F = -p''                (two numbers for each exciter, per unit of its unbalance)
 
-the state at the samples is exact for the machine; three Gauss points per step integrate the force of the rotor:
+the free motion between two samples is exact, and the force of the rotor is integrated with three Gauss points per step:
 
     x_{k+1} = exp(A h) x_k + sum_j w_j h exp(A (h - c_j h)) B F(t_k + c_j h)
 

@@ -117,8 +117,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
       the run with larger steps for the error; `seconds` includes compilation if the program was new, and is NaN under a JAX
       transformation
 
-    The `error` is the largest error of a state in the window: displacements and velocities relative to the largest, angles in
-    rad, speeds of loads relative to the rotor speed.
+    The `error` is the largest error of a state in the window: displacements relative to the largest displacement, velocities
+    relative to the largest velocity, angles in rad, speeds of loads relative to the rotor speed.
 
     - It is estimated as a fraction of the difference from a run with larger steps, or as twice this difference if an effect is
       not `smooth`, or if the acceleration of a drive jumps and the steps are equal; rounding errors are added

@@ -98,7 +98,7 @@ class MotorRunUp(Result):
     def weight_error(self) -> float:
         """Share by which the weight of the unbalances, which averaging omits, can change the peaks.
 
-        It is the largest S g / (J w^2) of all motors, with the unbalance S, the inertia J and the lowest natural frequency w; 0
+        It is the largest S g / (I w^2) of all motors, with the unbalance S, the inertia I and the lowest natural frequency w; 0
         without gravity.
         """
         g = np.hypot.reduce([float(each) for each in total_gravity(self.scene.all_effects).values()] or [0.0])
@@ -178,7 +178,7 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     runs from different initial angles: 8 runs for each motor after the first one, or for each motor if another exciter has an
     ideal drive. The peaks of a single run can be half as large. Compared with the full equations from the same angles without
     gravity, the peaks have errors of 2 % for a screen that passes its resonances within two turns. With gravity, the weight S g
-    of an unbalance changes the speed of its rotor within each turn by a share of about S g / (J w^2). This excites the
+    of an unbalance changes the speed of its rotor within each turn by a share of about S g / (I w^2). This excites the
     resonance w already at half of this speed, and the vibration that remains changes the later peak. The change has either
     sign, depending on the initial angle, and is up to about this share (`weight_error`), which can exceed 20 % for screens; use
     `simulate` from rest for peaks with less error.
