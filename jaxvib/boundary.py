@@ -154,7 +154,7 @@ class Figure(metaclass=_ByName):
 
 
 def is_real(value: object) -> bool:
-    """Return True for a real number or an array of real numbers, also a traced one, and False for Booleans and dates."""
+    """Return True for a real number or an array of real numbers, traced or not, and False for Booleans and dates."""
     if type(value) is float or type(value) is int:
         return True
     kind = getattr(value, "dtype", None)

@@ -52,7 +52,7 @@ class Outcome:
 
     - `parameters`: the free parameters by name, SI
     - `exists`: True if the motion exists
-    - `omega`: speed of the loads or of the exciters, rad/s
+    - `omega`: load speed, or speed of the exciters, rad/s
     - `amplitude` of each coordinate, platform 1 (y1) first, m or rad, and `foundation_force`, N, zero to peak
     - `force_per_amplitude`, N/m, of a jam mode
     """

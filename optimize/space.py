@@ -78,7 +78,7 @@ class Tie(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Any column but the first of a catalogue of rows.
+    """Column of a catalogue of rows, other than the first column.
 
     `source` is the parameter of the first column, with the values `at`; `target` is the parameter of this column, with `values`
     (SI). Between rows, `target` is interpolated linearly.

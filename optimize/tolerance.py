@@ -88,7 +88,7 @@ def tolerance_ranges(
     - `seed` of the random deviations
 
     **Returns** a list of `ToleranceRange`, one for each of the `quantities`. **Raises** `InputError` for a text of another
-    form, an unknown name, and a number that is named twice, also by a short name.
+    form, an unknown name, and a number that is named twice, even if one of the two names is short.
 
     >>> import jaxvib as jv
     >>> from optimize import jam_frequency

@@ -164,7 +164,7 @@ def run(y, speeds, par, end, steps):
 
 
 def rates_source() -> str:
-    """The vector field alone, `rates(y, par)` with the rotor's speed before the other numbers."""
+    """The vector field alone, `rates(y, par)` with the rotor speed before the other numbers."""
     names = dict(zip(NAMES, (f"y[{k}]" for k in range(6)), strict=True))
     body = _RATES.format(i=0, **names).replace("s0", "math.sin(y[4])").replace("c0", "math.cos(y[4])")
     return f"""

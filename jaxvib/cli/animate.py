@@ -19,22 +19,24 @@ if TYPE_CHECKING:
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--until", help="Duration of the simulation, if SOURCE is a scene file, such as 20s.")
 @click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), help="Initial state of the simulation [rest].")
-@click.option("--mode", type=int, help="Number of the jam mode; without --until, the film shows the exact motion of this mode.")
-@click.option("--begin", help="First time of the film, such as 4.5s [four vibration periods before the end].")
-@click.option("--end", help="Last time of the film [end of the run].")
-@click.option("--seconds", help="Duration of the film, s [about 11 frames for each turn of the rotor].")
+@click.option(
+    "--mode", type=int, help="Number of the jam mode; without --until, the animation shows the exact motion of this mode."
+)
+@click.option("--begin", help="First time of the animation, such as 4.5s [four vibration periods before the end].")
+@click.option("--end", help="Last time of the animation [end of the run].")
+@click.option("--seconds", help="Duration of the animation, s [about 11 frames for each turn of the rotor].")
 @click.option("--fps", type=int, default=20, show_default=True, help="Frames per second.")
 @click.option("--magnify", type=float, help="Magnification of displacements, relative to the circle of the loads [automatic].")
-@click.option("--width", type=float, default=6.4, show_default=True, help="Width of the film, in hundreds of pixels.")
+@click.option("--width", type=float, default=6.4, show_default=True, help="Width of the animation, in hundreds of pixels.")
 @click.option("--format", "kind", type=click.Choice(["gif", "html", "both"]), default="both", show_default=True)
 @shared
 def animate(
     source: Path, until: str | None, start: Start | None, mode: int | None, kind: str, output: Output, **options: Any
 ) -> None:
-    """Make a film of the moving machine in slow motion: animation.gif and animation.html, in --out or the current folder.
+    """Make an animation of the moving machine in slow motion: animation.gif and animation.html, in --out or the current folder.
 
     SOURCE is a run.npz of `jaxvib simulate`, or its folder, or a scene file. With --until the scene is simulated first; with
-    --mode the film shows its exact jam."""
+    --mode the animation shows its exact jam."""
     if source.is_dir():
         source = source / "run.npz"
     if source.suffix == ".npz":
@@ -56,7 +58,7 @@ def animate(
         if kind in (suffix, "both"):
             film.save(output.main_file(f"animation.{suffix}"))
     first, last = film.figure.axes[1].get_xlim()
-    document = {"pictures": film.count, "fps": film.fps, "begin": first, "end": last}
+    document = {"frames": film.count, "fps": film.fps, "begin": first, "end": last}
     output.done(document, lambda: f"{film.count} frames from {first:.6g} to {last:.6g} s", "animate")
 
 

@@ -79,7 +79,7 @@ new.help = f"{inspect.cleandoc(new.help or '')}\n\nMachines: {', '.join(_MACHINE
 def simulate(
     scene: Path, tolerance: float | None, accuracy: float | None, window: bool, csv: Path | None, output: Output, **options: Any
 ) -> None:
-    """Integrate the full equations of SCENE; --out saves the motion (run.npz) and its picture."""
+    """Integrate the full equations of SCENE; --out saves the motion (run.npz) and its figure."""
     from jaxvib.ode.progress import ProgressBar  # slow import, which --help does not need
 
     if tolerance is not None and accuracy is not None:

@@ -107,7 +107,7 @@ def balance(
     output: Output,
 ) -> None:
     """List the arrangements in which the loads of SCENE balance its rotor, and their exact stability at the rotor speed;
-    --out adds a picture.
+    --out adds a figure.
 
     The loads run in one plane or at two stations. The stability follows from the Floquet multipliers of the full equations."""
     from jaxvib.units import number  # slow import, which --help does not need

@@ -336,7 +336,7 @@ def regime_chart(
     unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
-    """Draw the fractions of regimes as stacked bars, and the speeds of the loads, over their drag.
+    """Draw the fractions of regimes as stacked bars, and the load speeds, over their drag.
 
     `drag` (n,) is in N s/m, `shares` are fractions (n,) by regime, and `omega` (n, starts) and `rotor_speed` are in rad/s,
     drawn in `unit`.

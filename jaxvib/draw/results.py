@@ -388,7 +388,8 @@ def drag_diagram(
 def drag_limits_chart(
     omega: np.ndarray, drag: np.ndarray, resonances: np.ndarray, *, unit: SpeedUnit | None = None, ax: Axes | None = None
 ) -> Drawn:
-    """Draw the greatest drag (n,), N s/m, of each resonance over the load speed `omega` (n,), rad/s, on a logarithmic axis.
+    """Draw, for each resonance, the greatest drag (n,), N s/m, at which loads can jam there, on a logarithmic axis, over the
+    load speed `omega` (n,), rad/s, of this jam.
 
     NaN entries are left out; `resonances`, rad/s, are dotted lines.
 
@@ -400,7 +401,7 @@ def drag_limits_chart(
     unit, scale = speed_unit(unit)
     axis, there = axes[0], np.isfinite(drag)
     for k, w in enumerate(resonances):
-        axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "natural frequency")
+        axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "resonance")
     axis.plot(scale * omega[there], drag[there], "o", color=COLORS[0], label="no jam above")
     axis.set(xlabel=f"load speed, {unit}", ylabel="greatest drag, N s/m", yscale="log" if there.any() else "linear")
     legend_above(axis)

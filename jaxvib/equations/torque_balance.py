@@ -198,7 +198,7 @@ class UnbalancedModel(ExcitedModel):
     def required_torque(self, omega: Array, displacement: Array) -> Array:
         """Return the mean torque -V that each rotor needs against the vibration, (count,) N m.
 
-        **Arguments**: `omega`: speed of the rotors, rad/s; `displacement` (nd,): complex amplitudes.
+        **Arguments**: `omega`: rotor speed, rad/s; `displacement` (nd,): complex amplitudes.
         """
         forward = omega**2 * (self.balance.direction.conj() @ displacement)
         return mean_torque(self.balance.unbalance, jnp.conj(self.phasors) * forward)

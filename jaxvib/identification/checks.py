@@ -14,9 +14,9 @@ from jaxvib.identification.fit import Fitted, angle_shares, polar_unbalances, pr
 from jaxvib.identification.records.orders import foreign_vibration
 from jaxvib.identification.torque import MAX_MISFIT
 
-CHANCE = 1e-5
-"""Chance below which residuals are not noise, and below which a run deviates from other runs. Residuals of pure noise get the
-status `patterned` with this probability for each channel."""
+SIGNIFICANCE_LEVEL = 1e-5
+"""p-value below which residuals are not noise, and below which a run deviates from other runs. Each test of pure noise (of a
+channel, for the angle of the rotor or of jammed loads) causes the status `patterned` with this probability."""
 
 _ANGLE_NAMES = ("the rotor's angle", "the angle of the jammed loads")
 
@@ -27,8 +27,8 @@ _CONTRADICTION = 4.0
 """Distance of a fitted value from its known value, in standard errors, above which the records contradict the known value."""
 
 _ANGLE_SHARE = 0.1
-"""Share of the residuals due to errors of the rotor's angle that are not unknowns above which intervals count as too narrow.
-The share is small because these errors change slowly and do not average out like noise."""
+"""Errors of the rotor's angle that are not unknowns of the fit cause a share of the residuals. Above this share, intervals
+count as too narrow. It is small because these errors change slowly and do not average out like noise."""
 
 _COARSE_ANGLE = 0.3
 """Standard error of the rotor's angle, rad, above which the response is not linear in it."""
@@ -41,7 +41,7 @@ _UNEXPLAINED = 0.5
 channel."""
 
 _MIN_POWER_SHARE = 0.5
-"""Smallest share of the power of a signal in one vibration for which a note names this vibration."""
+"""A note names a vibration if it has at least this share of the power of its signal."""
 
 _NOISE_LIKE = 0.01
 """Smallest variance of residuals, relative to that of the readings, for which a note names a vibration of constant
@@ -69,11 +69,11 @@ class FitStatus(eqx.Enumeration):
 
 
 def status_of(fitted: Fitted, information: Information) -> tuple[FitStatus, float, list[str]]:
-    """Return the status of a fit, the smallest `residual_chance` of its channels, and notes.
+    """Return the status of a fit, the smallest `residual_p_value` of its channels, and notes.
 
     **Arguments**: `fitted`, and the `information` about its numbers.
     """
-    chance, notes = 1.0, [*_contradictions(fitted), *_disagreements(fitted)]
+    p_value, notes = 1.0, [*_contradictions(fitted), *_disagreements(fitted)]
     contradicted = bool(notes)
     coarse = [max(rotor.error for rotor in rotors) for rotors in fitted.problem.rotors]
     for k, error in enumerate(coarse):
@@ -115,17 +115,17 @@ def status_of(fitted: Fitted, information: Information) -> tuple[FitStatus, floa
                 )
             angles = fitted.problem.angles[k].T
             for angle, whose in zip(angles if fitted.problem.has_loads else angles[:1], _ANGLE_NAMES, strict=False):
-                one = residual_chance(residuals[:, c], np.asarray(samples.taps)[:, c], angle, unknowns)
-                if one < CHANCE:
+                one = residual_p_value(residuals[:, c], np.asarray(samples.taps)[:, c], angle, unknowns)
+                if one < SIGNIFICANCE_LEVEL:
                     notes.append(f"the residuals of channel {channel.name!r} in run {k + 1} repeat with {whose}")
-                chance = min(chance, one)
+                p_value = min(p_value, one)
     if not has_fit and not foreign:
-        return FitStatus.not_converged, chance, notes
+        return FitStatus.not_converged, p_value, notes
     if contradicted or not has_fit:
-        return FitStatus.contradicted, chance, notes
-    if foreign or chance < CHANCE or is_inaccurate or max(coarse) > _COARSE_ANGLE:
-        return FitStatus.patterned, chance, notes
-    return FitStatus.undetermined if information.undetermined.size else FitStatus.found, chance, notes
+        return FitStatus.contradicted, p_value, notes
+    if foreign or p_value < SIGNIFICANCE_LEVEL or is_inaccurate or max(coarse) > _COARSE_ANGLE:
+        return FitStatus.patterned, p_value, notes
+    return FitStatus.undetermined if information.undetermined.size else FitStatus.found, p_value, notes
 
 
 def resembles(fitted: Fitted) -> bool:
@@ -144,7 +144,7 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
     """Yield sentences about vibrations that are not at the rotor speed: in the residuals, or in the readings if there is
     no fit."""
     problem = fitted.problem
-    # Readings of jammed loads and of contacts are not at that speed.
+    # Further exciters, jammed loads and contacts cause vibrations at other speeds.
     if len(problem.unbalances) > 1 or (problem.linear is not None and not has_fit):
         return
     for k, (samples, raw, mask, residuals) in enumerate(
@@ -169,7 +169,7 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
             yield f"{vibration.share:.0%} of the power of {what} is {vibration.frequency_text}{reason}"
 
 
-def residual_chance(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray, fitted_count: int) -> float:
+def residual_p_value(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray, fitted_count: int) -> float:
     """Return the probability that pure noise has vibrations at orders of the rotor speed as strong as those of the residuals.
 
     The residuals are filtered to white noise and compared with vibrations at the first orders of the rotor speed in each
@@ -180,9 +180,9 @@ def residual_chance(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray, 
 
     >>> angle, rng = np.linspace(0.0, 500.0, 4000), np.random.default_rng(0)
     >>> noise = rng.normal(size=4000)
-    >>> bool(residual_chance(noise, np.ones(1), angle, 4) > 1e-3)
+    >>> bool(residual_p_value(noise, np.ones(1), angle, 4) > 1e-3)
     True
-    >>> bool(residual_chance(noise + 0.3 * np.cos(angle), np.ones(1), angle, 4) < 1e-9)
+    >>> bool(residual_p_value(noise + 0.3 * np.cos(angle), np.ones(1), angle, 4) < 1e-9)
     True
     """
     from scipy.special import fdtrc  # slow to import
@@ -254,11 +254,11 @@ def _contradictions(fitted: Fitted) -> Iterator[str]:
 class Disagreement(NamedTuple):
     """Deviation of a run from other runs.
 
-    **Attributes**: `chance` of a deviation as large as this one if the machine is the same; `name` of the number whose change
+    **Attributes**: `p_value` of a deviation as large as this one if the machine is the same; `name` of the number whose change
     explains most of the deviation; `change` of this number, relative (of an angle: in rad), and its standard `error`.
     """
 
-    chance: float
+    p_value: float
     name: str
     change: float
     error: float
@@ -267,21 +267,21 @@ class Disagreement(NamedTuple):
         """Return the deviation of a run as a sentence."""
         kind = "change" if "(rad)" in self.name else "relative change"
         return (
-            f"{run} deviates from the others by more than their errors (chance {self.chance:.1g}); a {kind} of {self.name} by "
-            f"{self.change:+.3g} +- {1.96 * self.error:.1g} explains most of it"
+            f"{run} deviates from the others by more than their errors (p-value {self.p_value:.1g}); a {kind} of {self.name} "
+            f"by {self.change:+.3g} +- {1.96 * self.error:.1g} explains most of it"
         )
 
 
 def disagreement(others: np.ndarray, run: np.ndarray, gradient: np.ndarray, names: Sequence[str]) -> Disagreement:
-    """Return the deviation of a run from other runs by the ratio of the likelihoods of two models: the run has numbers
-    different from those of the others, or all runs have the same numbers.
+    """Return the deviation of a run from other runs, by a likelihood-ratio test of two models: either the run has numbers of
+    its own, or all runs have the same numbers.
 
     **Arguments**: information (k, k) of the `others` and of the `run`, about relative changes of k numbers; `gradient` of the
     run, J^T residuals/noise^2, at the numbers that fit the others and the run together; `names` (k,).
 
-    >>> others, run = np.array([[400.0]]), np.array([[100.0]])    # 0 +- 0.05 and 0.6 +- 0.1, together 0.12
+    >>> others, run = np.array([[400.0]]), np.array([[100.0]])    # estimates 0 +- 0.05 and 0.6 +- 0.1; of all runs 0.12
     >>> found = disagreement(others, run, 100.0 * np.array([0.6 - 0.12]), ["mass"])
-    >>> bool(abs(found.change - 0.6) < 1e-12), bool(abs(found.error**2 - 0.1**2 - 0.05**2) < 1e-12), found.chance < 1e-7
+    >>> bool(abs(found.change - 0.6) < 1e-12), bool(abs(found.error**2 - 0.1**2 - 0.05**2) < 1e-12), found.p_value < 1e-7
     (True, True, True)
     """
     from scipy.special import chdtrc  # slow to import
@@ -330,5 +330,5 @@ def _disagreements(fitted: Fitted) -> Iterator[str]:
     step = pseudoinverse(total)[0] @ gradient_sum  # to the exact minimum, which matters for a run with much less information
     for k, (part, gradient) in enumerate(parts[:-1]):
         deviation = disagreement(total - part, part, gradient - part @ step, names)
-        if deviation.chance < CHANCE:
+        if deviation.p_value < SIGNIFICANCE_LEVEL:
             yield deviation.sentence(f"run {k + 1}")

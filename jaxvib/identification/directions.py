@@ -268,10 +268,11 @@ _KINDS_WITH_KG = {
     "power": "powers",
     "bearing": "frictions of bearings",
 }
-"""Words in the names of numbers whose unit contains kg once, in products such as N s/m or kg m, and their plurals."""
+"""Words in the names of numbers whose unit is proportional to kg (kg, N s/m, kg m and others), and their plurals. The readings
+do not change if all these numbers are multiplied by the same factor."""
 
 
 def _kind_with_kg(name: str) -> str | None:
-    """Return the kind of a number whose unit contains kg once; None for other numbers."""
+    """Return the kind of a number whose unit is proportional to kg; None for other numbers."""
     last = name.rpartition(".")[2]
     return next((plural for word, plural in _KINDS_WITH_KG.items() if word in last), None)

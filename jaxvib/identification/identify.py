@@ -77,7 +77,7 @@ class MachineFit(Result):
       the loads, their speeds and the angle of the rotor at the first sample; empty without loads
     - `channels`: names of the compared channels of each run, and their `kinds`
     - `noise`: standard deviation of the residuals of each run's channels, SI
-    - `chance`: probability that pure noise has vibrations at orders of the rotor speed that are as strong as those of the
+    - `p_value`: probability that pure noise has vibrations at orders of the rotor speed that are as strong as those of the
       residuals; the smallest one of all channels
     - `time`, s, `readings`, and `fitted` (readings of the fitted model), SI: arrays for each run, NaN for samples that do not
       count
@@ -103,7 +103,7 @@ class MachineFit(Result):
     channels: tuple[tuple[str, ...], ...]
     kinds: tuple[tuple[str, ...], ...]
     noise: tuple[np.ndarray, ...]
-    chance: float = eqx.field(metadata=in_unit(""))
+    p_value: float = eqx.field(metadata=in_unit(""))
     time: tuple[np.ndarray, ...]
     readings: tuple[np.ndarray, ...]
     fitted: tuple[np.ndarray, ...]
@@ -286,7 +286,7 @@ def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted
 def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
     """Return a fit with intervals, directions, a status and notes."""
     problem, known = fitted.problem, information_of(fitted)
-    status, chance, notes = status_of(fitted, known)
+    status, p_value, notes = status_of(fitted, known)
     undetermined, by_gain = directions_of(known)
     exciters = len(problem.unbalances)
     fit_scene = fitted_scene(problem, fitted.x, fitted.linear)
@@ -339,7 +339,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         channels=tuple(tuple(channel.name for channel in samples.channels) for samples in problem.runs),
         kinds=tuple(tuple(channel.kind for channel in samples.channels) for samples in problem.runs),
         noise=fitted.noise,
-        chance=chance,
+        p_value=p_value,
         time=problem.times,
         readings=tuple(np.where(mask, raw, np.nan) for raw, mask in zip(problem.raw, problem.masks, strict=True)),
         fitted=tuple(raw - left for raw, left in zip(problem.raw, fitted.residuals, strict=True)),

@@ -286,8 +286,8 @@ def _rebuild(scene: Scene) -> None:
 
 
 def _rebuild_part(part: Any, section: str) -> None:
-    """Construct a part again. **Raises** `InputError` also for a shape that only the constructor accepts, such as one number
-    for an array of one value."""
+    """Construct a part again. **Raises** `InputError` for values that the constructor rejects, and for a shape that only the
+    constructor accepts, such as one number for an array of one value."""
     named, rebuilt = jax.tree_util.tree_leaves_with_path(part), jax.tree.leaves(rebuild_part(part, section))
     for (path, leaf), new in zip(named, rebuilt, strict=False):
         if np.shape(leaf) != np.shape(new):

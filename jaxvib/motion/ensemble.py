@@ -300,7 +300,7 @@ def _run_batch(
 def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equations, implicit: bool) -> _Ends:
     """Integrate a run with equal steps in `ENSEMBLE_PARTS` parts, once for each entry of `counts` (steps in a part).
 
-    **Returns** for the first count: the final state, the mean speeds of the loads over the last part, the distance of the final
+    **Returns** for the first count: the final state, the mean load speeds over the last part, the distance of the final
     state from that with the last count, True if the motion stayed finite, True for loads that lost contact with their track,
     and the number of steps.
     """

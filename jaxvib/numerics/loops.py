@@ -26,7 +26,7 @@ def _any_of_batch_rule(_size: int, _batched: list[bool], values: Array) -> tuple
 def repeat(step: Callable[[Array, Carry], Carry], count: int | Array, start: Carry, limit: int | None = None) -> Carry:
     """Return the carry after `count` steps, `step(k, carry)` with k = 0, 1, ..., from `start`.
 
-    **Arguments**: `limit`: largest count. With a limit, derivatives in reverse mode exist also for a traced count, and a batch
+    **Arguments**: `limit`: largest count. With a limit, derivatives in reverse mode exist even for a traced count, and a batch
     takes as many steps as the largest count in it. Without a limit, a loop with a traced count has derivatives in forward mode
     only.
 

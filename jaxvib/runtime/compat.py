@@ -102,7 +102,7 @@ def value_of(number: object) -> object:
 
 
 def evaluating() -> contextlib.AbstractContextManager[None]:
-    """Evaluate operations on concrete numbers immediately, also inside a transformation.
+    """Evaluate operations on concrete numbers immediately, even inside a transformation.
 
     Without JAX's private context manager these operations are traced.
     """
@@ -221,7 +221,7 @@ def _patched(module: ModuleType, name: str, instead: Callable[..., object]) -> I
 
 
 def _unpatched(module: ModuleType | None, name: str) -> Any:
-    """Return the original function of a module, also while `_patched` replaces it; None if the module has no such function."""
+    """Return the original function of a module, even while `_patched` replaces it; None if the module has no such function."""
     with _patching:
         known = _patches.get((getattr(module, "__name__", ""), name))
     return getattr(module, name, None) if known is None else known[1]

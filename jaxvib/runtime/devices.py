@@ -21,7 +21,7 @@ from jaxtyping import PyTree
 from jaxvib.runtime.compat import traced
 
 _VISIBILITY_VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
-"""Environment variables that restrict a process to some of the machine's accelerators."""
+"""Environment variables that restrict a process to some of the computer's accelerators."""
 
 _DEVICE_LOCK = threading.Lock()
 
@@ -86,7 +86,7 @@ def arrays_on_device(leaves: Sequence[object]) -> list[Any]:
 
 
 def take_a_device() -> None:
-    """Assign a separate accelerator to this worker process if the machine has several."""
+    """Assign a separate accelerator to this worker process if the computer has several."""
     # Must be set before the first array: otherwise each worker reserves most of the memory of every accelerator.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     devices = jax.local_devices()
@@ -98,7 +98,7 @@ def take_a_device() -> None:
 
 @functools.cache
 def _worker_index() -> int:
-    """Return the index of this process among the workers on this machine that see the same accelerators.
+    """Return the index of this process among the workers on this computer that see the same accelerators.
 
     A process reserves an index by locking a file. The system releases the lock when the process ends for any reason; the
     worker that replaces it then gets the same index and accelerator.

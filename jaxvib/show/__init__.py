@@ -1,1 +1,1 @@
-"""Pictures and films of machines: sketches of scenes, animations of their motions."""
+"""Sketches of scenes, and animations of their motions."""

@@ -1,4 +1,4 @@
-"""Films of a moving machine: platforms, springs, rotor, loads, forces on the foundation."""
+"""Animations of a moving machine: platforms, springs, rotor, loads, forces on the foundation."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from jaxvib.show.wheel import Pose, RotorPose
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.units import Number, number
 
-_MAX_TURNS_PER_PICTURE = 0.42
-"""Largest rotation between two pictures, turns. Near half a turn, a rotor seems to turn at another speed or backward."""
+_MAX_TURNS_PER_FRAME = 0.42
+"""Largest rotation between two frames, turns. Near half a turn, a rotor seems to turn at another speed or backward."""
 
-_TURNS_PER_PICTURE = 0.09
-"""Default rotation between pictures, turns of the rotor."""
+_TURNS_PER_FRAME = 0.09
+"""Default rotation between frames, turns of the rotor."""
 
-_MAX_PICTURES = 600
-"""Maximum number of pictures of a film."""
+_MAX_FRAMES = 600
+"""Maximum number of frames of an animation."""
 
 _MIN_WIDTH, _MAX_WIDTH = 1.0, 50.0
-"""Range of the width of a picture, inches."""
+"""Range of the width of a frame, inches."""
 
 _MAX_DRAWN_HEIGHTS = 100.0
-"""Largest drawn displacement of the machine, in heights of the picture."""
+"""Largest drawn displacement of the machine, in heights of the frame."""
 
 
 @validated
@@ -58,7 +58,7 @@ def animate(
     magnify: float | None = None,
     width: float = 6.4,
 ) -> Film:
-    """Return a film of a run or of an exact jam in slow motion, with a clock.
+    """Return an animation of a run or of an exact jam in slow motion, with a clock.
 
     Platforms, springs, rotor and loads move. Arrows show the forces of the supports on the foundation (black: total force on
     the foundation). The displacements and the force are plotted over time below the machine.
@@ -66,14 +66,14 @@ def animate(
     **Arguments**
 
     - `motion`: a `Run`, or an `Orbit` together with its `scene`
-    - `path` of the file: a GIF (".gif") or one HTML page with embedded pictures (".html"); None writes no file
+    - `path` of the file: a GIF (".gif") or one HTML page with embedded frames (".html"); None writes no file
     - `begin`, `end`: the part that is shown, s or text; default: the last four periods of a run, or four periods of an orbit
-    - `seconds`: duration of the film; typical: 5 to 10; default: a duration with which the rotor turns by about a tenth of a
-      turn between pictures, at most 600 pictures
-    - `fps`: pictures per second; typical: 20 (the default)
-    - `magnify`: magnification of displacements relative to the circle of the loads, which the picture states; typical: 1 to 50;
+    - `seconds`: duration of the animation; typical: 5 to 10; default: a duration with which the rotor turns by about a tenth of
+      a turn between frames, at most 600 frames
+    - `fps`: frames per second; typical: 20 (the default)
+    - `magnify`: magnification of displacements relative to the circle of the loads, which the frame states; typical: 1 to 50;
       default: a factor with which the largest displacement is clearly visible
-    - `width` of the picture, inches (100 pixels each); typical: 6.4 (the default). Drawing takes most of the computing time,
+    - `width` of the frame, inches (100 pixels each); typical: 6.4 (the default). Drawing takes most of the computing time,
       in proportion to `seconds` times `fps`
 
     **Returns** a matplotlib animation, whose `save` writes further files. The same call gives the same file.
@@ -81,7 +81,7 @@ def animate(
     **Raises** `InputError` for
 
     - a part of the run that is not stored, or that has too few samples
-    - a film in which loads or rotor would turn by nearly half a turn from one picture to the next
+    - an animation in which loads or rotor would turn by nearly half a turn from one frame to the next
     - an orbit without its scene
     - a path whose ending is not that of a GIF or HTML file, or that cannot be written to
 
@@ -95,20 +95,20 @@ def animate(
     """
     owner = drawable_scene(_scene_of(motion, scene))
     if path is not None and Path(path).suffix.lower() not in (".gif", ".html", ".htm"):
-        raise InputError("path", f"is {quoted(str(path))}; a film must be a .gif or .html file")
+        raise InputError("path", f"is {quoted(str(path))}; an animation must be a .gif or .html file")
     if isinstance(fps, bool) or not isinstance(fps, int) or not 1 <= fps <= 50:
-        raise InputError("fps", f"is {quoted(fps)}; it must be a whole number of pictures a second, 1 to 50")
+        raise InputError("fps", f"is {quoted(fps)}; it must be a whole number of frames per second, 1 to 50")
     first, last = _time_range(motion, begin, end)
     speed = _highest_speed(motion, owner)
     turns = speed * (last - first) / (2.0 * np.pi)
     duration = None if seconds is None else float(number(seconds, "s", "seconds", low=0.0, open_low=True))
-    pictures = int(np.ceil(turns / _TURNS_PER_PICTURE)) if duration is None else duration * fps
-    count = round(float(np.clip(pictures, 2, _MAX_PICTURES)))
-    if turns / count > _MAX_TURNS_PER_PICTURE:
-        latest_end = first + _MAX_TURNS_PER_PICTURE * 2.0 * np.pi * count / speed
-        problem = f"turns the rotor by {turns / count:.3g} turns from one picture to the next, which looks like another speed"
-        raise InputError("end", f"{problem}; end at {latest_end:.4g} s or before, or make the film longer")
-    # An orbit is periodic; the picture after the last picture would be the first picture.
+    frames = int(np.ceil(turns / _TURNS_PER_FRAME)) if duration is None else duration * fps
+    count = round(float(np.clip(frames, 2, _MAX_FRAMES)))
+    if turns / count > _MAX_TURNS_PER_FRAME:
+        latest_end = first + _MAX_TURNS_PER_FRAME * 2.0 * np.pi * count / speed
+        problem = f"turns the rotor by {turns / count:.3g} turns from one frame to the next, which looks like another speed"
+        raise InputError("end", f"{problem}; end at {latest_end:.4g} s or before, or make the animation longer")
+    # An orbit is periodic; the frame after the last frame would be the first frame.
     time = first + (last - first) * np.arange(count) / (count if isinstance(motion, Orbit) else count - 1)
     dense = np.linspace(time[0], time[-1], max(400, count))
     film_motion, history = (
@@ -132,7 +132,7 @@ def _scene_of(motion: object, scene: Scene | None) -> Scene | None:
 
 
 def _time_range(motion: Run | Orbit, begin: Number | None, end: Number | None) -> tuple[float, float]:
-    """Return the beginning and the end of the film, s."""
+    """Return the beginning and the end of the animation, s."""
     if isinstance(motion, Run):
         window = motion.window
         last = float(window.time[-1])
@@ -191,13 +191,13 @@ def _film(
     slower = (film_motion.time.size / fps) / (film_motion.time[-1] - film_motion.time[0])
     note = f"slowed down {slower:.3g} x, displacements drawn {magnification:.3g} x as large\n{ARROWS_NOTE}"
     stage.text(1.0, 0.0, note, transform=stage.transAxes, ha="right", va="top", fontsize="x-small", color="#555555")
-    # Texts that are wider than the picture must not reduce the size of the drawing.
+    # Texts that are wider than the frame must not reduce the size of the drawing.
     for text in stage.texts:
         text.set_in_layout(False)
     cursors = _plot_histories((lower, lowest), scene, history)
     directions = scene.machine.structure().foundation_directions
     directions = directions if len(directions) > 1 else ("foundation force",)
-    heading = "    " if len(directions) == 1 else "  force "  # both components fit above the picture
+    heading = "    " if len(directions) == 1 else "  force "  # both components fit above the frame
 
     def update(k: int) -> None:
         for artist, part in zip(artists, parts(k), strict=True):
@@ -244,7 +244,7 @@ _MAX_ANGLE_BETWEEN_SAMPLES = 1.2
 
 
 class SampledMotion(NamedTuple):
-    """Motion of a machine at the times of a film.
+    """Motion of a machine at the times of an animation.
 
     **Attributes**: `time` (nt,), s; `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s (tilts: rad, rad/s); `rotors`: a
     `RotorPose` for each exciter, whose arrays have a leading axis over the times; `force` on the foundation (nt, directions),

@@ -113,7 +113,7 @@ class View(abc.ABC):
 
 
 ARROWS_NOTE = "arrows: forces of the supports on the foundation (black: total force on the foundation)"
-"""Meaning of the arrows, written below films."""
+"""Meaning of the arrows, written below animations."""
 
 
 class RotorView(View):

@@ -113,7 +113,7 @@ def branches(
 
         n(Omega) = Omega + (mean braking torque of the vibration on the loads) / sum b_W R^2      (light loads, no dry friction)
 
-    For light loads n(Omega) is an explicit function (`rotor_speed_at`). Every point, also of the exact branch, is computed
+    For light loads n(Omega) is an explicit function (`rotor_speed_at`). Every point, even of the exact branch, is computed
     separately, without continuation from a neighbouring point. Therefore no part of the branch is missed.
 
     **Arguments**
@@ -124,8 +124,8 @@ def branches(
     - `most`: the greatest load speed, rad/s or text; default: 4/3 of the scene's rotor speed
     - `exact`: True for the periodic motions of the full equations in place of their limit for light loads, with Floquet
       multipliers and all special points
-    - `least`: the lowest load speed, with `exact`; default: a fifth of the lowest resonance or of the scene's rotor speed, if
-      this is lower
+    - `least`: the lowest load speed, with `exact`; default: a fifth of the lowest resonance, or a fifth of the rotor speed if
+      the rotor speed is below this resonance
     - `accuracy` of the rotor speeds, relative, with `exact`; typical: 1e-4 to 1e-8 (the default; in single precision 1e-3)
 
     **Returns** `Branches`, or `ExactBranches` if `exact`. **Raises** `InputError` for loads without drag, fewer than 2 points,

@@ -118,7 +118,7 @@ class Whirl(Result):
 
     @property
     def sense(self) -> np.ndarray:
-        """Sense of each whirl, (ns, nd): "forward", "backward" (also if it does not oscillate) or "straight"."""
+        """Sense of each whirl, (ns, nd): "forward", "backward" (including a motion that does not oscillate) or "straight"."""
         return _sense_words(self.forward, self.straight)
 
     def summary(self) -> str:
@@ -252,7 +252,7 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
 
     The kind is - Re(2 s + c/m). Of the two real roots of an overdamped motion, it is negative at the slower one, at which
     damping balances the spring, and positive at the faster one, at which damping stops the mass. Its sign (the sign
-    characteristic in the theory of Hermitian matrix polynomials) tells slow from fast roots also if the roots of several
+    characteristic in the theory of Hermitian matrix polynomials) tells slow from fast roots even if the roots of several
     motions are mixed in size.
 
     The error is the step of Newton's method for the scalar equation, plus the rounding of its terms.

@@ -1,4 +1,4 @@
-"""Computation of chunks by Dask workers: processes on this machine, or a cluster with a scheduler at an address."""
+"""Computation of chunks by Dask workers: processes on this computer, or a cluster with a scheduler at an address."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def on_a_cluster(
     from distributed.scheduler import KilledWorker
 
     if workers is not None and scheduler is not None:
-        raise InputError("scheduler", "cannot be combined with workers, which are processes of this machine; give one of them")
+        raise InputError("scheduler", "cannot be combined with workers, which are processes on this computer; give one of them")
     seconds = float(number(timeout, "s", "timeout", low=0.0, open_low=True))
     with contextlib.ExitStack() as stack:
         if scheduler is None:

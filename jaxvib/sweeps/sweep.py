@@ -186,7 +186,7 @@ def sweep(
       Typical: the default, about a second of computation. With smaller chunks an interruption loses fewer cases, but there are
       more file operations. An accelerator computes a whole chunk at once, up to 262,144 cases; give a chunk that fills
       its memory
-    - `workers`: number of processes on this machine; or `scheduler`: address of a Dask scheduler ("tcp://10.0.0.1:8786"),
+    - `workers`: number of processes on this computer; or `scheduler`: address of a Dask scheduler ("tcp://10.0.0.1:8786"),
       which must answer within `timeout`, s. Both need the extra `cluster`
     - `report`: a function that is called with a `Progress` after each chunk
 
@@ -255,7 +255,7 @@ def run_study(
     if workers is not None:
         count(workers, "workers")
         if workers > (limit := max(_MAX_WORKERS, 4 * (os.cpu_count() or 1))):
-            raise InputError("workers", f"is {workers}, too many processes for this machine; give at most {limit}")
+            raise InputError("workers", f"is {workers}, too many processes for this computer; give at most {limit}")
     if not path.exists():
         Store.create(path, new_study)
     opened = Store(path, writable=True)

@@ -1,4 +1,4 @@
-"""Conversion of the values that users pass to SI units, and checks of these values. `jaxvib.display` converts results back."""
+"""Conversion of users' values to SI units, and checks of these values. `jaxvib.display` converts results to other units."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ _MAX_COUNT = 2**31 - 1
 def count(value: object, field: str, *, low: int = 1, each: float = 0.0) -> int:
     """Return a whole number of objects, at least `low`; one object needs `each` bytes.
 
-    **Raises** `InputError` for any other value, and if the objects need more than half of this machine's memory.
+    **Raises** `InputError` for any other value, and if the objects need more than half of the computer's memory.
 
     >>> count(0, "loads.count")
     Traceback (most recent call last):
@@ -225,7 +225,7 @@ def count(value: object, field: str, *, low: int = 1, each: float = 0.0) -> int:
     if each and 2.0**30 / each < value < 2**63:
         room = 0.5 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2.0**33
         if value * each > room:
-            needs = f"needs {value * each / 2.0**30:.3g} GiB, more than half of this machine's memory"
+            needs = f"needs {value * each / 2.0**30:.3g} GiB, more than half of the computer's memory"
             raise InputError(field, f"is {value}, which {needs}; {int(room / each)} at most fit")
     if value > _MAX_COUNT:
         raise InputError(field, f"is {quoted(value)}; it must be a whole number from {low} to {_MAX_COUNT}")

@@ -49,7 +49,7 @@ def test_modes_json_has_the_promised_keys(typed):
 
 def test_modes_writes_table_and_picture(typed, tmp_path):
     code, out, _ = typed("modes", "machine.toml", "--out", "pictures")
-    assert code == 0 and "mode" in out and "stays" in out and "wrote" in out
+    assert code == 0 and "mode" in out and "stable" in out and "wrote" in out
     assert " yes " in out and " no " in out and "no: the loads spread" in out and max(map(len, out.splitlines())) <= 110
     assert (tmp_path / "pictures" / "branches.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "pictures" / "modes.json").read_text())["rotor_speed"] == 150.0
@@ -417,7 +417,7 @@ def test_animate_and_sketch_write_a_film_and_a_drawing(typed, tmp_path):
     assert code == 0 and (tmp_path / "sketch.png").stat().st_size > 10_000 and out.endswith("wrote sketch.png\n"), err
     small = ["--seconds", "0.5", "--width", "3", "--end", "0.05s"]
     code, out, err = typed("animate", "machine.toml", "--mode", "3", *small, "--out", "a", "--json")
-    assert code == 0 and json.loads(out) == {"pictures": 10, "fps": 20.0, "begin": 0.0, "end": pytest.approx(0.045)}, err
+    assert code == 0 and json.loads(out) == {"frames": 10, "fps": 20.0, "begin": 0.0, "end": pytest.approx(0.045)}, err
     assert (tmp_path / "a" / "animation.gif").exists() and "<script>" in (tmp_path / "a" / "animation.html").read_text()
 
 

@@ -13,7 +13,7 @@ from jaxvib.identification.checks import (
     disagreement,
     pseudoinverse,
     resembles,
-    residual_chance,
+    residual_p_value,
     status_of,
 )
 from jaxvib.identification.problem import Known
@@ -23,7 +23,7 @@ def channel(name):
     return SimpleNamespace(name=name)
 
 
-def test_chance_of_residuals_is_that_of_an_f_test():
+def test_p_value_of_residuals_is_that_of_an_f_test():
     rng, n, taps = np.random.default_rng(3), 3000, np.array([1.0, -0.4, 0.2])
     angle = np.linspace(0.0, 200.0, n) ** 1.2
     left = rng.normal(size=n) + 0.15 * np.cos(angle) + 0.2 * np.sin(2.0 * angle) - 0.2 * np.cos(3.0 * angle)
@@ -44,10 +44,10 @@ def test_chance_of_residuals_is_that_of_an_f_test():
         explained += np.sum((basis @ np.linalg.lstsq(basis, white[part], rcond=None)[0]) ** 2)
     columns, found = 16 * 7, 5
     rest = (np.sum(white[place] ** 2) - explained) / (place.size - columns)
-    chance = f.sf(explained / (columns - found) / rest, columns - found, place.size - columns)
-    assert residual_chance(left, taps, angle, found) == pytest.approx(chance, rel=1e-9) and 1e-9 < chance < 0.5
-    assert residual_chance(left[:890], taps, angle[:890], found) == 1.0  # too short
-    assert residual_chance(0.0 * left, taps, angle, found) == 1.0
+    p_value = f.sf(explained / (columns - found) / rest, columns - found, place.size - columns)
+    assert residual_p_value(left, taps, angle, found) == pytest.approx(p_value, rel=1e-9) and 1e-9 < p_value < 0.5
+    assert residual_p_value(left[:890], taps, angle[:890], found) == 1.0  # too short
+    assert residual_p_value(0.0 * left, taps, angle, found) == 1.0
 
 
 def test_rotor_at_rest_has_no_orders():
@@ -56,8 +56,8 @@ def test_rotor_at_rest_has_no_orders():
     left = rng.normal(size=n) + np.repeat(0.15 * rng.normal(size=16), 200)
     means = np.mean(left.reshape(16, 200), axis=1)
     explained, total = 200.0 * np.sum(means**2), np.sum(left**2)
-    chance = f.sf(explained / 12 / ((total - explained) / (n - 16)), 12, n - 16)
-    assert residual_chance(left, np.ones(1), np.full(n, 0.3), 4) == pytest.approx(chance, rel=1e-9)
+    p_value = f.sf(explained / 12 / ((total - explained) / (n - 16)), 12, n - 16)
+    assert residual_p_value(left, np.ones(1), np.full(n, 0.3), 4) == pytest.approx(p_value, rel=1e-9)
 
 
 def test_disagreement_is_a_ratio_of_likelihoods():
@@ -67,13 +67,13 @@ def test_disagreement_is_a_ratio_of_likelihoods():
     gradient = b @ np.linalg.inv(a + b) @ a @ away
     found = disagreement(a, b, gradient, ["mass", "stiffness"])
     statistic = away @ np.linalg.inv(np.linalg.inv(a) + np.linalg.inv(b)) @ away
-    assert found.chance == pytest.approx(chi2.sf(statistic, 2), rel=1e-9)
+    assert found.p_value == pytest.approx(chi2.sf(statistic, 2), rel=1e-9)
     # A change of one number alone: weighted mean of the differences, with the information A (A + B)^-1 B about them.
     shared = np.diagonal(a @ np.linalg.inv(a + b) @ b)
     assert found.name == "mass"
     assert found.change == pytest.approx(gradient[0] / shared[0]) and found.error == pytest.approx(shared[0] ** -0.5)
     text = (
-        f"run 2 deviates from the others by more than their errors (chance {found.chance:.1g}); a relative change of mass by "
+        f"run 2 deviates from the others by more than their errors (p-value {found.p_value:.1g}); a relative change of mass by "
     )
     assert found.sentence("run 2") == text + f"{found.change:+.3g} +- {1.96 * found.error:.1g} explains most of it"
 
@@ -83,7 +83,7 @@ def test_numbers_of_one_side_alone_cannot_disagree(others, run):
     nothing = disagreement(np.array([[others]]), np.array([[run]]), np.array([5.0]), ["mass"])
     assert nothing == (1.0, "mass", 0.0, np.inf)
     both = disagreement(np.diag([others, 4.0]), np.diag([run, 9.0]), np.array([0.0, 6.0]), ["mass", "stiffness"])
-    assert both.name == "stiffness" and both.chance == pytest.approx(chi2.sf(36.0 * (1.0 / 4.0 + 1.0 / 9.0), 1))
+    assert both.name == "stiffness" and both.p_value == pytest.approx(chi2.sf(36.0 * (1.0 / 4.0 + 1.0 / 9.0), 1))
 
 
 def test_pseudoinverse_is_on_the_scale_of_the_diagonal():
@@ -160,24 +160,24 @@ def outcome(monkeypatch, **changes):
         "disagreements": [],
         "foreign": [],
         "fits": True,
-        "chances": (0.5, 0.3),
+        "p_values": (0.5, 0.3),
         "shares": (0.0, 0.0),
     }
     given |= (
         {"errors": (0.01, 0.02), "outliers": (0.0, 0.0), "undetermined": 0, "misfits": (1.9,)} | {"absorbed": False} | changes
     )
-    chances = iter(given["chances"])
+    p_values = iter(given["p_values"])
     monkeypatch.setattr(checks, "_contradictions", lambda fitted: given["contradictions"])
     monkeypatch.setattr(checks, "_disagreements", lambda fitted: given["disagreements"])
     monkeypatch.setattr(checks, "_foreign_vibrations", lambda fitted, fits: given["foreign"] if fits == given["fits"] else None)
     monkeypatch.setattr(checks, "resembles", lambda fitted: given["fits"])
     monkeypatch.setattr(checks, "angle_shares", lambda fitted: [np.array(given["shares"])])
 
-    def chance(left, taps, angle, found):
+    def p_value(left, taps, angle, found):
         assert left.tolist() == taps.tolist() and angle.tolist() == [7.0] and found == 3
-        return next(chances)
+        return next(p_values)
 
-    monkeypatch.setattr(checks, "residual_chance", chance)
+    monkeypatch.setattr(checks, "residual_p_value", p_value)
     rotors = [tuple(SimpleNamespace(error=each) for each in given["errors"])]
     two = np.array([[1.0, 2.0]])
     runs = [SimpleNamespace(channels=(channel("a"), channel("b")), taps=two)]
@@ -203,8 +203,13 @@ def outcome(monkeypatch, **changes):
         ({"fits": False}, "not_converged", 0.3, []),
         ({"fits": False, "foreign": ["another"]}, "contradicted", 0.3, ["another"]),
         ({"foreign": ["another"]}, "patterned", 0.3, ["another"]),
-        ({"chances": (1e-6, 0.3)}, "patterned", 1e-6, ["the residuals of channel 'a' in run 1 repeat with the rotor's angle"]),
-        ({"chances": (2e-5, 2e-6)}, "patterned", 2e-6, ["the residuals of channel 'b' in run 1 repeat with the rotor's angle"]),
+        ({"p_values": (1e-6, 0.3)}, "patterned", 1e-6, ["the residuals of channel 'a' in run 1 repeat with the rotor's angle"]),
+        (
+            {"p_values": (2e-5, 2e-6)},
+            "patterned",
+            2e-6,
+            ["the residuals of channel 'b' in run 1 repeat with the rotor's angle"],
+        ),
         ({"errors": (0.31, 0.02)}, "patterned", 0.3, ["the rotor's angle in run 1 has the standard error 0.31 rad between"]),
         ({"errors": (0.29, 0.02)}, "found", 0.3, []),
         (

@@ -189,7 +189,7 @@ def test_prediction_in_words():
 
 
 @pytest.mark.parametrize(
-    ("size", "chances", "deviation", "status", "words"),
+    ("size", "p_values", "deviation", "status", "words"),
     [
         (0.1, (0.5, 0.5), 0.5, "predicted", []),
         (0.145, (0.5, 0.5), 0.5, "predicted", []),
@@ -199,7 +199,7 @@ def test_prediction_in_words():
         (0.16, (0.5, 0.5), 1e-6, "contradicted", ["the residuals of channel 'a' are 1.6 times", "the run deviates"]),
     ],
 )
-def test_status_of_a_prediction(monkeypatch, size, chances, deviation, status, words):
+def test_status_of_a_prediction(monkeypatch, size, p_values, deviation, status, words):
     """The second fitted run has another noise of the channel, which is compared; the channel `new` is in no run of the fit."""
     left = np.array([[size, 0.3], [-size, -0.3], [size, np.nan], [-size, np.nan]])
     mask, raw = ~np.isnan(left), np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]])
@@ -209,10 +209,10 @@ def test_status_of_a_prediction(monkeypatch, size, chances, deviation, status, w
         times=[np.arange(4.0)], notes=("first",), linear=None,
     )  # fmt: skip
     at = SimpleNamespace(problem=problem, residuals=left, taps=["taps a", "taps new"])
-    found = SimpleNamespace(chance=deviation, sentence=lambda run: f"{run} deviates")
-    rest = iter(zip(("taps a", "taps new"), left.T, chances, strict=True))
+    found = SimpleNamespace(p_value=deviation, sentence=lambda run: f"{run} deviates")
+    rest = iter(zip(("taps a", "taps new"), left.T, p_values, strict=True))
 
-    def chance(values, taps, angle, count):
+    def p_value(values, taps, angle, count):
         name, column, own = next(rest)
         np.testing.assert_array_equal(values, column)
         assert taps == name and angle.tolist() == [3.0] and count == 0
@@ -220,7 +220,7 @@ def test_status_of_a_prediction(monkeypatch, size, chances, deviation, status, w
 
     monkeypatch.setattr(predict, "_at_the_fit", lambda *_: at)
     monkeypatch.setattr(predict, "_deviation", lambda *_: found)
-    monkeypatch.setattr(predict, "residual_chance", chance)
+    monkeypatch.setattr(predict, "residual_p_value", p_value)
     noise, time = (np.array([9.0, 9.0]), np.array([0.1])), (np.arange(4.0),) * 2
     fit = SimpleNamespace(channels=(("a", "b"), ("a",)), noise=noise, time=time)
     run = predict.predict_run.__wrapped__(fit, None)
@@ -232,7 +232,7 @@ def test_status_of_a_prediction(monkeypatch, size, chances, deviation, status, w
     np.testing.assert_allclose(run.ratio, [size / 0.1, np.nan])
     np.testing.assert_array_equal(run.readings, np.where(mask, raw, np.nan))
     np.testing.assert_array_equal(run.predicted, raw - left)
-    assert run.channels == ("a", "new") and run.chance == deviation and run.time.tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert run.channels == ("a", "new") and run.p_value == deviation and run.time.tolist() == [0.0, 1.0, 2.0, 3.0]
 
 
 @pytest.mark.parametrize(("own", "others"), [(0.001, 0.01), (0.01, 0.001), (0.003, 0.01), (0.01, 0.01)])

@@ -119,7 +119,10 @@ def test_numbers_lost_by_rounding_are_refused():
 def test_arrays_that_no_memory_holds_are_refused():
     s = scene()
     for ask, says in (
-        (lambda: jv.simulate(s, 1.0, samples=10**11), r"samples is 100000000000, which needs .* GiB, more than half of this"),
+        (
+            lambda: jv.simulate(s, 1.0, samples=10**11),
+            r"samples is 100000000000, which needs .* GiB, more than half of the comp",
+        ),
         (lambda: jv.branches(s, points=10**11), r"points is 100000000000, which needs"),
         (lambda: jv.phase_jams(s, starts=10**11), r"starts is 100000000000, which needs"),
         (lambda: jv.jam_orbit(s, mode=3, points=10**7), r"points is 10000000, which needs"),

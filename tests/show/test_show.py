@@ -148,7 +148,7 @@ def test_a_film_is_a_gif_and_a_page_without_requests(run, orbit, tmp_path):
         (lambda run, orbit: jv.animate(orbit), r"scene is missing; an Orbit does not contain it"),
         (lambda run, orbit: jv.animate(run, scene=SCENE), "scene is only for an Orbit"),
         (lambda run, orbit: jv.animate(SCENE), "it must be a Run or an Orbit"),
-        (lambda run, orbit: jv.animate(run, "a.mp4"), "path is 'a.mp4'; a film must be a .gif or .html file"),
+        (lambda run, orbit: jv.animate(run, "a.mp4"), "path is 'a.mp4'; an animation must be a .gif or .html file"),
         (lambda run, orbit: jv.animate(run, "no/such/folder.gif", begin=1.99), "cannot be written"),
         (lambda run, orbit: jv.animate(run, begin=1.0, end="0.5 s"), "end is 0.5 s; it must be after the beginning, 1 s"),
         (lambda run, orbit: jv.animate(run, end=3.0), "begin selects .* the run keeps 0 to 2 s"),

@@ -54,7 +54,7 @@ def end_state(run: jv.Run) -> np.ndarray:
 
 
 def compared(run: jv.Run, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Differences relative to the largest displacement, velocity, and 1 rad; the rotor's speed for rates."""
+    """Differences relative to the largest displacement, velocity, and 1 rad; the rotor speed for rates."""
     found = end_state(run)
     nd, count = run.window.state.displacement.shape[1], run.scene.loads.count
     kept = run.window.state
@@ -181,7 +181,7 @@ def _():
     return np.asarray(run.trajectory.state.displacement)[:, 0] + 0.02, right + 0.02
 
 
-@case("a ball on a heavy platform approaches the rotor's speed exponentially", 1e-6)
+@case("a ball on a heavy platform approaches the rotor speed exponentially", 1e-6)
 def _():
     scene = jv.Scene(jv.one_mass(mass=1e9, stiffness=1e12, damping=0.0), balls(0.5, 1, 0.1, 2.0), jv.ConstantSpeed(60.0))
     run = jv.simulate(scene, 2.0)

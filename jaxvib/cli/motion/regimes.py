@@ -34,7 +34,7 @@ from jaxvib.errors import InputError
 @csv_options
 @shared
 def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], csv: Path | None, output: Output) -> None:
-    """List the synchronous regimes of SCENE: motions in which all exciters turn at one speed; --out adds a picture of
+    """List the synchronous regimes of SCENE: motions in which all exciters turn at one speed; --out adds a figure of
     phases."""
     from jaxvib.machine.validation import start_notes  # slow imports, which --help does not need
     from jaxvib.results.status import status_name

@@ -122,7 +122,7 @@ def _text(
     if operating:
         points = result.operating
         rows = [motion(points, k, "yes" if points.stable[k] else "no") for k in operating]
-        lines.append(table("operating points (zero to peak)", [unit, "stays", *moves, *end], rows))
+        lines.append(table("operating points (zero to peak)", [unit, "stable", *moves, *end], rows))
         if several:
             rows = [
                 [f"{scale * points.speed[k]:.5g}", str(number), *(f"{x:.4g}" for x in (needed, motor, points.speed[k] * motor))]

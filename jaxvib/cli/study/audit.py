@@ -51,10 +51,10 @@ def audit(
     output: Output,
     **options: Any,
 ) -> None:
-    """List the changes of the results of SCENE by each effect and each tier, and the cost of each.
+    """List how much each effect and each tier changes the results of SCENE, and how much computing time each of them needs.
 
-    The list shows negligible and missing effects. The effects of the scene are removed one at a time, and effects that the
-    scene lacks are added one at a time, with typical values. --out adds the figure."""
+    The list shows which effects are negligible or missing. The effects of the scene are removed one at a time, and effects that
+    the scene lacks are added one at a time, with typical values. --out adds the figure."""
     if count_operations:
         from jaxvib.study.audit.operation_counts import operation_counts  # slow import, which --help does not need
 
@@ -88,7 +88,7 @@ def audit_text(result: jv.Audit) -> str:
     if result.effects:
         heading = f"changes by effects, %; requested accuracy {100.0 * result.accuracy:g} %"
         absent = any(not row.present for row in result.effects)
-        head = ["effect", "advice", "amplitude", "force", "load speed", "fold", "by"]
+        head = ["effect", "advice", "amplitude", "force", "load speed", "fold", "tier"]
         changes = [_changes(row) for row in result.effects]
         lines.append(table(f"{heading}; in brackets: added effects" if absent else heading, head, changes))
         head = ["effect", "operations", "time of a run", "time to compile"]

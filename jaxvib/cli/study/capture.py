@@ -65,7 +65,7 @@ def capture(
     show_all: bool,
     output: Output,
 ) -> None:
-    """Find the initial speeds from which the balls in a torus of SCENE reach the rotor speed; --out adds pictures."""
+    """Find the initial speeds from which the balls in a torus of SCENE reach the rotor speed; --out adds figures."""
     import numpy as np  # slow import, which --help does not need
 
     if not -1.0 <= low < high <= 0.0:

@@ -64,9 +64,9 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Identify numbers of a machine from recorded runs, or the friction of a bearing from a recorded swing.
 
     RECORD is an identification file (TOML) that names a scene file, recorded runs and their channels; --out adds the fitted
-    scene (found.toml), the picture and the fit (fit.npz). For a bearing, RECORD is a CSV file of time and angle of a pendulum
+    scene (found.toml), the figure and the fit (fit.npz). For a bearing, RECORD is a CSV file of time and angle of a pendulum
     whose swing on the bearing decays, or a measurement file (TOML) that names the CSV file; options replace the values in the
-    measurement file, and --out adds the picture and the fit (fit.csv)."""
+    measurement file, and --out adds the figure and the fit (fit.csv)."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.machine.files import read_toml

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @click.argument("study", type=click.Path(path_type=Path))
 @click.option("--store", type=click.Path(path_type=Path), help="Folder to write [name of STUDY with the ending .zarr].")
 @click.option("--resume/--no-resume", default=True, show_default=True, help="Continue the study if its store exists already.")
-@click.option("--workers", type=click.IntRange(min=1), help="Number of processes on this machine (Dask).")
+@click.option("--workers", type=click.IntRange(min=1), help="Number of processes on this computer (Dask).")
 @click.option("--scheduler", metavar="ADDRESS", help="Address of a Dask scheduler, such as tcp://10.0.0.1:8786.")
 @click.option(
     "--timeout", default="30 s", show_default=True, help="Time limit for the answer of the scheduler and its workers."

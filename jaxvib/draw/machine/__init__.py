@@ -1,1 +1,1 @@
-"""Shapes of parts of a machine, and films of them, from plain numbers."""
+"""Shapes of parts of a machine, and animations of them, from plain numbers."""

@@ -1,4 +1,4 @@
-"""Films as GIF files or as single HTML pages, which need no network."""
+"""Animations as GIF files or as single HTML pages, which need no network."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from PIL import Image
 from jaxvib.errors import written
 
 _COLORS = 64
-"""Maximum number of colours of a film."""
+"""Maximum number of colours of an animation."""
 
 _MIN_COLOR_DIFFERENCE = 10
 """Smallest difference of two colours of the palette, in levels of 255."""
@@ -30,7 +30,7 @@ _PAGE = """<!doctype html>
 <style>body{{font-family:sans-serif;margin:1em auto;max-width:{width}px;padding:0 .5em}}img{{width:100%;height:auto}}
 .bar{{display:flex;gap:.6em;align-items:center}}input{{flex:1}}button{{min-width:5em}}</style></head>
 <body><img id="picture" alt="{title}"><div class="bar"><button id="run">Pause</button>
-<input id="place" type="range" min="0" max="{last}" value="0" aria-label="picture">
+<input id="place" type="range" min="0" max="{last}" value="0" aria-label="frame">
 <label>speed <select id="speed"><option value="0.25">1/4</option><option value="0.5">1/2</option>
 <option value="1" selected>1</option><option value="2">2</option></select></label></div>
 <script>
@@ -51,8 +51,8 @@ show(0); timer = setTimeout(step, {pause});
 class Film(FuncAnimation):
     """Animation of matplotlib in which only some artists move; its method `save` draws the other artists only once.
 
-    **Arguments**: `figure`; `update`: function that moves the artists to their positions in picture k; `moving`: these artists;
-    `count`: number of pictures; `fps`: pictures per second.
+    **Arguments**: `figure`; `update`: function that moves the artists to their positions in frame k; `moving`: these artists;
+    `count`: number of frames; `fps`: frames per second.
     """
 
     def __init__(self, figure: Figure, update: Callable[[int], object], moving: Sequence[Artist], count: int, fps: float):
@@ -60,8 +60,8 @@ class Film(FuncAnimation):
         self._draw_was_started = True  # suppresses matplotlib's warning about an animation that was never shown
         self.figure, self._update, self._moving, self.count, self.fps = figure, update, list(moving), count, fps
 
-    def pictures(self) -> Iterator[Image.Image]:
-        """Yield every picture; artists that do not move are drawn once."""
+    def frames(self) -> Iterator[Image.Image]:
+        """Yield every frame; artists that do not move are drawn once."""
         canvas = self.figure.canvas
         assert isinstance(canvas, FigureCanvasAgg)
         for artist in self._moving:
@@ -79,7 +79,7 @@ class Film(FuncAnimation):
             artist.set_animated(False)
 
     def save(self, filename: str | Path, *rest: Any, **options: Any) -> None:
-        """Write a GIF file (".gif") or a single HTML page that contains the pictures (".html", ".htm").
+        """Write a GIF file (".gif") or a single HTML page that contains the frames (".html", ".htm").
 
         Other formats, and calls with further arguments, are passed to matplotlib's `FuncAnimation.save`.
 
@@ -102,11 +102,11 @@ class Film(FuncAnimation):
         first.save(path, save_all=True, append_images=others, duration=pause, loop=0, optimize=True, disposal=1)
 
     def _few_colours(self) -> list[Image.Image]:
-        """Return all pictures with a common palette, which follows from a few of them, without dithering.
+        """Return all frames with a common palette, which follows from a few of them, without dithering.
 
-        Parts that do not move are therefore identical in all pictures.
+        Parts that do not move are therefore identical in all frames.
         """
-        every = list(self.pictures())
+        every = list(self.frames())
         some = every[:: max(1, len(every) // 4)]
         strip = Image.new("RGB", (some[0].width, some[0].height * len(some)))
         for k, each in enumerate(some):

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto
-from jaxvib.identification.checks import CHANCE, Disagreement, disagreement, pseudoinverse, residual_chance
+from jaxvib.identification.checks import SIGNIFICANCE_LEVEL, Disagreement, disagreement, pseudoinverse, residual_p_value
 from jaxvib.identification.directions import eliminate, elimination
 from jaxvib.identification.fit import differences_of, linear_at, minimize, polar_unbalances, run_equations
 from jaxvib.identification.further_runs.planned import own_precisions, problem_of_run, shared_indices
@@ -56,7 +56,7 @@ class RunPrediction(Result):
     **Attributes** (C channels, n samples)
 
     - `status`: a `PredictionStatus`; `notes`: sentences for the reader
-    - `chance` of a deviation as large as this one, if the machine is the same
+    - `p_value` of a deviation as large as this one, if the machine is the same
     - `channels` (C,): names; `noise` (C,), SI: standard deviation of the residuals; `ratio` (C,) of this standard deviation to
       that of the fit, both at the lower one of the two sampling rates; NaN for a channel that the fit does not have
     - `time` (n,) s, `readings` and `predicted` (n, C), SI, NaN for samples that do not count
@@ -64,7 +64,7 @@ class RunPrediction(Result):
 
     status: PredictionStatus
     notes: tuple[str, ...]
-    chance: float = eqx.field(metadata=in_unit(""))
+    p_value: float = eqx.field(metadata=in_unit(""))
     channels: tuple[str, ...]
     noise: np.ndarray = eqx.field(metadata=in_unit("", "channel"))
     ratio: np.ndarray = eqx.field(metadata=in_unit("", "channel"))
@@ -96,7 +96,7 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
       zero of the rotor's angle is also fitted, unless the fit and the run both have the mark of a tachometer and the scene has
       neither loads nor nonlinear supports, or the scene has several exciters
     - A likelihood-ratio test compares two hypotheses: the machine has the same numbers in the run as in the fit, or it has
-      other numbers. The test accounts for the errors of the fit and the noise of the run. If the chance of the deviation is
+      other numbers. The test accounts for the errors of the fit and the noise of the run. If the p-value of the deviation is
       below 1e-5, the run contradicts the fit, and a note names the number whose change explains most of the deviation. In a run
       with loads or nonlinear supports, no number is named if the residuals are more than 1.5 times the noise
 
@@ -125,22 +125,23 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     for k, name in enumerate(names):
         if ratio[k] > _NOISE_RATIO:
             notes.append(f"the residuals of channel {name!r} are {ratio[k]:.3g} times the noise of the fit")
-        if residual_chance(at.residuals[:, k], at.taps[k], at.problem.angles[0][:, 0], 0) < CHANCE:
+        if residual_p_value(at.residuals[:, k], at.taps[k], at.problem.angles[0][:, 0], 0) < SIGNIFICANCE_LEVEL:
             notes.append(f"the residuals of channel {name!r} repeat with the rotor's angle")
     status = PredictionStatus.patterned if notes else PredictionStatus.predicted
-    if deviation.chance < CHANCE:
+    if deviation.p_value < SIGNIFICANCE_LEVEL:
         status = PredictionStatus.contradicted
         is_far = at.problem.linear is not None and bool(np.any(ratio > _NOISE_RATIO))
-        # Far from the fit, the linearized motion does not tell which number has changed.
+        # Far from the fit, the linearized motion does not show which number has changed.
         too_far = (
-            f"the run deviates from the fit by more than its errors (chance {deviation.chance:.1g}), too much to name a number"
+            f"the run deviates from the fit by more than its errors (p-value {deviation.p_value:.1g}), "
+            "too much to name a number"
         )
         notes.append(too_far if is_far else deviation.sentence("the run"))
     mask, raw = at.problem.masks[0], at.problem.raw[0]
     return RunPrediction(
         status=status,
         notes=(*at.problem.notes, *notes),
-        chance=deviation.chance,
+        p_value=deviation.p_value,
         channels=tuple(names),
         noise=noise,
         ratio=ratio,

@@ -1,12 +1,12 @@
 """Steps of a motion that end where the contact with a stop begins or ends.
 
-A side of a stop is in contact if its penetration p and its force k p + c p' are positive. Its switch is s = min(p, k p + c p').
-Between two changes of the sign of a switch the equations are smooth, and a step of order 8 is accurate. A change at the time t
-has the derivative
+A side of a stop is in contact if its penetration p and its force k p + c p' are positive. Its switching function is
+g = min(p, k p + c p'). A switch is a change of the sign of g. Between two switches the equations are smooth, and a step of
+order 8 is accurate. The time t of a switch has the derivative
 
-    dt = -ds / s',      ds: change of s at a constant time
+    dt = -dg / g',      dg: change of g at a constant time
 
-so that derivatives of a motion with stops are exact, also if the force of a damper makes the accelerations jump.
+Derivatives of a motion with stops are therefore exact, even if the force of a damper makes the accelerations jump.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from jaxvib.machine.effects.supports import Side, Stop
 from jaxvib.machine.effects.terms import SupportForce, Term
 
 _MAX_SWITCHES = 16
-"""Largest number of changes in a step; the rest of the step is then computed without further changes."""
+"""Largest number of switches in a step; the rest of the step is then computed without further switches."""
 
 _MAX_TRIALS, _ACCURACY = 60, 1e-13
-"""Largest number of trials for the time of a change, and its error relative to the length of the step."""
+"""Largest number of trials for the time of a switch, and its error relative to the length of the step."""
 
 _NEAR_TURN = 0.2
-"""Distance of a turning point from a stop, relative to the rise before it, below which a contact at the turning point is
-possible."""
+"""A side may approach its stop and move away again within one step. If it stops short of the stop by less than this fraction
+of its approach (in a parabola through the rates at both ends of the step), a short contact is possible."""
 
 Step = Callable[[Array, Array, Array, Dynamics], Array]
-"""Function that returns the state after a step from a time, a state and a length of the step, by equations."""
+"""Function of a time, a state, the length of a step, and equations of motion, that returns the state after the step."""
 
 
 class FixedContactStop(Effect):
-    """Stop whose contact is fixed: each side is in contact, or not, at every displacement. Its force is smooth.
+    """Stop of which each side is treated as in contact, or as free, whatever the displacement. Its force is therefore smooth.
 
-    **Attributes**: `stop`; `presses` (s,): 1 for each of its `sides` that is in contact, otherwise 0.
+    **Attributes**: `stop`; `presses` (s,): 1 for each of the s `sides` that is treated as in contact, otherwise 0.
     """
 
     stop: Stop
@@ -86,7 +86,7 @@ def side_count(dynamics: Dynamics) -> int:
 
 
 def penetrations(dynamics: Dynamics, q: Array, v: Array) -> tuple[Array, Array, Array]:
-    """Return the penetrations (s,) of all sides, m, their rates (s,), and the switches (s,).
+    """Return the penetrations (s,) of all sides, m, their rates (s,), and the switching functions (s,).
 
     **Arguments**: `q` and `v` (nd,): displacements and velocities of the coordinates.
     """
@@ -130,8 +130,8 @@ def switched_step(
     nd = dynamics.stiffness_per_mass.shape[0]
 
     def wrong(y: Array, presses: Array, dynamics: Dynamics) -> Array:
-        """Return the switches (s,), positive for a side that is in contact in the state but not in the equations, or the
-        reverse."""
+        """Return the switching functions (s,), with signs such that a value is positive if the state and the equations differ
+        about the contact of the side."""
         return jnp.where(presses, -1.0, 1.0) * penetrations(dynamics, y[:nd], y[nd : 2 * nd])[2]
 
     def go_on(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
@@ -146,7 +146,7 @@ def switched_step(
         which = jnp.argmax(lax.stop_gradient(values))
         slope = rates(*lax.stop_gradient((begin + taken, new, taken, now)))
         rate = jax.jvp(lambda y: wrong(y, presses, fixed[3]), (lax.stop_gradient(new),), (slope,))[1][which]
-        # The correction of the time is 0; its derivative is that of the time of the change.
+        # The correction of the time is 0; its derivative is that of the time of the switch.
         correction = (lax.stop_gradient(values) - values)[which] * jnp.where(is_switch, 1.0 / rate, 0.0)
         presses = presses ^ (is_switch & (jnp.arange(presses.size) == which))
         done = jnp.where(is_switch, done + taken + correction, h)
@@ -158,8 +158,8 @@ def switched_step(
 
 
 def _turning(start: tuple[Array, Array], last: Array, presses: Array, h: Array) -> Array:
-    """Return the time after which a side without contact is nearest to its stop within a step, if it may touch the stop
-    then; otherwise 0.
+    """Return the time from the beginning of a step to the moment at which a free side is nearest to its stop, if a contact is
+    possible at this moment, see `_NEAR_TURN`; otherwise 0.
 
     **Arguments**: penetrations (s,) and their rates at the `start`; the `last` rates (s,); length of the step.
     """
@@ -171,11 +171,11 @@ def _turning(start: tuple[Array, Array], last: Array, presses: Array, h: Array) 
 
 
 class _Change(NamedTuple):
-    """First change of a switch within a step, by Newton's method between bounds.
+    """State of the search for the first switch within a step, by Newton's method between bounds.
 
-    **Attributes**: `low` and `high`: bounds of its time after the start of the step; `length`: the next trial; `is_final`: True
-    if the search has ended; `is_found`: False if no switch differs at the end of the step or at a turning point within it;
-    `trials`: number of trials.
+    **Attributes**: `low` and `high`: bounds of the time from the beginning of the step to the switch; `length`: the next trial
+    of this time; `is_final`: True if the search has ended; `is_found`: False if there is no switch, neither at the end of the
+    step nor at the moment of `_turning`; `trials`: number of trials.
     """
 
     low: Array
@@ -196,7 +196,7 @@ def _first_change(
     h: Array,
     dynamics: Dynamics,
 ) -> _Change:
-    """Return the first change within the time `h`; `wrong`: the switches of a state, positive after a change."""
+    """Return the search for the first switch within the time `h`; `wrong`: function of a state, positive after a switch."""
     nd = dynamics.stiffness_per_mass.shape[0]
     start = penetrations(dynamics, y[:nd], y[nd : 2 * nd])[:2]
 
@@ -205,7 +205,7 @@ def _first_change(
         values, slopes = jax.jvp(wrong, (new,), (rates(t + at.length, new, at.length, dynamics),))
         which = jnp.argmax(values)
         is_late = values[which] > 0.0
-        # The end of the step is tried first, and then a turning point, at which a short contact is deepest.
+        # The end of the step is tried first, and then the moment at which a free side is nearest to its stop.
         turn = _turning(start, penetrations(dynamics, new[:nd], new[nd : 2 * nd])[1], presses, h)
         is_turn = (at.trials == 0) & ~is_late & (turn > 0.0)
         is_found = at.is_found | is_late

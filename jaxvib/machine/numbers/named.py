@@ -169,7 +169,7 @@ def numbers_of(scene: Scene) -> dict[str, NamedNumber]:
 
 
 def _is_continuous(value: object) -> bool:
-    """Return True for a floating-point number or an array of such numbers, also if it is traced."""
+    """Return True for a floating-point number or an array of such numbers, even if it is traced."""
     is_numeric = isinstance(value, (float, np.generic, np.ndarray, jax.Array))
     return is_numeric and jnp.issubdtype(jnp.result_type(value), jnp.floating)
 

@@ -174,7 +174,7 @@ class _Bodies(Machine):
         return self._point_rows(numbers(cast(Numbers, point), "m", name, 2).astype(dtype), body)
 
     def support_rows(self) -> tuple[Array, Array]:
-        """Return the rows of the forces of all supports, also of those between two bodies, see `Machine.support_rows`."""
+        """Return the rows of the forces of all supports, including those between two bodies, see `Machine.support_rows`."""
         found: dict[str, list[Array]] = {"stiffness": [], "damping": []}
         for each in self.supports:
             rows, along = self._relative_motion(each)

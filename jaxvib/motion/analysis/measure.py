@@ -287,7 +287,8 @@ def _sampled_outputs(model: Model, field: Field, times: Array, states: State) ->
     carrier, step = model.carrier, _step(times)
     nb, nd = carrier.foundation_damping.shape
     if isinstance(field, Dynamics) and not model.supports and 2 * (field.rows.shape[0] + nb) < nd:
-        # The rate of the force, T_K q' + T_C q'', needs the accelerations of the rows T_C only.
+        # The rate of the force is T_K q' + T_C q'' (T_K, T_C: stiffness and damping matrices of the foundation force). The few
+        # accelerations T_C q'' cost less than all of q''.
         field = field.at_rows(carrier.foundation_damping)
         q, v = states.displacement, states.velocity
         damping_rate = scalarized_vmap(_rates)((times, states), field).velocity[:, -nb:]
@@ -335,7 +336,8 @@ def _mean_speed(t: Array, phi: Array, rate: Array, first: Array, last: Array) ->
     i = jnp.argmin(jnp.where((k >= first) & (k <= last), jnp.abs(phi - target), jnp.inf))
     t_i, phi_i, rate_i = jnp.unstack(sample(i))
     start = t_i + (target - phi_i) / _away_from_zero(rate_i)
-    # Secant step for a rate that is linear in time; accurate enough because the sample is next to the root.
+    # Second step, with the mean rate between the sample and the first estimate, for a rate that is linear in time. This is
+    # accurate enough because the sample is next to the root.
     j = jnp.where(start > t_i, jnp.minimum(i + 1, last), jnp.maximum(i - 1, first))
     t_j, _, rate_j = jnp.unstack(sample(j))
     h = jnp.where(i == j, 1.0, t_j - t_i)

@@ -95,7 +95,7 @@ def fit_harmonic(time: Array, displacement: Array, speed: Array) -> tuple[Array,
 
 @cached
 def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -> Vibration:
-    """Return the harmonic at the mean speed of the loads, fitted to the displacements of a window, with the measured amplitudes
+    """Return the harmonic at the mean load speed, fitted to the displacements of a window, with the measured amplitudes
     and the mean torques and powers of the drives.
 
     The exciter force is NaN for a rotor with an imbalance, or with loads and an unbalance, because the rotor can turn faster

@@ -154,7 +154,7 @@ def envelope(
 ) -> Envelope:
     """Integrate the averaged equations of a scene from 0 to `until`: amplitudes and load speeds in place of vibrations.
 
-    Each step spans many turns, also in a run-up in which loads jam at a resonance or pass through it. Several exciters may
+    Each step spans many turns, even in a run-up in which loads jam at a resonance or pass through it. Several exciters may
     synchronize, or turn at different speeds; in the second case the steps resolve the beats between them. Each mass that turns,
     a load or the unbalance of a rotor, counts as a load here. The result is the limit of light loads:
 

@@ -62,7 +62,7 @@ class Envelopes(Readable):
     - `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s: complex amplitudes Y of q = Re(Y exp(i theta)), with the mean
       angle theta of the loads. If exciters turn at different speeds, the amplitudes beat
     - `amplitude` (nt, nd), m, and `foundation_force` (nt, nb), N, zero to peak
-    - `omega` (nt,): mean speed of the loads, each positive in the direction of its exciter, and `load_speed` (nt, count) of
+    - `omega` (nt,): mean load speed, each load positive in the direction of its exciter, and `load_speed` (nt, count) of
       each load, positive anticlockwise, rad/s
     - `phase` (nt, count) of each load relative to the mean angle, rad, in its direction of rotation
     - `rotor_speeds`: an array (nt,) for each exciter, anticlockwise, rad/s; `rotor_speed` is that of the only one
@@ -129,7 +129,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         return (self.drift < SETTLED_DRIFT) & is_stable
 
     def harmonic(self) -> Harmonic:
-        """Return the mean vibration of the coordinates over the window, at the mean speed of the loads.
+        """Return the mean vibration of the coordinates over the window, at the mean load speed.
 
         **Raises** `InputError` for a batch of runs.
         """

@@ -193,7 +193,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
     U is the `StaticImbalance` and W the `MomentImbalance` of the rotor, s_j the distance of a load along the axis from the
     rotor's centre of mass. For loads in one plane the first equation is sufficient.
 
-    Balls and rollers with a `ball_radius` must have room beside each other, also without the effect `LoadContact`.
+    Balls and rollers with a `ball_radius` must have room beside each other, even without the effect `LoadContact`.
 
     - Two loads cancel if they are equal and opposite each other
     - Three loads cancel in one triangle and its mirror image
@@ -372,7 +372,7 @@ def balanced_growth(scene: Scene, speeds: Numbers, angles: ArrayLike | None = No
     **Arguments**
 
     - `scene`; its own speed is not used
-    - `speeds`, rad/s, an array of any shape; or a list, also of strings with a unit
+    - `speeds`, rad/s, an array of any shape; or a list of numbers or of strings with a unit
     - `angles` and `steps`: as for `balanced_stability`
 
     **Returns** an array of the shape of `speeds`. **Raises** the errors of `balanced_stability`.

@@ -68,7 +68,7 @@ class AbstractJam(Result):
 
     - `mode`: number of the mode
     - `status`: a `JamStatus`
-    - `omega`: speed of the loads, rad/s; `rotor_speed`, rad/s
+    - `omega`: load speed, rad/s; `rotor_speed`, rad/s
     - `stable`: True if the slope dn/dOmega > 0, for light loads that stay together (`phase_jams` shows whether they do)
     - `slope`: dn/dOmega
     - `displacement` (nd,): complex amplitudes of q = Re(displacement exp(i Omega t)), m (rad for tilts)
@@ -116,7 +116,7 @@ class Jam(AbstractJam):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
-        """Plot the speed of the loads in `unit`, and the amplitudes; `ax`: two axes to plot onto."""
+        """Plot the load speed in `unit`, and the amplitudes; `ax`: two axes to plot onto."""
         return _modes_chart(jax.tree.map(lambda leaf: leaf[None], self), None, unit, ax)
 
 
@@ -167,7 +167,7 @@ class JamModes(AbstractJam):
 
     @validated
     def row(self, mode: int, *, throw: bool = False) -> int:
-        """Return the row of the jam mode with number `mode` in the arrays, also for a mode that does not exist.
+        """Return the row of the jam mode with number `mode` in the arrays, even for a mode that does not exist.
 
         **Raises** `InputError` for a number outside 1 .. 2 nd + 1; with `throw` also the errors of `select`.
         """
@@ -205,7 +205,7 @@ class JamModes(AbstractJam):
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         rows = ("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in lines)
         notes = [text] if (text := self.unresolved_text()) else []
-        return "\n".join([f"rotor {rotor}; resonances {resonances}", *rows, *notes, f"stays: {STABILITY_CRITERION}"])
+        return "\n".join([f"rotor {rotor}; resonances {resonances}", *rows, *notes, f"stable: {STABILITY_CRITERION}"])
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
@@ -221,18 +221,18 @@ def modes_table(jams: JamModes, growth: Mapping[int, float]) -> list[list[str]]:
     unit, scale = speed_unit()
     existing = [jams.select(k) for k in jams.mode_numbers()]
     shown = [shown_unit(each, _largest(jams, k)) for k, each in enumerate(jams.units)]
-    heads = [f"{name}, {length}" for name, (length, _) in zip(jams.coordinates, shown, strict=True)]
+    headers = [f"{name}, {length}" for name, (length, _) in zip(jams.coordinates, shown, strict=True)]
     rows = [
         [
             f"{int(jam.mode)}",
             f"{scale * float(jam.omega):.5g}",
-            stays_text(jam, growth.get(int(jam.mode), math.nan)),
+            stability_text(jam, growth.get(int(jam.mode), math.nan)),
             *(f"{factor * float(a):.4g}" for a, (_, factor) in zip(np.asarray(jam.amplitude), shown, strict=True)),
             f"{float(jam.foundation_force):.4g}",
         ]
         for jam in existing
     ]
-    return [["mode", unit, "stays", *heads, "force, N"], *rows]
+    return [["mode", unit, "stable", *headers, "force, N"], *rows]
 
 
 def _largest(jams: JamModes, coordinate: int) -> float:
@@ -242,7 +242,7 @@ def _largest(jams: JamModes, coordinate: int) -> float:
     return float(np.max(values, initial=0.0, where=np.isfinite(values)))
 
 
-def stays_text(jam: Jam, growth: float) -> str:
+def stability_text(jam: Jam, growth: float) -> str:
     """Return a text about the stability of a jam, from its slope and from the growth rate of disturbances that separate the
     loads, NaN if it is unknown."""
     if jam.judgement == "loads cannot stay together":
@@ -294,7 +294,7 @@ def jam_modes(scene: Scene) -> JamModes:
     the number of the resonance nearest to the peak; the status of the other modes is `absent`, and `unresolved` lists them.
 
     **Returns** `JamModes`; derivatives of every field with respect to every parameter of the scene are exact (implicit
-    function theorem), forward and reverse. `vmap` over scenes gives many rotor speeds at once.
+    function theorem), forward and reverse. `vmap` over scenes computes the jams at many rotor speeds at once.
 
     **Raises** `InputError` for
 
@@ -338,8 +338,8 @@ def jams_of(scene: Scene) -> JamModes:
     chosen = jnp.argmax(hits, axis=1)
     omega = jnp.where(there, omega[chosen], n)
 
-    # Closer to a fold, the difference between its rotor speed and the scene's is lost in rounding errors, and derivatives are
-    # not significant.
+    # If the rotor speeds of the scene and of a fold differ by less than this limit, their difference is lost in rounding
+    # errors, and derivatives are not significant.
     speeds = jax.lax.stop_gradient(jnp.where(pieces.folds.exists, pieces.folds.rotor_speed, jnp.inf))
     close = jnp.concatenate([jnp.zeros((1,), bool), jnp.abs(speeds - n) < 4096.0 * jnp.finfo(n.dtype).eps * n])
     close = (close | jnp.roll(close, -1))[chosen]

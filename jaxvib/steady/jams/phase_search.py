@@ -86,7 +86,7 @@ class PhaseJams(AbstractPhaseJam):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot the speeds of the loads over the drag, from a 30th of the scene's to 30 times it, for each pattern of these
+        """Plot the load speeds over the drag, from a 30th of the scene's to 30 times it, for each pattern of these
         jams.
 
         Colours show the arrangement of the loads; stable solid, unstable dashed, the jams themselves as points.

@@ -120,20 +120,22 @@ def exact_branches(
     """Compute the branch n(Omega) of exact jams with its stability and the points of stability changes.
 
     Each point is solved separately at its own load speed; therefore folds need no continuation. Special points are bracketed by
-    the points of the diagram and then computed as roots. The multipliers s_i are those over a period; for motions with the
-    half-turn symmetry, s_i is instead the growth over half a period followed by the half-turn. The special points are the roots
+    the points of the diagram and then computed as roots of functions of the growth factors s_i of disturbances. The s_i are the
+    Floquet multipliers of a period, or, if the motion has the half-turn symmetry, the eigenvalues of the map from a disturbance
+    to the disturbance half a period later, rotated by half a turn. Coincident loads have two sets of s_i: those of disturbances
+    that keep the loads coincident, and those of disturbances that separate them. The special points are the roots
 
     - of dn/dOmega: fold
-    - of prod (1 - s_i s_j) over pairs: torus
-    - of prod (1 + s_i), for all loads together or for loads that separate: loss of symmetry if the motion has the half-turn
-      symmetry, otherwise period doubling
-    - of prod (1 - s_i), for loads that separate: loss of symmetry
+    - of prod (1 - s_i s_j) over pairs of the first set: torus
+    - of prod (1 + s_i), of either set: loss of symmetry if the motion has the half-turn symmetry, otherwise period doubling
+    - of prod (1 - s_i) of the second set: loss of symmetry
 
     **Arguments**
 
     - `points`: number of points along Omega, denser near the resonances
-    - `least`, `most`: limits of the load speed, rad/s or text; default: a fifth of the lowest resonance or of the scene's rotor
-      speed, if this is lower, and 4/3 of the rotor speed
+    - `least`: lowest load speed, rad/s or text; default: a fifth of the lowest resonance, or a fifth of the rotor speed if the
+      rotor speed is below this resonance
+    - `most`: highest load speed, rad/s or text; default: 4/3 of the rotor speed
     - `accuracy` of the rotor speeds, relative; default: 1e-8, in single precision 1e-3
 
     **Returns** `ExactBranches`; a point that could not be solved has NaN and a status. **Raises** `InputError`.
@@ -172,7 +174,8 @@ def exact_branches(
 
 _FIELDS = tuple(name for name in ExactBranches.__dataclass_fields__ if name not in ("special", "scene"))
 _Values: TypeAlias = dict[str, Any]
-"""These fields of exact jams, with a leading axis, and `tests` (P, 4), which change sign at stability changes, see `_tests`."""
+"""The `_FIELDS` of exact jams, with a leading axis, and the `tests` (P, 4) of `_tests`, which change sign where the stability
+changes."""
 
 
 class _Solver:
@@ -233,10 +236,9 @@ _KINDS_OF_TESTS = ("torus", "half_turn", "half_turn", "symmetry")
 def _tests(growth: Floquet) -> Array:
     """Return four test functions (P, 4) of the growth factors s.
 
-    - Two for all loads together, with the `roots` of `Floquet` as s: prod (1 - s_i s_j) over pairs, and prod (1 + s_i)
-    - Two for loads that separate, with its `inner` as s: prod (1 + s_i), and prod (1 - s_i)
-
-    The growth is that over half a period followed by the half-turn if the motion has this symmetry, otherwise over a period.
+    - Two for disturbances that keep the loads coincident, s = `roots` of `Floquet`: prod (1 - s_i s_j) over pairs, and
+      prod (1 + s_i)
+    - Two for disturbances that separate the loads, s = `inner` of `Floquet`: prod (1 + s_i), and prod (1 - s_i)
     """
     s = growth.roots
     first, second = np.triu_indices(s.shape[0], 1)

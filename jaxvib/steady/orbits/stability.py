@@ -40,10 +40,12 @@ class Floquet(NamedTuple):
 
     **Attributes**
 
-    - `roots` (2 nd + 2 G - 1, P) complex: growth over a turn of the grid, without the trivial root of a shift in time. If the
-      motion has the half-turn symmetry, a turn of the grid is half a period followed by the half-turn, and the multipliers are
-      the squares of the roots; otherwise it is a period, and the roots are the multipliers
-    - `inner` (2, P): the same for two loads that separate while the others do not move, None for a single load
+    - `roots` (2 nd + 2 G - 1, P) complex: growth factors of disturbances that keep the loads of a group coincident, over the
+      span of the collocation grid, without the trivial root of a shift in time. The span is a period, and the roots are the
+      Floquet multipliers. If the motion has the half-turn symmetry, the span is half a period, the disturbance at its end is
+      rotated by half a turn, and the multipliers are the squares of the roots
+    - `inner` (2, P): growth factors of the distance of two coincident loads while all other parts do not move, over the same
+      span; None for a single load
     - `trivial` (P,): the trivial root, which is 1 except for the error of the integration
     """
 

@@ -356,7 +356,8 @@ def _require_one_body(exciter: Exciter, place: str) -> None:
         return
     if exciter.unbalance is not None or has_term(exciter.effects, RotorImbalance):
         problem = (
-            "do not turn at the speed of the rotor's unbalance, so that no motion repeats; leave one of them out, or simulate"
+            "do not turn at the rotor speed, as the rotor's unbalance does, so no motion repeats; "
+            "leave one of them out, or simulate"
         )
         raise InputError(f"{place}loads", problem)
     if not drive.ideal:

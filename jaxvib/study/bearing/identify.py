@@ -215,7 +215,7 @@ def _interpret_fit(
     law = jax.tree.unflatten(jax.tree.structure(fit.unknowns.friction), intervals)
     viscous, dry = law.viscous, law.dry
     pattern = float(np.sum(residuals[1:] * residuals[:-1]) / np.sum(residuals**2)) if np.any(residuals) else 0.0
-    structure, chance = _structure(record.time[used], residuals, turns, len(values))
+    structure, p_value = _structure(record.time[used], residuals, turns, len(values))
     correlation = float(covariance[4, 5] / (errors[4] * errors[5])) if dry is not None else math.nan
 
     is_long, weight = turns.amplitude.size > 20, float(pendulum.mass * pendulum.g * pendulum.length)
@@ -244,7 +244,7 @@ def _interpret_fit(
         record=record,
         pendulum=pendulum,
     )
-    is_patterned = abs(pattern) > 4.0 / math.sqrt(samples) or chance < _PATTERN_PROBABILITY
+    is_patterned = abs(pattern) > 4.0 / math.sqrt(samples) or p_value < _PATTERN_PROBABILITY
     is_patterned = is_patterned and result.noise > 10.0 * TOLERANCE
     has_converged = bool(fit.converged) and result.noise <= 0.5 * float(np.std(record.angle[used]))
     status = _status(result, has_converged=has_converged, is_patterned=is_patterned, instrument=instrument)

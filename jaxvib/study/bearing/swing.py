@@ -54,7 +54,7 @@ class BearingPendulum(Readable):
     >>> round(float(rod.total_inertia), 6), round(float(rod.frequency), 4)
     (0.025, 5.4249)
 
-    Source: Artyunin, Sumenkov 2019, figure 2; here also for large swings and with dry friction.
+    Source: Artyunin, Sumenkov 2019, figure 2; extended here to large swings and dry friction.
     """
 
     mass: Array

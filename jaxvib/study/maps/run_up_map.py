@@ -52,7 +52,7 @@ class RunUpMap(Result):
     - `angle` (ns, count): initial angles of the loads, rad
     - `regime`: a `Regime` whose arrays have the leading axes (nd, ns)
     - `kind` (nd, ns): short name of the regime, or "failed" if the run did not reach its end
-    - `omega` (nd, ns): mean speed of the loads, rad/s, NaN for a failed run
+    - `omega` (nd, ns): mean load speed, rad/s, NaN for a failed run
     - `finished` (nd, ns): True if the run reached its end
     """
 

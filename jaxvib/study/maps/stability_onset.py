@@ -28,7 +28,7 @@ class StabilityMap(Result):
 
     - `value` (n,) of x
     - `omega` (n, P): load speeds, rad/s
-    - `stable` (n, P): True if the jam is stable, also against separation of the loads
+    - `stable` (n, P): True if the jam is stable, including against separation of the loads
     - `special` (n,): the special points of each diagram
     """
 

@@ -170,7 +170,7 @@ def test_planned_runs_keep_their_jam():
 def test_further_run_with_jammed_loads_is_predicted():
     rng = np.random.default_rng(7)
     found = jv.predict_run(fitted(), jammed_record(JAMMED_NOISE, rng, impact=-0.15))
-    assert found.status_name == "predicted" and found.chance > 1e-3
+    assert found.status_name == "predicted" and found.p_value > 1e-3
     np.testing.assert_allclose(found.ratio, 1.0, atol=0.1)
     other = jv.predict_run(fitted(), jammed_record(JAMMED_NOISE, rng, impact=-0.15, drag=1.52))
     assert other.status_name == "contradicted"

@@ -242,7 +242,7 @@ def test_expected_errors_on_a_stop_are_those_of_a_later_fit():
 def test_further_run_on_a_stop_is_predicted():
     """The angle of the unbalance of the linear response differs from the true one by 1.6 rad."""
     found = jv.predict_run(fitted(), slower_record(1))
-    assert found.status_name == "predicted" and found.chance > 1e-3, found.notes
+    assert found.status_name == "predicted" and found.p_value > 1e-3, found.notes
     np.testing.assert_allclose(found.ratio, 1.0, atol=0.15)
     other = jv.predict_run(fitted(), slower_record(2, **{"effects.stop[0].gap": 1.02e-3}))
     assert other.status_name == "contradicted" and other.notes[-1].endswith("too much to name a number")

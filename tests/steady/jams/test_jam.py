@@ -220,8 +220,8 @@ def test_select_says_what_is_wrong():
 def test_summary_lists_the_modes():
     text = jv.jam_modes(published().scene()).summary()
     lines = text.splitlines()
-    assert lines[1].split()[:3] == ["mode", "rpm", "stays"] and lines[2].split()[:2] == ["3", "9.2824"]
-    assert text.endswith("stays: by slope, for light loads that stay together")
+    assert lines[1].split()[:3] == ["mode", "rpm", "stable"] and lines[2].split()[:2] == ["3", "9.2824"]
+    assert text.endswith("stable: by slope, for light loads that stay together")
 
 
 def test_vmap_over_rotor_speeds_is_a_loop():
