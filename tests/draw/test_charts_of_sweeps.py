@@ -1,0 +1,101 @@
+"""Charts of many cases, against the numbers that they show."""
+
+import matplotlib.colors
+import numpy as np
+import pytest
+
+from jaxvib.draw.charts import convergence, front_chart
+from jaxvib.draw.style import COLORS, HATCHED
+from jaxvib.draw.sweeps import distribution_chart, label_map, points_over, shares_chart, tornado_chart, value_map
+
+
+def shown_colors(mesh):
+    return [matplotlib.colors.to_hex(color) for color in mesh.to_rgba(mesh.get_array()).reshape(-1, 4)]
+
+
+def test_cells_without_a_result_are_hatched():
+    axis = label_map(
+        np.arange(2.0), np.arange(3.0), np.array([[0, -1], [0, 0], [0, -1]]), ["a"], x_label="x", y_label="y"
+    ).axes[0]
+    legend = axis.get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["a", "no result"]
+    plain = matplotlib.colors.to_hex(legend.get_patches()[0].get_facecolor())
+    grey = HATCHED["no result"]["facecolor"]
+    assert shown_colors(axis.collections[0]) == [plain, grey, plain, plain, plain, grey]
+    mixed = 0.55 * np.asarray(matplotlib.colors.to_rgb(COLORS[0])) + 0.45
+    np.testing.assert_allclose(legend.get_patches()[0].get_facecolor()[:3], mixed)
+    (hatched,) = (patch for patch in axis.patches if patch.get_hatch())
+    corners = hatched.get_path().vertices.reshape(2, 5, 2)
+    assert corners[:, 0].tolist() == [[0.5, -0.5], [0.5, 1.5]] and corners[:, 2].tolist() == [[1.5, 0.5], [1.5, 2.5]]
+
+
+def test_a_map_of_values_has_logarithmic_axes_on_request():
+    x, y, values = np.array([1.0, 10.0]), np.array([1.0, 100.0]), np.array([[1.0, 2.0], [3.0, np.nan]])
+    for log in ((False, False), (True, False), (False, True)):
+        axis = value_map(x, y, values, x_label="x", y_label="y", label="z", log=log).axes[0]
+        assert (axis.get_xscale() == "log", axis.get_yscale() == "log") == log
+        np.testing.assert_array_equal(axis.collections[0].get_array().filled(np.nan), values)
+
+
+def test_points_over_a_parameter_are_drawn():
+    x, values = np.array([1.0, 10.0]), np.array([[1.0, 2.0], [3.0, 4.0]])
+    axis = points_over(x, values, x_label="x", y_label="y", log=True).axes[0]
+    assert [line.get_xydata().tolist() for line in axis.lines] == [[[1.0, 1.0], [10.0, 3.0]], [[1.0, 2.0], [10.0, 4.0]]]
+    assert axis.get_xscale() == "log" and axis.get_yscale() == "linear"
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_intervals_of_few_shares_are_bars_side_by_side(log):
+    x, share = np.array([1.0, 100.0]), np.array([0.1, 0.5])
+    shares = {"a": (share, share - 0.05, share + 0.1), "b": (share + 0.2, share, share + 0.3)}
+    axis = shares_chart(x, shares, x_label="x", log=log).axes[0]
+    shift = 0.003 * np.array([-1.0, 1.0])
+    places = [x * 100.0**each if log else x + 99.0 * each for each in shift]
+    lines = [line.get_xydata() for line in axis.lines if line.get_label() in shares]
+    np.testing.assert_allclose(lines[0], np.stack([places[0], [10.0, 50.0]], axis=1))
+    np.testing.assert_allclose(lines[1], np.stack([places[1], [30.0, 70.0]], axis=1))
+    bars = [container.lines[2][0].get_segments() for container in axis.containers]
+    np.testing.assert_allclose(np.asarray(bars)[:, :, :, 1], [[[5.0, 20.0], [45.0, 60.0]], [[10.0, 40.0], [50.0, 80.0]]])
+    assert axis.get_xscale() == ("log" if log else "linear")
+
+
+def test_intervals_of_many_shares_are_bands():
+    x = np.linspace(0.0, 1.0, 41)
+    axis = shares_chart(x, {"a": (0.5 * x, 0.25 * x, x)}, x_label="x").axes[0]
+    np.testing.assert_allclose(axis.lines[0].get_xydata(), np.stack([x, 50.0 * x], axis=1))
+    corners = {tuple(corner) for corner in axis.collections[0].get_paths()[0].vertices.tolist()}
+    assert {(1.0, 25.0), (1.0, 100.0), (0.0, 0.0)} <= corners and not axis.containers
+
+
+def test_a_distribution_adds_up_to_all_cases():
+    counts, share = distribution_chart(np.array([0.0, 1.0, 3.0]), np.array([1.0, 3.0]), x_label="force, N").axes
+    assert [(bar.get_x(), bar.get_width(), bar.get_height()) for bar in counts.patches] == [(0.0, 1.0, 1.0), (1.0, 2.0, 3.0)]
+    assert share.lines[0].get_xydata().tolist() == [[0.0, 0.0], [1.0, 25.0], [3.0, 100.0]]
+    none = distribution_chart(np.array([0.0, 1.0]), np.zeros(1), x_label="force, N").axes[1]
+    assert none.lines[0].get_ydata().tolist() == [0.0, 0.0]
+
+
+def test_the_largest_difference_of_a_tornado_is_at_the_top():
+    low, high = np.array([1.0, 5.0, np.nan]), np.array([3.0, -4.0, 1.0])
+    axis = tornado_chart(["a", "b", "c"], low, high, 2.0, x_label="force, N").axes[0]
+    assert [text.get_text() for text in axis.get_yticklabels()] == ["c", "a", "b"]
+    bars = [(bar.get_x(), bar.get_x() + bar.get_width(), bar.get_y() + 0.5 * bar.get_height()) for bar in axis.patches]
+    at = [(min(ends), max(ends), pytest.approx(y)) for *ends, y in bars]
+    assert at[2:] == [(1.0, 2.0, 1.0), (2.0, 3.0, 1.0), (2.0, 5.0, 2.0), (-4.0, 2.0, 2.0)]
+    colors = [matplotlib.colors.to_hex(bar.get_facecolor()) for bar in axis.patches[2:4]]
+    legend = [matplotlib.colors.to_hex(patch.get_facecolor()) for patch in axis.get_legend().get_patches()]
+    assert colors == legend and axis.lines[0].get_xdata()[0] == 2.0
+
+
+def test_a_front_is_a_line_of_numbered_machines():
+    axis = front_chart(np.array([2.0, 1.0, 1.0]), np.array([1.0, 4.0, 3.0]), x_label="x", y_label="y").axes[0]
+    assert axis.lines[0].get_xydata().tolist() == [[1.0, 3.0], [1.0, 4.0], [2.0, 1.0]]
+    assert [(text.get_text(), text.xy) for text in axis.texts] == [("0", (2.0, 1.0)), ("1", (1.0, 4.0)), ("2", (1.0, 3.0))]
+
+
+@pytest.mark.parametrize(("least", "scale"), [(1.0, "log"), (0.0, "linear"), (-1.0, "linear")])
+def test_convergence_has_the_best_start_in_bold(least, scale):
+    history = np.array([[5.0, 4.0], [3.0, least], [np.nan, least]])
+    axis = convergence(history, best=1, label="force, N").axes[0]
+    bold = next(line for line in axis.lines if line.get_label() == "best start")
+    assert bold.get_ydata().tolist() == [4.0, least, least] and axis.get_yscale() == scale
