@@ -310,12 +310,12 @@ def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Draw
 
 def growth_chart(time: np.ndarray, rates: np.ndarray, exponent: float, uncertainty: float, *, ax: Axes | None = None) -> Drawn:
     """Draw growth rates (n,), 1/s, of intervals that end at `time` (n,), s, and the largest Lyapunov exponent, 1/s, with its
-    standard error."""
+    uncertainty."""
     figure, (axes,) = panels(1, ax=ax)
     axes.plot(time, rates, "o-", ms=3.5, color=COLORS[0], label="each interval")
     half = time[time.size // 2 :]
     axes.fill_between(half[[0, -1]], exponent - uncertainty, exponent + uncertainty, color=COLORS[1], alpha=0.3, lw=0.0)
-    axes.plot(half[[0, -1]], [exponent, exponent], color=COLORS[1], ls="--", label="exponent, with its standard error")
+    axes.plot(half[[0, -1]], [exponent, exponent], color=COLORS[1], ls="--", label="exponent, with its uncertainty")
     axes.axhline(0.0, color="black", lw=0.8)
     axes.set(xlabel="time, s", ylabel="growth of disturbances, 1/s")
     legend_above(axes)

@@ -85,8 +85,8 @@ def contact_force(
 class ContactSolution(NamedTuple):
     """Inertia factor `kappa`, generalized `force` and `friction` of loads, each of which either rolls or slides.
 
-    `on_rotor`: the friction that brakes the rotor, if it is not `friction`. The force of a sliding contact does not brake the
-    rotor, like that of a rolling contact.
+    `on_rotor`: the friction that brakes the rotor, if it is not `friction`. It does not include the contact forces, neither
+    those of sliding loads nor those of rolling loads.
     """
 
     kappa: Array

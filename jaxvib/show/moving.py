@@ -53,7 +53,7 @@ def moving_svg(scene: Scene, jam: Jam) -> str:
     """
     view = view_of(drawable_scene(scene))
     if not np.isfinite(jam.omega) or not np.isfinite(jam.displacement).all():
-        raise ComputationError("absent", f"jam mode {int(jam.mode)} cannot be shown:  {jam.message}")
+        raise ComputationError("absent", f"jam mode {int(jam.mode)} cannot be shown: {jam.message}")
     first, *others = (np.asarray(u, float) for u in scene.loads.rest())
     angles = _THETA[:, None] + np.zeros_like(first)
     load_positions = places_of(scene.loads, (angles, *others))  # one call for all poses

@@ -359,8 +359,9 @@ def _constant(value: float, unit: str) -> Combined:
 
 
 def _with_unit(value: Operand, name: str, beside: Operand = "") -> Quantity:
-    """Return a value as a quantity. A number has no unit; a string such as "2 mm" is converted to SI with its own unit, or with
-    that of the other operand `beside` of a ratio if both are per time."""
+    """Return a value as a quantity. A number has no unit. A string such as "2 mm" is converted to the SI unit of its dimension;
+    if it is a speed or a frequency ("25 Hz"), and the other operand `beside` of a ratio is one too, to the unit of that
+    operand."""
     if isinstance(value, Quantity):
         return value
     if isinstance(value, (str, UnitQuantity)):

@@ -98,7 +98,7 @@ class _Trial(NamedTuple):
 
 def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     """Return the problem of a motion with loads, in which the first values of the linear unknowns are set, and the first values
-    of x.
+    of the other unknowns, x.
 
     If the motion with the first values of the scene does not resemble the records, it is computed again with other stiffnesses,
     see `_stiffnesses_of_jam`.

@@ -30,7 +30,7 @@ class TorqueTable(Motor):
     - `speeds` of the points, rad/s, in ascending order, at least 2; typical: ["0 rpm", "1000 rpm", "1500 rpm"]
     - `torques` at these speeds, N m: the first must be positive, the last 0 or negative and not above the one before it;
       typical: -10 to 200
-    - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
+    - `inertia` I of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
     **Attributes**: the arguments; the no-load `speed`, the largest speed at which the torque falls to 0.
 
@@ -256,7 +256,7 @@ class SpeedControl(Motor):
     - `gain`, N m s; typical: 0.05 to 5
     - `integral_gain`, N m; typical: gain divided by 0.1 to 1 s
     - `torque_limit`, N m; typical: 1.5 to 2.5 times the rated torque
-    - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
+    - `inertia` I of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
     **Raises** `InputError` for a wrong unit, a value that is not positive, and a reference of the wrong type.
 

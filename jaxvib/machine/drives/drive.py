@@ -64,7 +64,7 @@ class Drive(Part):
 
     @abc.abstractmethod
     def torque_and_inertia(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> tuple[Array, Array] | None:
-        """Return two values at time `t` (s) and rotor `speed` (rad/s): the torque T (N m), and the rotor's inertia J (kg m^2).
+        """Return two values at time `t` (s) and rotor `speed` (rad/s): the torque T (N m), and the rotor's inertia I (kg m^2).
 
         `states` are those of the motor, see `state_units`; without them T is the steady torque. Return None if no torque
         changes the speed.
@@ -205,9 +205,9 @@ class IdealDrive(Drive):
 class Motor(Drive):
     """Drive of limited power; the rotor's motion follows from its torque and the loads.
 
-        J theta'' = T(theta') - torque of the loads on the rotor
+        I theta'' = T(theta') - torque of the loads on the rotor
 
-    J (`inertia`) is the moment of inertia of the whole rotor about its axis. It includes the unbalance of the rotor but not
+    I (`inertia`) is the moment of inertia of the whole rotor about its axis. It includes the unbalance of the rotor but not
     the loads; typical: 0.005 to 1 kg m^2.
 
     >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
@@ -410,7 +410,7 @@ class DCMotor(Motor):
 
     - `speed`: no-load speed, rad/s; typical: 100 to 320 (1000 to 3000 rpm)
     - `stall_torque`, N m; typical: 1 to 50
-    - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
+    - `inertia` I of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
     **Raises** `InputError` for a wrong unit or a value that is not positive.
 
@@ -446,7 +446,7 @@ class InductionMotor(Motor):
     - `breakdown_torque` T_b, the largest torque, N m; typical: 2 to 3 times the rated torque, 8 to 250 for 0.5 to 15 kW at 1500
       rpm
     - `breakdown_slip` s_b, the slip at that torque, below 1; typical: 0.1 (large motors) to 0.4 (small motors)
-    - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
+    - `inertia` I of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
     **Raises** `InputError` for a wrong unit or a value that is not allowed.
 

@@ -47,7 +47,7 @@ class NamePlateMotor(Motor):
     - `power`: rated mechanical power, W; typical: "0.25 kW" to "15 kW"
     - `rated_speed`, rad/s; typical: "1440 rpm"
     - `breakdown_ratio`: breakdown torque divided by rated torque, greater than 1; typical: 2 to 3.5
-    - `inertia` J of the whole rotor with its unbalance, kg m^2; typical: 0.005 to 0.5
+    - `inertia` of the whole rotor with its unbalance, kg m^2; typical: 0.005 to 0.5
     - `frequency` of the supply, rad/s; typical: "50 Hz" (the default) or "60 Hz"
     - `starting_ratio`: starting torque (locked rotor) divided by rated torque, M_A/M_N of catalogues; None (the default): that
       of Kloss's formula; typical: 1.8 to 2.8
@@ -173,7 +173,7 @@ class DCMotorElectrical(Motor):
     - `voltage` V of the supply, V; typical: 12 to 400
     - `resistance` R of the armature, ohm; typical: 0.2 to 20
     - `torque_constant` K, N m/A, equal to the constant of the induced voltage in V s/rad; typical: 0.05 to 2
-    - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
+    - `inertia` of the whole rotor, kg m^2; typical: 0.005 to 0.5
     - `inductance` L of the armature, H, or None (the default); typical: 1e-4 to 0.05
 
     **Raises** `InputError` for a wrong unit or a value that is not positive.
@@ -241,7 +241,7 @@ class InductionMotorCircuit(Motor):
     - `stator_resistance` R_s and `rotor_resistance` R_r of a phase, ohm; typical: 0.2 to 10
     - `stator_leakage` and `rotor_leakage`: leakage inductances of a phase, H; typical: 1e-3 to 0.03
     - `magnetizing_inductance` L_m, H; typical: 0.05 to 0.7
-    - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
+    - `inertia` of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
     **Raises** `InputError` for a wrong unit or a value that is not allowed.
 

@@ -41,7 +41,7 @@ def damped_newton(
     - `on_scalars`: compile the equations as operations on single numbers instead of arrays, see `scalarize`. For many starts
       this takes a third of the time, but it takes longer to compile
 
-    **Returns** the root and the auxiliary values there.
+    **Returns** the unknowns with the smallest residuals (the root, if the iteration converges) and the auxiliary values there.
 
     >>> x, two_x = damped_newton(lambda x, a: (x**2 - a, 2.0 * x), jnp.ones(1), jnp.full(1, 2.0))
     >>> round(float(x[0]), 5), round(float(two_x[0]), 5)

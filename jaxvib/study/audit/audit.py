@@ -115,7 +115,7 @@ def audit(
     repeats: int = 3,
     progress: Callable[[str, float], None] | None = None,
 ) -> Audit:
-    """Compute the changes of the results of a scene by each effect and by each tier, and the cost of each.
+    """Compute by how much each effect and each tier changes the results of a scene, and the cost of each.
 
     The audit shows which effects of a scene are negligible, and which effects the scene lacks.
 
