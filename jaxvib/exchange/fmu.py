@@ -92,7 +92,7 @@ def export_fmu(
     - Inputs are `force.y1` on each coordinate (N, for angles N m) and, with a motor, `rotor.torque` (N m, anticlockwise), which
       is added to the torque of the motor
     - In a scene with several exciters, the names of their signals begin with the exciter, such as `exciters[1].rotor.torque`
-    - Event indicators are the differences that are compared in nonsmooth forces (stops, contacts, dry friction) and in a drive
+    - Event indicators are the differences that are compared in non-smooth forces (stops, contacts, dry friction) and in a drive
       whose acceleration jumps; a solver ends a step at the time at which an indicator changes its sign
     - Directional derivatives of rates and outputs with respect to states, inputs, parameters and time are exact
 

@@ -186,7 +186,7 @@ def identify(
     - The least-squares fit uses the whole record, including the transients
     - The unknowns of the fit are the unknown numbers, the gains of the sensors (known to `gain_error`), the angle of the
       unbalance, the offsets, and the state at the first sample
-    - The noise of each channel may be coloured: residuals are filtered to white noise by an autoregressive model, and the
+    - The noise of each channel may be coloured: residuals are whitened by an autoregressive model, and the
       intervals follow from the Fisher information with the estimated noise
     - The loads of a scene with one exciter (balls, rollers, pendulums) must be jammed throughout the runs; their motion is that
       of `vector_field`, and their angles and speeds at the first sample are unknowns

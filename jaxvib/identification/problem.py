@@ -65,7 +65,7 @@ DELAY_MARGIN = 2
 
 
 _MAX_DELAY = 450
-"""Largest delay of readings in steps; the longest filter contains it and a filter to white noise."""
+"""Largest delay of readings in steps; the longest filter contains it and a whitening filter."""
 
 
 class Known(NamedTuple):

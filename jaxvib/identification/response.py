@@ -95,9 +95,9 @@ class Samples(eqx.Module):
 
     - `drives`: for each exciter the drive that turns its rotor in this run
     - `begin` and `end`, s: times of the first and the last sample
-    - `readings` (N, n, C): readings after the filter to white noise, see `with_noise` in `jaxvib.identification.problem`
+    - `readings` (N, n, C): readings after the whitening filter, see `with_noise` in `jaxvib.identification.problem`
     - `weights` (N, n, C): 1/noise of each reading, 0 for readings that do not count
-    - `taps` (m + 1, C): filter to white noise for the readings of the model
+    - `taps` (m + 1, C): coefficients of the whitening filter, for the readings of the model
     - `step` h, s
     - `changed`: numbers of the scene that differ in this run; `actions` ("add", "scale" or "set") and `amounts` of the changes
     - `channels` that are compared; `turn`: index of the run's unknown zero of the angle, or None

@@ -16,14 +16,14 @@ _MAX_BYTES, _MAX_LINE = 2**29, 10_000
 """Largest number of bytes of a file (ten million rows of five columns), and of characters of a line."""
 
 _MAX_PREAMBLE = 400
-"""Largest number of lines above the head of a table."""
+"""Largest number of lines above the header of a table."""
 
 _MISSING = ("", "-", "nan", "na", "n/a", "#n/a", "null", "none")
 """Texts, in lower case, in place of a reading that is missing."""
 
 
 _ONE_COLUMN_MARK = "\n"
-"""Mark of a table with one column: it occurs in no line."""
+"""Separator of a table with one column: a character that occurs in no line."""
 
 
 class TextTable(NamedTuple):
@@ -34,7 +34,7 @@ class TextTable(NamedTuple):
     - `path` of the file
     - `heads` and `units`: texts of the line of names and of the line below it, an empty list without such a line
     - `width`: number of columns
-    - `remarks`: lines above the head, and those that begin with #
+    - `remarks`: lines above the header, and those that begin with #
     - `first`: number of lines above the first row of numbers; empty lines and lines that begin with # do not count
     - `mark`: character between columns, None for blanks, a line break for one column
     """
@@ -103,7 +103,7 @@ class TextTable(NamedTuple):
 
 
 def read_table(path: str | Path, needs: str) -> TextTable:
-    """Read the head of a table of text.
+    """Read the header of a table of text.
 
     - Lines that begin with # and empty lines are skipped
     - Lines above the line of names are skipped if only a line of units, or no line, is between the names and the numbers

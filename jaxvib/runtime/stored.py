@@ -268,7 +268,7 @@ _ARRAYS = (jax.Array, np.ndarray, np.generic)
 """Types of arrays. A call copies NumPy's arrays to the device in a tenth of the time of `jax.device_put`."""
 
 _UNKNOWN = _Program(lambda *_: [], Skeleton(()))
-"""Mark of a program that is not in memory."""
+"""Sentinel for a program that is not in memory."""
 
 
 def _evict_least_recently_used() -> None:

@@ -67,12 +67,13 @@ class AbstractResponse(Readable):
       in two directions: the root of the sum of the squares of their peaks (for a rotating force sqrt 2 times its magnitude)
     - `transmissibility`: `foundation_force` divided by `exciter_force`; inf if the centrifugal forces cancel
     - `torque` (exciter,), N m: mean torque that each rotor needs to sustain the vibration; `power` (exciter,), W
-    - `motor_torque` (exciter,), N m: torque of each motor at this speed. That of an ideal drive is equal to `torque`, plus an
-      equal share of the torque that the motors of other exciters lack
+    - `motor_torque` (exciter,), N m: torque of each motor at this speed. An ideal drive supplies its own `torque`
+      and an equal part of the difference between `torque` and `motor_torque` of the exciters with motors
     - `torque_share`: the sum of `torque` divided by that of `motor_torque`; inf above the no-load speed, where the motors brake
 
-    Values at an undamped resonance are infinite. Values at speed 0 are the limits at low speeds: the transmissibility of a
-    machine on springs is 1, and the amplitude of one without supports is S/M.
+    At an undamped resonance the values other than `speed`, `exciter_force` and `motor_torque` are infinite. Values at speed 0
+    are the limits at low speeds: the transmissibility of a machine on springs is 1, and the amplitude of one without supports
+    is S/M.
     """
 
     speed: Array = eqx.field(metadata=in_unit("rad/s", "*"))

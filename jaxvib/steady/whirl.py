@@ -54,8 +54,8 @@ class CriticalSpeeds(Result):
 
     - `speed` (nd,), rad/s, ascending; inf for a speed that does not exist (a thin disc has no second forward critical speed)
     - `forward` (nd,): True if the whirl turns in the direction of the rotor. On supports that are equal in both directions an
-      imbalance excites forward whirls only. If horizontal and vertical supports differ, it excites all whirls, and between
-      the two speeds into which a critical speed is split, it turns the rotor's axis backward
+      imbalance excites forward whirls only. If horizontal and vertical supports differ, it excites all whirls; between
+      the two speeds into which a critical speed is split, the rotor's axis then whirls backward
     - `straight` (nd,): True if the axis moves on a straight line, which needs different horizontal and vertical supports
     - `status`: a `WhirlStatus`
     """
@@ -252,8 +252,8 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
 
     The kind is - Re(2 s + c/m). Of the two real roots of an overdamped motion, it is negative at the slower one, at which
     damping balances the spring, and positive at the faster one, at which damping stops the mass. Its sign (the sign
-    characteristic in the theory of Hermitian matrix polynomials) tells slow from fast roots even if the roots of several
-    motions are mixed in size.
+    characteristic in the theory of Hermitian matrix polynomials) distinguishes slow from fast roots even if a slow root of one
+    motion is larger than a fast root of another motion.
 
     The error is the step of Newton's method for the scalar equation, plus the rounding of its terms.
 

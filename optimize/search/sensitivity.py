@@ -18,7 +18,8 @@ _STEP = 0.01
 
 
 _EDGE = 2.0 * ACTIVE_DISTANCE
-"""Distance from a bound, relative to the range, within which a free parameter with a multiplier is at its bound."""
+"""Distance from a bound, relative to the range, within which a free parameter counts as at its bound if the multiplier of the
+bound is not 0."""
 
 
 def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult, sides: np.ndarray) -> tuple[Limit, ...]:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 @click.option("--most", type=SPEED_TYPE, help="Highest speed, such as '2000 rpm' [4/3 of the working speed].")
 @click.option(
     "--phases",
-    help="Phases of the unbalances of several exciters, which gears keep, such as '0 deg, 180 deg' [those of the first stable "
-    "synchronous regime].",
+    help="Fixed phases of the unbalances of several exciters, as if gears connected them, such as '0 deg, 180 deg' [those of "
+    "the first stable synchronous regime].",
 )
 @click.option("--points", type=int, default=500, show_default=True, help="Number of speeds.")
 @WITHOUT

@@ -353,7 +353,7 @@ class InductionMotorElectrical(InductionMotorCircuit):
         return 1.5 * self.pole_pairs * (states[0] * iy - states[1] * ix)
 
     def supply_frequency(self) -> Array:
-        """Return the frequency of the supply, at whose phase the fluxes continue."""
+        """Return the angular frequency of the supply, rad/s; the torque depends on the phase of the supply."""
         return self.frequency
 
     def state_units(self) -> tuple[Array, ...]:

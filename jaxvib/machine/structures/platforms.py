@@ -26,11 +26,11 @@ class Platforms(Machine):
 
     **Attributes** (n platforms, L links); typical values: see `two_mass`
 
-    - `mass` (n,), kg, of the platforms; the exciter's platform includes the auto-balancer's body, not its loads
+    - `mass` (n,), kg, of the platforms; the exciter's platform includes the body of the exciter, not its loads
     - `stiffness` (n,), N/m, and `damping` (n,), N s/m, of the supports
     - `link_stiffness` (L,), N/m, and `link_damping` (L,), N s/m
     - `links`: the pair of platforms that each link joins, numbered from 1
-    - `exciter`: the platform that carries the auto-balancer
+    - `exciter`: the number of the platform that carries the exciter
 
     Source: Filimonikhin et al. 2022, equations (1)-(39) for one, two and three masses.
     """
@@ -184,7 +184,7 @@ def two_mass(
     - `link_stiffness`, N/m; typical: 5e4 to 5e6, that is 1 to 10 times a support
     - `link_damping`, N s/m; typical: as `damping`. A ratio is relative to the two platforms on the link alone, that is to the
       mass M_1 M_2/(M_1 + M_2)
-    - `exciter`: the number of the platform with the auto-balancer, 1 or 2 (default: 2)
+    - `exciter`: the number of the platform with the exciter, 1 or 2 (default: 2)
 
     **Returns** `Platforms`. **Raises** `InputError` for wrong lengths, wrong units, masses that are not positive, or negative
     coefficients.
@@ -209,7 +209,7 @@ def three_mass(
     link_damping: Sequence[Number],
     exciter: int = 2,
 ) -> Platforms:
-    """Return three platforms on supports, every two joined by a link.
+    """Return three platforms on supports, with a link between each two of them.
 
         M_i y_i'' + b_i y_i' + k_i y_i + sum_j [ b_ij (y_i' - y_j') + k_ij (y_i - y_j) ] = force of the loads on platform i
 
@@ -220,7 +220,7 @@ def three_mass(
     - `damping` (3,) of the supports, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M)
     - `link_stiffness` (3,) of the links 1-2, 1-3, 2-3, N/m; typical: 5e4 to 5e6, 0 for an absent link
     - `link_damping` (3,) of these links, N s/m; typical: as `damping`
-    - `exciter`: the number of the platform with the auto-balancer, 1 to 3 (default: 2)
+    - `exciter`: the number of the platform with the exciter, 1 to 3 (default: 2)
 
     **Returns** `Platforms`. **Raises** `InputError` in the cases of `two_mass`.
 
@@ -258,7 +258,7 @@ def network(
     - `links`: L pairs of platforms, numbered from 1
     - `link_stiffness` (L,), N/m; typical: 5e4 to 5e6
     - `link_damping` (L,), N s/m; typical: as `damping`
-    - `exciter`: the number of the platform with the auto-balancer
+    - `exciter`: the number of the platform with the exciter
 
     **Returns** `Platforms`. **Raises** `InputError` in the cases of `two_mass`, and for a link to a platform that does not
     exist.

@@ -18,10 +18,11 @@ class Arrangements(NamedTuple):
 
 
 def arrangements(loads: np.ndarray, imbalance: complex, touching: float, *, ordered: bool) -> Arrangements:
-    """Return the arrangements of loads (N,) kg m that cancel each other and an imbalance, kg m, in their plane.
+    """Return the arrangements of loads that cancel each other and an imbalance in their plane.
 
-    **Arguments**: `touching`: angle between two loads that touch each other, rad, 0 for loads without a size; `ordered`: True
-    if the loads cannot pass each other; then only arrangements in which their angles ascend within a turn are returned.
+    **Arguments**: `loads` (N,): unbalances of the loads, kg m; `imbalance`: complex, kg m; `touching`: angle between two loads
+    that touch each other, rad, 0 for loads without a size; `ordered`: True if the loads cannot pass each other; then only
+    arrangements in which their angles ascend within a turn are returned.
     """
     n, free = loads.size, imbalance == 0.0
     sides = loads if free else np.append(loads, abs(imbalance))

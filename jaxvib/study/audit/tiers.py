@@ -34,7 +34,8 @@ class TierRow(NamedTuple):
       quantity itself; for `amplitude` the error of the coordinate with the largest error, relative to the largest
       amplitude in the same unit; NaN if `applicable` is False, and for an error relative to 0
     - `seconds` of a computation; `compile`: additional seconds of the first computation; NaN without timings
-    - `note`: purpose of the tier, the reason why it cannot compute the quantities, or the motion to which the run left the jam
+    - `note`: purpose of the tier, the reason why it cannot compute the quantities, or the motion that the run reached after it
+      left the jam
     """
 
     tier: str
