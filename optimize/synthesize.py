@@ -234,9 +234,7 @@ def _validate_demands(space: DesignSpace, objective: Quantity, subject_to: Deman
     demands = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)
     for demand in demands:
         if not isinstance(demand, Demand):
-            hint = (
-                "; == is no demand, hold(quantity, value) in the DesignSpace keeps a value" if isinstance(demand, bool) else ""
-            )
+            hint = "; for ==, use hold(quantity, value) in the DesignSpace" if isinstance(demand, bool) else ""
             raise InputError("subject_to", f"has {quoted(demand)}; write demands such as amplitude(mode=3) > '2 mm'{hint}")
     require_double(space.scene, "a search")
     between(space.scene, objective.of)

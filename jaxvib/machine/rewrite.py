@@ -60,7 +60,7 @@ def rewrite_scene(text: str, scene: Scene) -> str:
     result = "\n".join(lines) + "\n"
     try:
         is_same = _is_close(tomllib.loads(scene_to_toml(scene_from_toml(result))), new)
-    except ValueError:  # the changed text is no scene file
+    except ValueError:  # the changed text is not a scene file
         is_same = False
     return result if is_same else scene_to_toml(scene)
 

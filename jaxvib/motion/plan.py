@@ -1,7 +1,7 @@
 """Plans of runs: choices that depend on the values of a scene and are made on the host, before a program is traced.
 
-Only this module tests which values are known (not traced). The method and static sizes (samples, steps, stretches) depend on
-known values; under a JAX transformation the sizes are fixed.
+The method and the static sizes (samples, steps, stretches) depend on values that are known (not traced). Under a JAX
+transformation, these values are unknown, and the sizes are fixed. The traced program does not test which values are known.
 """
 
 from __future__ import annotations

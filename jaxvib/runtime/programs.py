@@ -308,7 +308,7 @@ def _evaluate(*arrays: Array, call: _CallSignature) -> list[Array]:
 
 
 def _differentiate(arrays: Sequence[Array], tangents: Sequence[Any], *, call: _CallSignature) -> tuple[list[Array], list[Any]]:
-    with evaluating():  # JAX passes a Python number as an object that is no array, and a result may contain it unchanged
+    with evaluating():  # JAX passes a Python number as an object that is not an array, and a result may contain it unchanged
         arrays = [x if eqx.is_array(x) else jnp.asarray(x) for x in arrays]
     active = tuple(not is_zero(tangent) for tangent in tangents)
     nonzero = [tangent for is_active, tangent in zip(active, tangents, strict=True) if is_active]

@@ -102,12 +102,12 @@ def changed_layout(store: Path) -> str | None:
         digests = layout["files"]
         body = json.dumps(digests, sort_keys=True)
         if layout["digest"] != hashlib.sha256(body.encode()).hexdigest():
-            return f"{FOLDER}/{_LAYOUT} differs from what was written"
+            return f"{FOLDER}/{_LAYOUT} was changed"
         for name, digest in digests.items():
             if Path(name).is_absolute() or ".." in Path(name).parts or digest != _digest({name: store / name}):
-                return f"{name} is missing or not what was written"
+                return f"{name} is missing or was changed"
     except (InputError, RecursionError, ValueError, KeyError, TypeError, AttributeError):
-        return f"{FOLDER}/{_LAYOUT} is missing or not what was written"
+        return f"{FOLDER}/{_LAYOUT} is missing or was changed"
     return None
 
 

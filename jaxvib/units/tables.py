@@ -42,7 +42,7 @@ def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.nda
 
 
 def row_names(path: str | Path, unit: str, column: str | None = None) -> list[str]:
-    """Return texts that identify the rows of `csv_column`: the first cell, if it is no number, with the row and the file."""
+    """Return texts that identify the rows of `csv_column`: the first cell, if it is not a number, with the row and the file."""
     _, cells = _column(path, unit, column)
     return [f"{_named(first)}row {line} of {Path(path).name}" for line, _, first in cells]
 
@@ -57,8 +57,8 @@ def _named(cell: str) -> str:
 
 
 def _column(path: str | Path, unit: str, column: str | None) -> tuple[float, list[tuple[int, str, str]]]:
-    """Return the factor from a column to the SI unit, and of each row that has a cell there the number, this and the first
-    cell."""
+    """Return the factor from the unit of a column to the SI unit, and (number of the row, cell in the column, first cell) for
+    each row in which the cell is not empty."""
     (_, head), *rows = _rows(path)
     names = [split_head(each, unit) for each in head]
     matching = [k for k, (name, head_unit) in enumerate(names) if _matches(head[k], name, head_unit, unit, column)]
@@ -84,7 +84,7 @@ def _matches(head: str, name: str, head_unit: str, unit: str, column: str | None
 
 
 def _rows(path: str | Path) -> list[tuple[int, list[str]]]:
-    """Return the rows of a CSV file that are not empty, with their numbers from 1. Decimal commas in the cells below the names
+    """Return the rows of a CSV file that are not empty, with their numbers from 1. Decimal commas in the cells below the header
     are replaced by decimal points."""
     lines = read_text(path, "a CSV file").splitlines()
     first = next((line for line in lines if line.strip(";, \t")), "")

@@ -99,15 +99,15 @@ def capture(
             [f"{v:.5f}", f"{f:.3f}", f"{e:.3f}" if starts > 1 else ""]
             for v, f, e in zip(result.speed, result.fraction, result.standard_error, strict=True)
         ]
-        head = ["initial speed / rotor speed", "share captured", "standard error"]
+        head = ["initial speed / rotor speed", "fraction captured", "standard error"]
         rows = [row for k, row in enumerate(rows) if show_all or _is_near_change(result.fraction, k)]
-        title = "starts captured" if show_all else "starts captured, where the share changes (all speeds: --all)"
+        title = "starts captured" if show_all else "starts captured, where the fraction changes (all speeds: --all)"
         return result.summary() + "\n" + table(title, head, rows)
 
     document = {**result.as_dict(), **fields_of(result, "fraction", "standard_error")}
     output.done(document, text, "capture", result)
 
 
-def _is_near_change(share: np.ndarray, k: int) -> bool:
-    """Return True for the first and the last speed, and for speeds at which the share differs from that of a neighbour."""
-    return k in (0, len(share) - 1) or share[k] != share[k - 1] or share[k] != share[k + 1]
+def _is_near_change(fraction: np.ndarray, k: int) -> bool:
+    """Return True for the first and the last speed, and for speeds at which the fraction differs from that of a neighbour."""
+    return k in (0, len(fraction) - 1) or fraction[k] != fraction[k - 1] or fraction[k] != fraction[k + 1]

@@ -17,7 +17,8 @@ from jaxvib.units import Number, Numbers
 from jaxvib.units.known import require_if_known, when_known
 
 _MAX_DIPS = 4
-"""Largest number of dips of a torque table that a response includes. Each takes as much time as another coordinate."""
+"""Largest number of dips (local minima) of a torque table that a response includes. Each of them takes as much computing time
+as an additional coordinate."""
 
 
 class TorqueTable(Motor):
@@ -34,8 +35,8 @@ class TorqueTable(Motor):
 
     **Attributes**: the arguments; the no-load `speed`, the largest speed at which the torque falls to 0.
 
-    **Raises** `InputError` for a wrong unit, speeds that do not ascend, and torques that do not fall to 0 or
-    rise at the end.
+    **Raises** `InputError` for a wrong unit, for speeds that do not ascend, for torques that do not fall to 0, and for torques
+    that rise at the end.
 
     >>> import jaxvib as jv
     >>> motor = jv.TorqueTable([0.0, 100.0, 160.0], ["10 N m", "20 N m", "-4 N m"], inertia=0.02)
@@ -67,7 +68,8 @@ class TorqueTable(Motor):
 
     @property
     def dips(self) -> int:
-        """Number of dips: each needs two points between the first and the last."""
+        """Largest possible number of dips (local minima) of the torque: each needs two points between the first and the last
+        point."""
         return min((self.speeds.shape[0] - 2) // 2, _MAX_DIPS)
 
     def torque(self, speed: Array) -> Array:
@@ -228,7 +230,8 @@ class Converter(MotorWrapper):
         return self.motor.torque(speed + self.motor.speed - self.reference.speed_at(t))
 
     def starting_torque(self) -> Array | None:
-        """Return the torque at rest, N m; None for a speed that changes, because the torque at rest then passes its maximum."""
+        """Return the torque at standstill, N m; None if the reference speed changes, because the torque at standstill then
+        passes through its maximum."""
         return super().starting_torque() if self.reference.constant else None
 
     def jump_ts(self) -> tuple[Array, ...]:

@@ -260,7 +260,7 @@ class Motor(Drive):
 
     @property
     def dips(self) -> int:
-        """Largest number of dips of the torque below the no-load speed that `response` includes."""
+        """Largest number of dips (local minima) of the torque below the no-load speed that `response` includes."""
         return 0
 
     def starting_torque(self) -> Array | None:
