@@ -9,7 +9,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from jaxvib.draw.charts import before_after, branch_diagram, crossings, regime_chart
-from jaxvib.draw.comparison import audit_chart
 from jaxvib.draw.criterion import agreement_maps, criterion_chart
 from jaxvib.draw.machine.parts import ground
 from jaxvib.draw.motion.histories import amplitude_histories, time_histories
@@ -81,15 +80,6 @@ def test_bars_of_a_mode_shape_stand_side_by_side():
     assert len(bars) == 8 and all(right < left for (_, right), (left, _) in itertools.pairwise(bars))
     middles = np.reshape(bars, (2, 8)).mean(axis=1)
     np.testing.assert_allclose(middles, axis.get_xticks(), atol=1e-12)  # around the number of their mode
-
-
-def test_an_audits_picture_grows_by_a_line_for_each_effect():
-    heights = []
-    for count in (5, 15):
-        labels, each = [f"{k}" for k in range(count)], np.full(count, 1e-3)
-        figure = audit_chart(labels, {"amplitude": each}, each, 0.01)
-        heights.append(figure.get_size_inches()[1])
-    assert heights[1] - heights[0] == pytest.approx(3.4)  # inches
 
 
 def test_the_smaller_of_two_bands_lies_in_front_of_the_larger():

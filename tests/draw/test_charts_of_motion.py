@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
+from jaxvib.draw.capture import torus_paths
+from jaxvib.draw.motion.histories import time_histories
 from jaxvib.draw.motion.regimes import DrawnRegime, TorqueCurves, regimes_chart
 from jaxvib.draw.motion.response import response_chart
 from jaxvib.draw.motion.spectra import path_chart, spectrum_chart, waterfall_chart
+from jaxvib.draw.results import drag_diagram, signals_chart
+from jaxvib.draw.style import GUIDE
+from jaxvib.draw.sweeps import shares_chart
 from jaxvib.draw.whirl import campbell_diagram, critical_groups
 
 
@@ -163,3 +168,35 @@ def test_critical_speeds_are_grouped_by_their_neighbour():
     speed = np.array([10.0, 10.3, 10.6, 12.0, 30.0, np.nan])
     groups = [group for group, _ in critical_groups(speed, np.full(6, "forward"), right=10.0 / 0.7)]
     assert groups == [[0, 1, 2], [3]]
+
+
+TWO = np.stack([np.sin(np.arange(50.0)), np.cos(np.arange(50.0))], axis=1)
+TIME = np.arange(50.0)
+PANELS = {
+    "phases": lambda: response(show=["phase"])[0],
+    "torques": lambda: response(show=["torque"])[0],
+    "spectrum": lambda: spectrum_chart(TIME, {"a": TIME, "b": TIME}, np.zeros((1, 1)), np.zeros((1, 1)), np.zeros(1)).axes[0],
+    "waterfall": lambda: waterfall_chart(TIME, TIME, "a", np.ones((50, 50)), TWO[:, :1], TWO[:, 1:], np.zeros(1)).axes[0],
+    "paths": lambda: path_chart({"a": TWO.T, "b": 2.0 * TWO.T}).axes[0],
+    "signals": lambda: signals_chart(TIME, [("x", TWO, ["a", "b"])], x_label="t").axes[0],
+    "shares": lambda: shares_chart(TIME, dict.fromkeys(("swinging", "jammed"), (TIME, TIME, TIME)), x_label="x").axes[0],
+    "whirls": lambda: campbell_diagram(TIME, TWO + 1.0, np.tile(["forward", "backward"], (50, 1))).axes[0],
+    "torus": lambda: torus_paths(TWO, TWO, TWO, TIME).axes[1],
+    "drag": lambda: drag_diagram(
+        [("all together", TIME, TIME, TIME > -1), ("at other phases", TIME, TIME, TIME > -1)], 8.0, label="drag", at=1.5
+    ).axes[0],
+    **{f"histories {k}": lambda k=k: histories().axes[k] for k in (0, 1, 2, 3, 4, 5)},
+}
+
+
+def histories():
+    arrays = (TIME, TWO, TWO, 1.01 * TWO[:, :1], TWO)
+    return time_histories(arrays, arrays, names=("y1", "y2"), directions=("up", "across"))
+
+
+@pytest.mark.parametrize("panel", PANELS)
+def test_curves_of_a_panel_differ_without_colours_and_with_them(panel):
+    curves = [line for line in PANELS[panel]().lines if len(line.get_xdata()) > 2 and line.get_color() not in ("black", GUIDE)]
+    curves = list({line.get_color(): line for line in curves}.values())
+    strokes = {(str(line._unscaled_dash_pattern), line.get_marker()) for line in curves}
+    assert len(curves) == len(strokes) == 2

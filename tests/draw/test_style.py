@@ -8,8 +8,11 @@ from matplotlib.figure import Figure
 
 import jaxvib as jv
 from jaxvib.draw.charts import before_after, branch_diagram, solid_and_dashed
+from jaxvib.draw.comparison import audit_chart
 from jaxvib.draw.motion.histories import band, time_histories
+from jaxvib.draw.results import shapes_chart, speeds_chart
 from jaxvib.draw.style import COLORS, legend_above, numbered, panels
+from jaxvib.draw.sweeps import tornado_chart
 
 # Machado, Oliveira, Fernandes 2009: what readers without one kind of cones see, of linear RGB.
 VISION = {
@@ -157,6 +160,22 @@ def test_the_figure_of_jam_modes_names_the_coordinates():
     for found in (modes, modes.select(modes.mode_numbers()[0])):
         legend = found.plot().axes[1].get_legend()
         assert [text.get_text() for text in legend.get_texts()] == ["y1", "y2"]
+
+
+@pytest.mark.parametrize(
+    ("axis", "draw", "inches"),
+    [
+        (1, lambda n: audit_chart(n * ["a"], {"amplitude": np.full(n, 1e-3)}, np.full(n, 1e-3), 0.01), 0.34),
+        (1, lambda n: before_after(n * [("a", 1.0, 2.0)]), 0.42),
+        (1, lambda n: tornado_chart(n * ["a"], np.zeros(n), np.ones(n), 0.5, x_label="x"), 0.45),
+        (1, lambda n: speeds_chart(n * [("a", np.ones(1))]), 0.55),
+        (0, lambda n: shapes_chart(np.ones(n), np.ones((n, 1)), names=["y"]), 1.4),
+    ],
+    ids=["audit", "before and after", "tornado", "speeds", "shapes"],
+)
+def test_a_figure_grows_by_a_line_for_each_entry(axis, draw, inches):
+    sizes = [draw(count).get_size_inches()[axis] for count in (5, 15)]
+    assert sizes[1] - sizes[0] == pytest.approx(10.0 * inches)
 
 
 def test_axes_that_are_none_are_refused():
