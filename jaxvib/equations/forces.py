@@ -109,12 +109,12 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     """Return the kinetic and potential energy of a state, J.
 
         E = q'.M q'/2 + q.K q/2 + sum_j [ m_j |B_j q' + p_j'|^2/2 + (kappa_j - 1) m_j |p_j'|^2/2 + V_j(u_j) ] + V(q)
-            + theta' d'(theta).P q' + J_r theta'^2/2 + S g sin(theta)
+            + theta' d'(theta).P q' + I_r theta'^2/2 + S g sin(theta)
             + sum_j [ (kappa_j - 1) m_j (|c_j|^2/2 - p_j'.c_j) + I_j s_j^2/2 ]
 
     - V_j and V are the potentials of the effects on the loads and on the supports
     - d(theta) is the vector of the unbalance S of the rotor and of its other imbalances
-    - J_r is the inertia of a motor's rotor (an ideal drive has none); g is the gravity in the plane of the rotor
+    - I_r is the inertia of a motor's rotor (an ideal drive has none); g is the gravity in the plane of the rotor
     - the terms of the loads and of the rotor are added over all exciters
     - c is the sliding velocity of a load's contact point and s its spin about the contact normal; each is 0 unless an effect
       permits it

@@ -30,8 +30,8 @@ _PRIOR_WEIGHT = 0.05
 def amplitudes(
     readings: np.ndarray, mask: np.ndarray, angle: np.ndarray, step: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the speeds (W,), rad/s, in W stretches, the amplitudes (W, C) of the vibrations of C channels at the rotor's
-    speed, and their weights (W, C) between 0 and 1.
+    """Return the speeds (W,), rad/s, in W stretches, the amplitudes (W, C) of the vibrations of C channels at the
+    rotor speed, and their weights (W, C) between 0 and 1.
 
     The readings of each stretch of whole turns are fitted by c + a cos(angle) + b sin(angle). The weight is small if the
     amplitude is not above its standard error.

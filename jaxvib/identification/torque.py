@@ -3,11 +3,11 @@
 The vibration a(t) at the rotor follows from the recorded angle and the numbers of the machine. It brakes the rotor, and the
 predicted speed w and angle obey
 
-    J w' = T(w) + c(t),      c = -Re[conj(i p) (a + i g)],      angle' = w
+    I w' = T(w) + c(t),      c = -Re[conj(i p) (a + i g)],      angle' = w
 
-p(t), kg m, is the unbalance times the unit vector in its direction, a the acceleration of the rotor's axis (horizontal + i
-up), both at the recorded angle, and g gravity. The first angle and speed are unknowns, and the predicted angle is compared with
-the pulses (or with samples of an angle or a speed). This comparison has three advantages:
+I is the inertia of the rotor, p(t), kg m, the unbalance times the unit vector in its direction, a the acceleration of the
+rotor's axis (horizontal + i up), both at the recorded angle, and g gravity. The first angle and speed are unknowns, and the
+predicted angle is compared with the pulses (or with samples of an angle or a speed). This comparison has three advantages:
 
 - It needs no derivative of the record
 - The errors of the pulses are independent except for a common delay

@@ -281,7 +281,7 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
         radians = plan.integration.bounds[0] * latest.window.time[-1]
         if tolerance <= floor or float(estimated_error(jnp.zeros(()), 0.0, plan.scene, latest.steps, radians)) > accuracy:
             break
-        # The tolerance is reduced more than in proportion, because the error decreases more slowly than the tolerance.
+        # The tolerance is reduced more than in proportion, because the error may decrease more slowly than the tolerance.
         share = min(max(0.2 * (accuracy / float(run.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(run.error)) else 1e-2
         previous, coarser = latest, control
         control = StepControl(tolerance=np.asarray(max(share * tolerance, floor), dtype))
@@ -307,7 +307,7 @@ def _compare_runs(
 def _error_share(fine: StepControl, coarse: StepControl, order: int) -> Array | np.ndarray:
     """Return the error of the finer of two runs of a smooth motion, as a share of the difference between both runs.
 
-    With a method of order 8 the error falls with the power 8/9 of the tolerance and the power 8 of the number of steps. The
+    With a method of order 8 the error falls in proportion to the tolerance and with the power 8 of the number of steps. The
     powers used here are 0.45 and 3, which makes the estimate conservative. With a method of an `order` p up to 3 and r times as
     many steps, the share is 1/(r^p - 1).
     """

@@ -135,10 +135,10 @@ CRITERION_TERMS = (
 def criterion(scene: Scene) -> Criterion:
     """Return the ranges of rotor speed in which loads balance a machine, and those in which they gather.
 
-        f(q) = (s^2 q^2 / 2) Re of the mount's receptance averaged over a turn;    f < 0: balancing,    f > 0: gathering
+        f(S, w) = (S^2 w^2 / 2) Re(e^H A(w) e),    f < 0: balancing,    f > 0: gathering
 
-    The functional f of `criterion_functional` changes sign only at the characteristic speeds: from + to - at a resonance, and
-    from - to + at an additional speed. These speeds are therefore the ends of the intervals.
+    f is the mean over a turn that `criterion_functional` explains. It changes sign only at the characteristic speeds: from + to
+    - at a resonance, and from - to + at an additional speed. These speeds are therefore the ends of the intervals.
 
     **Arguments**: `scene` with at least two loads; typical: loads of 0.1 % to 1 % of the machine's mass. The share of correct
     predictions for random machines was 0.99 for loads of 0.1 %, and 0.55 for 10 %.

@@ -27,7 +27,7 @@ loads as fast as the carrier, and 1e-10 for loads three times as fast as the car
 
 _STIFF_DECAY_RATIO = 3.0
 """Ratio of decay rate and fastest oscillation above which the implicit method is used. Explicit steps would have to resolve
-the decay, and diverge above a ratio of about 15."""
+the decay, and diverge above a ratio of about 7."""
 
 # The last stage of the method is at the end of the step; its evaluation is the first one of the next step.
 _NODES = np.concatenate([[0.0], NODES[:-1]])
