@@ -214,3 +214,22 @@ def test_names_of_test_files_are_unique():
     """Test folders are no packages, so that pytest imports each file by its name alone."""
     names = collections.Counter(path.name for path in (ROOT / "tests").rglob("test_*.py"))
     assert not [name for name, count in names.items() if count > 1]
+
+
+def without_encoding(modules):
+    """Modules that read or write texts in the encoding of the platform, without examples of docstrings."""
+    for module, text in modules.items():
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                name, mode = node.func.attr, node.args[0] if node.args else ast.Constant("r")
+                opens_text = name == "open" and isinstance(mode, ast.Constant) and "b" not in mode.value
+                if (opens_text or name in ("read_text", "write_text")) and "encoding" not in {
+                    each.arg for each in node.keywords
+                }:
+                    yield f"{module}: {ast.unparse(node)}"
+
+
+def test_files_of_text_are_in_utf_8_on_every_platform():
+    found = list(without_encoding({"m": "path.write_text('ö')\npath.open('w')\npath.open('rb')\nImage.open(file)\n"}))
+    assert found == ["m: path.write_text('ö')", "m: path.open('w')"]
+    assert list(without_encoding(sources())) == []

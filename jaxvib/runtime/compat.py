@@ -153,13 +153,13 @@ def accepted_flags(flags: list[str]) -> list[str]:
     path = user_folder() / f"flags-{version}.json"
     is_accepted: dict[str, bool] = {}
     with contextlib.suppress(OSError, ValueError):
-        is_accepted = {str(flag): value is True for flag, value in json.loads(path.read_text()).items()}
+        is_accepted = {str(flag): value is True for flag, value in json.loads(path.read_text(encoding="utf-8")).items()}
     untested = [flag for flag in flags if flag not in is_accepted]
     if untested:
         is_accepted |= {flag: jax_starts_with([flag]) for flag in untested}
         with contextlib.suppress(OSError):
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            path.write_text(json.dumps(is_accepted))
+            path.write_text(json.dumps(is_accepted), encoding="utf-8")
     return [flag for flag in flags if is_accepted[flag]]
 
 

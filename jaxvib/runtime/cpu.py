@@ -108,6 +108,6 @@ def processor() -> str:
     """Return the architecture and the name of the processor, with its instruction sets if the system lists them (Linux)."""
     features = ""
     with contextlib.suppress(OSError):  # Linux only
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         features = next((line for line in lines if line.lower().startswith(("flags", "features"))), "")
     return f"{platform.machine()} {platform.processor()} {features}"

@@ -92,7 +92,8 @@ def seal_layout(store: Path) -> None:
     (store / FOLDER).mkdir()
     (store / FOLDER / _LOCK).touch()
     body = json.dumps(digests, sort_keys=True)
-    (store / FOLDER / _LAYOUT).write_text(json.dumps({"files": digests, "digest": hashlib.sha256(body.encode()).hexdigest()}))
+    layout = json.dumps({"files": digests, "digest": hashlib.sha256(body.encode()).hexdigest()})
+    (store / FOLDER / _LAYOUT).write_text(layout, encoding="utf-8")
 
 
 def changed_layout(store: Path) -> str | None:
