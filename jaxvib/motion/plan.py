@@ -80,7 +80,8 @@ class Tolerance:
 class Accuracy:
     """Steps with which the estimated error of the whole result is at most `error`. The run is repeated to find these steps.
 
-    **Arguments**: `error`, relative; typical: 1e-3 to 1e-8. An error of 1e-8 takes about twice the time of an error of 1e-4.
+    **Arguments**: `error`, relative; typical: 1e-3 to 1e-8. An error of 1e-8 needs about three times as many evaluations as an
+    error of 1e-4.
 
     **Raises** `InputError` for a value that is not a real number.
 

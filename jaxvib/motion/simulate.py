@@ -93,7 +93,7 @@ def simulate(
     - `Tolerance(1e-8)`: the error of each step (the default; 1e-5 in single precision); typical: 1e-6 to 1e-10
     - `Accuracy(1e-4)`: the `error` of the result; typical: 1e-3 to 1e-8. The run is repeated with smaller tolerances, in at
       most 6 runs, until its estimated error is at most this value; otherwise the status is `not_accurate`. An error of 1e-8
-      takes about twice the time of an error of 1e-4
+      needs about three times as many evaluations as an error of 1e-4
     - `EqualSteps(2000)`: a number of equal steps; typical: 4 for each radian of the fastest motion. The steps do not end at the
       jumps of a drive: derivatives with respect to the times of jumps are then 0
     - a step size controller of diffrax
