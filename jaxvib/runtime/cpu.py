@@ -34,7 +34,7 @@ def prepare_cpu(devices: int | None = 1) -> str:
 
     - `xla_cpu_small_while_loop_byte_threshold=1000000000`, jax before 0.12: compiles a whole time loop into one function
     - `--xla_cpu_use_fusion_emitters=false`, jax before 0.11: a code generator that needs two thirds of the compile time
-    - `--xla_cpu_prefer_vector_width=512` on processors with AVX-512: batches of runs take 0.9 of the time
+    - `--xla_cpu_prefer_vector_width=512` on processors with AVX-512, except with jax 0.11: batches of runs take 0.9 of the time
     - `--xla_force_host_platform_device_count` for several `devices`, for use in your own programs; jaxvib itself uses all
       cores without this flag
 

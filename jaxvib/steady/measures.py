@@ -197,7 +197,8 @@ class VibrationMeasures(Readable):
 
     @property
     def isolation_efficiency(self) -> Array:
-        """Share of the exciter's force that does not reach the foundation: 1 - transmissibility, negative above 1."""
+        """Share of the exciter's force that does not reach the foundation: 1 - transmissibility, negative if the
+        transmissibility is above 1."""
         return 1.0 - self.transmissibility
 
     def notes(self) -> list[str]:
@@ -488,7 +489,7 @@ def weight_deflection(model: LinearModel) -> Array | None:
     opposite sign, m (rad for tilts): positive if the coordinate moves downward.
 
     It is 0 for a platform that no support carries, NaN for other machines whose supports cannot carry the weight, and None if
-    the directions of the coordinates are unknown. Motions that no spring resists, and no weight causes, are left out.
+    the directions of the coordinates are unknown. A motion that no spring resists is left out if the weight does not cause it.
     """
     machine = model.scene.machine
     up = machine.upward()

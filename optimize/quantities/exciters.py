@@ -325,7 +325,8 @@ def least_torque() -> Quantity:
 
 
 def _least_torques(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
-    """Return the largest ratio of the torques near each resonance, 0 for resonances that a run-up does not pass."""
+    """Return pieces whose maximum is `sign` times the largest ratio of the torques: for `sign` 1 the ratio near each resonance,
+    0 for resonances that a run-up does not pass."""
     scene = evaluation.scene
     balance = assemble_torque_balance(scene)
     if any(balance.is_prescribed):

@@ -74,7 +74,7 @@ def _response_quantity(
 
 
 def _pieces(evaluation: Evaluation, sign: float, tier: Tier, read: Read, speeds: Speeds, *settings: object) -> Array:
-    """Return the values of `_values` if the quantity is minimized (`sign` 1); otherwise minus the largest value, (1,)."""
+    """Return pieces whose maximum is `sign` times the largest value: for `sign` 1 the values of `_values`."""
     values = _values(evaluation, read, speeds, settings)
     return values if sign > 0.0 else -jnp.max(values)[None]
 

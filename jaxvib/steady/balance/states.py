@@ -529,7 +529,7 @@ class BalancedStability(Result):
     - `multipliers` (2 (nd + N),), complex, the largest first
     - `neutral`: the number of multipliers that are 1 because the arrangements form a family. Without an imbalance, the family
       contains at least the common rotation of all loads
-    - `error` of the multipliers, estimated from half the number of steps
+    - `error` of the multipliers, estimated by a second computation with half as many steps
     - `rotor_speed`, rad/s, at which the stability was computed
     """
 
