@@ -1,9 +1,9 @@
 """Least-squares fit of a machine to recorded runs by the method of Levenberg and Marquardt with projected linear unknowns.
 
 At every trial the linear unknowns (first states, unbalances, offsets) are computed by linear least squares. Only the steps of
-the other unknowns are damped. The noise of each channel follows from its residuals, and the fit is repeated with residuals
-filtered to white noise. Outliers among the residuals have little influence; a clipped reading is a bound of the true value. If
-the error of a rotor's angle is not small compared with the noise, the angle is fitted together with the machine.
+the other unknowns are damped. The noise of each channel follows from its residuals, and the fit is repeated with whitened
+residuals. Outliers among the residuals have little influence; a clipped reading is a bound of the true value. If the error of a
+rotor's angle is not small compared with the noise, the angle is fitted together with the machine.
 """
 
 from __future__ import annotations

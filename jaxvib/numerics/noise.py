@@ -1,9 +1,9 @@
 """Noise of measured samples: its autoregressive models, outliers, bounds, and uncertainties of fits under coloured noise.
 
 A least-squares fit takes account of outliers and bounds by modified residuals. Let psi(e) be the score of a residual e: the
-negative derivative of the logarithm of its probability density. A fit of the residuals psi(e)/mean(psi') with the standard
-deviation sqrt(mean(psi^2))/mean(psi') has its minimum where the probability of the readings is greatest, and the covariance of
-a fit with this score (Huber 1981).
+negative derivative of the logarithm of its probability density. A least-squares fit with the residuals psi(e)/mean(psi') and
+the standard deviation sqrt(mean(psi^2))/mean(psi') has its minimum where the probability of the readings is greatest, and its
+covariance is that of a fit with this score (Huber 1981).
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ _MAX_ORDER = 40
 
 _COLOUR_GAIN = 10.0
 """Difference of the information criteria of white and coloured noise above which noise counts as coloured. A fit takes up part
-of the noise at the natural frequencies of its model. This gap in the spectrum of short residuals looks like colour, and a
-filter for it makes standard errors too small. With 400 white residuals of a fit with 17 unknowns, the difference is larger in 1
-of 1000 cases."""
+of the noise at the natural frequencies of its model. For a short record, this gap in the spectrum of the residuals looks like
+colour, and a filter for it makes standard errors too small. With 400 white residuals of a fit with 17 unknowns, the difference
+is larger in 1 of 1000 cases."""
 
 _FREQUENCIES = 2**14
 """Number of frequencies at which a spectral density is evaluated."""
@@ -43,7 +43,7 @@ class Noise(NamedTuple):
 
     **Attributes**
 
-    - `taps` (1, a_1, ...): coefficients of the filter that turns the noise into white noise
+    - `taps` (1, a_1, ...): coefficients of the whitening filter, which turns the noise into white noise
     - `deviation`: standard deviation of the white noise without outliers
     - `outliers`: share of outliers among the white noise, 0 to 1
     - `width`: standard deviation of the outliers divided by `deviation`
@@ -169,7 +169,7 @@ def limited(relative: np.ndarray, used: np.ndarray, share: float, width: float) 
 
     P(e) is the probability that a residual is an outlier.
 
-    **Arguments**: `relative` e, residuals relative to the standard deviation of those that are no outliers; `used` (n,):
+    **Arguments**: `relative` e, residuals relative to the standard deviation of those that are not outliers; `used` (n,):
     False for samples to leave out; `share` and `width` of the outliers, see `outliers_of`.
 
     >>> moved, deviation = limited(np.array([-1.0, 0.1, 1.0, 50.0]), np.ones(4, bool), 0.02, 20.0)
@@ -206,7 +206,7 @@ def bounded(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def autoregression(residual: np.ndarray, used: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-    """Return the filter that turns noise into white noise, and the standard deviation of the white noise.
+    """Return the whitening filter of noise, and the standard deviation of the white noise.
 
         e_k = r_k + a_1 r_{k-1} + ... + a_p r_{k-p}
 

@@ -355,7 +355,7 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     assert out.count(" t/h") == out.count("conveys ")
     assert "954.887" in out and "point (0.4, 0.1) m: stroke" in out and max(map(len, out.splitlines())) <= 80
     assert "rotation: exciter 1 anticlockwise, exciter 2 clockwise" in out and "margin: factor" in out
-    assert "natural frequencies: 42.706, 42.706, 51.247 rpm" in out and "stable, above all natural frequencies:" in out
+    assert "resonances: 42.706, 42.706, 51.247 rpm" in out and "stable, above all resonances:" in out
     code, _, err = typed("regimes", "screen.toml", "--slope", "10")
     assert code == 2 and "--slope is 10 rad (573 degrees), no slope of a deck; write degrees as '10 deg'" in err
     assert (

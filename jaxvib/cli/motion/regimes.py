@@ -78,7 +78,7 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
         stable = [(regime, figures) for regime, figures in zip(selected, measures, strict=True) if figures is not None]
         directions = ("anticlockwise" if exciter.direction == 1 else "clockwise" for exciter in loaded.exciters)
         notes = [
-            f"natural frequencies: {speed_text(frequencies)}",
+            f"resonances: {speed_text(frequencies)}",
             f"rotation: {', '.join(f'exciter {k} {direction}' for k, direction in enumerate(directions, 1))}",
             "margin: factor by which the differences of the motors' torques can grow; inf for",
             "equal motors",
@@ -96,11 +96,11 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
 
 
 def _place_among(speed: float, frequencies: list[float]) -> str:
-    """Return the place of a speed among the ascending natural frequencies, in words."""
+    """Return the place of a speed among the ascending resonances, in words."""
     below = bisect.bisect(frequencies, speed)
     if below in (0, len(frequencies)):
-        return f"{'below' if below == 0 else 'above'} all natural frequencies"
-    return f"between the natural frequencies {below} and {below + 1}"
+        return f"{'below' if below == 0 else 'above'} all resonances"
+    return f"between the resonances {below} and {below + 1}"
 
 
 def _row(regime: jv.SynchronousRegime, scale: float) -> list[str]:

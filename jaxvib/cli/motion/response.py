@@ -114,7 +114,7 @@ def _text(
         last = [f"{of.foundation_force[k]:.4g}", f"{np.sum(of.torque[k]):.4g}"]
         return [f"{scale * of.speed[k]:.5g}", *texts, *amplitudes, *last]
 
-    lines, several = [f"natural frequencies {speed_text(result.resonances)}"], len(result.scene.exciters) > 1
+    lines, several = [f"resonances {speed_text(result.resonances)}"], len(result.scene.exciters) > 1
     if several:
         written = ", ".join(f"{a:.4g}" for a in np.rad2deg(phases[0]))
         lines.append(f"phases of the unbalances {written} deg ({phases[1]}), at all speeds")

@@ -299,7 +299,7 @@ def amplitude_histories(
     signs = [sign for sign in (1.0, -1.0) if np.any(sign * rotor_speed > 0.0)]
     passed = [w for w in resonances if w < np.max(np.abs(rotor_speed), initial=0.0)]
     for k, w in enumerate(np.outer(signs, passed).ravel().tolist()):
-        axes[-2].axhline(scale * w, color=GUIDE, ls=":", lw=0.9, label=None if k else "natural frequencies")
+        axes[-2].axhline(scale * w, color=GUIDE, ls=":", lw=0.9, label=None if k else "resonances")
     axes[-2].set_ylabel(f"speed, {unit}")
     legend_above(axes[-2], 6)
     lines(axes[-1], force, range(len(directions)), directions)

@@ -95,7 +95,7 @@ def _draw_torques(
     """Draw the torque of each drive, that which the vibration needs, and the regimes; equal curves are one line."""
     top = float(np.nanmax(curves.driving))
     for k, w in enumerate(resonances[(resonances > 0.0) & (resonances < curves.speed[-1])]):
-        axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "natural frequency")
+        axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "resonance")
     for values, stroke, words in ((curves.driving, "-", "of {}"), (curves.needed, STROKES[1], "needed by {}")):
         groups: list[list[int]] = []
         for k in (k for k in range(values.shape[1]) if not np.isnan(curves.driving[0, k])):

@@ -63,9 +63,7 @@ def response_chart(
     figure, axes = panels(len(drawn), size=(7.2, 2.5), share_x=True, ax=ax)
     for axis, (name, kind) in zip(axes, drawn, strict=True):
         for k, w in enumerate(resonances[(resonances > 0.0) & (resonances <= np.max(curve["speed"]))]):
-            axis.axvline(
-                scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k or axis is not axes[0] else "natural frequency"
-            )
+            axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k or axis is not axes[0] else "resonance")
         if name in ("amplitude", "phase"):
             which = [k for k, each in enumerate(units) if kind in ("", each)]
             _coordinates(axis, curve, points, scale, name, which, names)
