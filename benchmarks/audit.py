@@ -59,7 +59,7 @@ def scenes() -> dict[str, tuple[jv.Scene, dict[str, Any]]]:
 
 def bearing() -> list[tuple[float, float, float]]:
     """Radial loads of the published rotor's pendulums, which turn evenly at some speeds on a shaft at rest: the speed, the
-    largest change of the radial load by gravity over a turn (`normal_force`), and g/(l Omega^2), per cent."""
+    largest change of the radial load by gravity over a turn (`normal_force`), and g/(l Omega^2), percent."""
     machine = jv.one_mass(mass=1e9, stiffness=1e15, damping=0.0)
     length = float(published_rotor().loads.radius)
     loads = jv.pendulums(count=1, mass=0.05, radius=length, drag=0.0)

@@ -259,7 +259,7 @@ def read_text(path: str | Path, what: str, max_bytes: int = MAX_TEXT_BYTES) -> s
 class ComputationError(RuntimeError):
     """Error for a computation with allowed input that has no result; `status` names the reason.
 
-    Functions that raise it accept `throw=False`, which returns the status instead.
+    A function that has an argument `throw` returns the status instead if `throw` is False.
 
     **Arguments**, also attributes: `status`, a name such as "absent" or "max_steps_reached"; `message`, a sentence.
 

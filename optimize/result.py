@@ -20,17 +20,17 @@ from jaxvib.results.result import Result
 from jaxvib.units.reading import unit_ratio
 
 _MAX_SHOWN_PERCENT = 1000.0
-"""Largest change that is shown in per cent; larger ones are shown in the unit of the objective."""
+"""Largest change that is shown in percent; larger ones are shown in the unit of the objective."""
 
 
 _MAX_LINEAR_PERCENT = 10.0
-"""Largest change of the objective, per cent, for which a prediction from its slope is shown."""
+"""Largest change of the objective, percent, for which a prediction from its slope is shown."""
 
 _MAX_EQUAL_DIFFERENCE = 1e-4
 """Relative difference of the objectives of two machines below which they count as equally good."""
 
 _MIN_LIMIT_CHANGE = 1e-6
-"""Smallest change of a limit, per cent, for which the change of the objective is shown."""
+"""Smallest change of a limit, percent, for which the change of the objective is shown."""
 
 
 class SynthesisStatus(eqx.Enumeration):
@@ -95,8 +95,8 @@ class Limit(NamedTuple):
     - `active`: True if it limits the design
     - `multiplier`: derivative of the objective with respect to the limit, in the direction that relaxes the limit (for held
       quantities: an increase of the held value), times the modulus of the limit; in the unit of the objective
-    - `gain`: change of the objective, per cent, if the limit is relaxed by 1 %, predicted from this derivative; negative for an
-      improvement. A prediction of more than a few per cent is not reliable
+    - `gain`: change of the objective, percent, if the limit is relaxed by 1 %, predicted from this derivative; negative for an
+      improvement. A prediction of more than a few percent is not reliable
     - `written`: unit in which the user wrote the limit, such as "mm"; "" for the default display unit
     """
 
@@ -128,7 +128,7 @@ class Limit(NamedTuple):
 class Influence(NamedTuple):
     """Influence of a free parameter, named `what`, on the objective.
 
-    **Attributes**: change of the objective, per cent, if only this parameter is 1 % smaller (`less`) or 1 % larger (`more`).
+    **Attributes**: change of the objective, percent, if only this parameter is 1 % smaller (`less`) or 1 % larger (`more`).
     """
 
     what: str

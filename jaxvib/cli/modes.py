@@ -148,7 +148,7 @@ def _drag_document(limits: jv.DragLimits | None) -> list[dict[str, Any]]:
 
 
 def _drag_lines(scene: jv.Scene, limits: jv.DragLimits | None) -> list[str]:
-    """Return a table of the greatest drags, or no line without one."""
+    """Return a table of the greatest drags; an empty list if there is none."""
     from jaxvib.display import speed_unit  # slow imports, which --help does not need
     from jaxvib.machine.loads import CircularLoads
 

@@ -23,7 +23,8 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.whirl import critical_speeds, whirl
 
 _ABOUT_SLIDERS = """The sliders of masses, springs, dampers, radii, drags, unbalances and torques range from a tenth to ten
-times the value in the file. The arrow keys move a slider by one step; the field above the sliders sets one to a number."""
+times the value in the file. The arrow keys move a slider by one step; the field above the sliders sets one of them to a typed
+number."""
 
 _ABOUT_LOADS = """Each number of loads needs its own compiled program. The programs for the seven numbers closest to the number
 in the file are compiled while the page is open; any other takes one or two seconds the first time and is then stored.
@@ -138,10 +139,10 @@ def heading(scene: Scene) -> str:
     """Return the description of `diagram` for this scene, with a reference to other results."""
     if not scene.is_plain:
         return (
-            "Working regime: the stable synchronous regime at the speed of the motors. Its rotor speed and amplitudes, and the "
-            "phases of the exciters (of one exciter the foundation force), over the speed of the motors without load, which "
-            "all change by one factor. A line has a gap where no synchronous regime is stable. The sketch shows the first "
-            "regime of the list; ellipses are the paths of points of the body."
+            "Working regime: the stable synchronous regime at the speed of the motors. The diagram shows its rotor speed, its "
+            "amplitudes and the phases of the exciters (for one exciter: the foundation force) over the no-load speed of the "
+            "motors; all no-load speeds change by one factor. A line has a gap where no synchronous regime is stable. The "
+            "sketch shows the first regime of the list; ellipses are the paths of points of the body."
         )
     if has_branches(scene):
         return (

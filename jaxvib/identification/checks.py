@@ -71,7 +71,7 @@ class FitStatus(eqx.Enumeration):
 def status_of(fitted: Fitted, information: Information) -> tuple[FitStatus, float, list[str]]:
     """Return the status of a fit, the smallest `residual_p_value` of its channels, and notes.
 
-    **Arguments**: `fitted`, and the `information` about its numbers.
+    **Arguments**: `fitted`, and the `information` about its parameters.
     """
     p_value, notes = 1.0, [*_contradictions(fitted), *_disagreements(fitted)]
     contradicted = bool(notes)
@@ -254,8 +254,8 @@ def _contradictions(fitted: Fitted) -> Iterator[str]:
 class Disagreement(NamedTuple):
     """Deviation of a run from other runs.
 
-    **Attributes**: `p_value` of a deviation as large as this one if the machine is the same; `name` of the number whose change
-    explains most of the deviation; `change` of this number, relative (of an angle: in rad), and its standard `error`.
+    **Attributes**: `p_value` of a deviation as large as this one if the machine is the same; `name` of the parameter whose
+    change explains most of the deviation; `change` of this parameter, relative (of an angle: in rad), and its standard `error`.
     """
 
     p_value: float
@@ -273,11 +273,11 @@ class Disagreement(NamedTuple):
 
 
 def disagreement(others: np.ndarray, run: np.ndarray, gradient: np.ndarray, names: Sequence[str]) -> Disagreement:
-    """Return the deviation of a run from other runs, by a likelihood-ratio test of two models: either the run has numbers of
-    its own, or all runs have the same numbers.
+    """Return the deviation of a run from other runs, by a likelihood-ratio test of two models: either the run has parameters of
+    its own, or all runs have the same parameters.
 
-    **Arguments**: information (k, k) of the `others` and of the `run`, about relative changes of k numbers; `gradient` of the
-    run, J^T residuals/noise^2, at the numbers that fit the others and the run together; `names` (k,).
+    **Arguments**: information (k, k) of the `others` and of the `run`, about relative changes of k parameters; `gradient` of
+    the run, J^T residuals/noise^2, at the parameters that fit the others and the run together; `names` (k,).
 
     >>> others, run = np.array([[400.0]]), np.array([[100.0]])    # estimates 0 +- 0.05 and 0.6 +- 0.1; of all runs 0.12
     >>> found = disagreement(others, run, 100.0 * np.array([0.6 - 0.12]), ["mass"])

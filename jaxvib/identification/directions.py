@@ -1,7 +1,7 @@
-"""Information of the records about the numbers of a scene: covariance, and directions that the records do not determine.
+"""Information of the records about the parameters of a scene: covariance, and directions that the records do not determine.
 
-The numbers are compared on a logarithmic scale (numbers of either sign: relative to their first values). A direction is a
-combination of relative changes; its standard error is 1/sqrt(eigenvalue) of the information matrix of the scene's numbers,
+The parameters are compared on a logarithmic scale (parameters of either sign: relative to their first values). A direction is a
+combination of relative changes; its standard error is 1/sqrt(eigenvalue) of the information matrix of the scene's parameters,
 after all other unknowns (gains, errors of the angle and others) are eliminated.
 """
 
@@ -19,27 +19,27 @@ UNDETERMINED = 1.0
 factor of e."""
 
 _UNBOUNDED_ERROR = 1e3
-"""Standard error of the logarithm of a number above which the records do not bound the number, not even from above."""
+"""Standard error of the logarithm of a parameter above which the records do not bound the parameter, not even from above."""
 
 _SINGLE = 0.99
-"""Absolute value of the component of a number in a direction (a vector of length 1) above which the direction is that of the
-number alone."""
+"""Absolute value of the component of a parameter in a direction (a vector of length 1) above which the direction is that of the
+parameter alone."""
 
 _MIN_SHARE = 0.05
-"""Absolute value of the component of a number in an undetermined direction above which the number itself counts as
+"""Absolute value of the component of a parameter in an undetermined direction above which the parameter itself counts as
 undetermined."""
 
 _MIN_COMMON_PART = 0.95
 """Part of the direction of the common factor (of all masses, stiffnesses, dampings and unbalances) that lies within the
 undetermined directions; above this value the factor itself counts as undetermined."""
 
-_ADVICE = "give one of these numbers as known, or record a run with a known mass added"
+_ADVICE = "give one of these parameters as known, or record a run with a known mass added"
 
 
 class Direction(NamedTuple):
-    """Combination of numbers that the records do not determine. Returned by `identify` in a `MachineFit`.
+    """Combination of parameters that the records do not determine. Returned by `identify` in a `MachineFit`.
 
-    **Attributes**: `sentence` that describes the direction; `names` (k,) of the numbers; `weights` (k,): their relative
+    **Attributes**: `sentence` that describes the direction; `names` (k,) of the parameters; `weights` (k,): their relative
     changes, a vector of length 1; `error`: standard error along the direction, relative.
     """
 
@@ -50,18 +50,18 @@ class Direction(NamedTuple):
 
 
 class Information(NamedTuple):
-    """Information about the numbers of a scene (k,), and about the gains.
+    """Information about the parameters of a scene (k,), and about the gains.
 
     **Attributes**
 
-    - `names` (k,) of the numbers; `values` (k,), SI
-    - `logarithmic` (k,): True if the variable of the fit is the logarithm of the number; otherwise the variable is the number
-      divided by its scale
-    - `scale` (k,): change of the number per unit of this variable
+    - `names` (k,) of the parameters; `values` (k,), SI
+    - `logarithmic` (k,): True if the variable of the fit is the logarithm of the parameter; otherwise the variable is the
+      parameter divided by its scale
+    - `scale` (k,): change of the parameter per unit of this variable
     - `covariance` (k, k) of the variables in the determined directions
     - `undetermined` (k, u): directions that the records do not determine; `errors` (u,): their standard errors
-    - `determined` (k,): False for numbers that take part in an undetermined direction
-    - `vanished` (k,): True for positive numbers that are not distinguishable from 0, because their standard error is larger
+    - `determined` (k,): False for parameters that take part in an undetermined direction
+    - `vanished` (k,): True for positive parameters that are not distinguishable from 0, because their standard error is larger
       than their value
     - `by_gain` (k, g): directions that are determined only because the gains of the sensors are known to their `gain_error`;
       `by_gain_errors` (g,): their standard errors
@@ -81,7 +81,7 @@ class Information(NamedTuple):
 
 
 def information_of(fitted: Fitted) -> Information:
-    """Return the information of a fit about the numbers of its scene; see `Information`."""
+    """Return the information of a fit about the parameters of its scene; see `Information`."""
     problem = fitted.problem
     unknowns, p = problem.unknowns, fitted.x.size
     number_count = len(unknowns.numbers)
@@ -102,7 +102,7 @@ def information_of(fitted: Fitted) -> Information:
     error = np.sum(single * errors, axis=1)
     # Unbalances are left out: if the size of an unbalance tends to 0, its angle is unknown, too.
     vanished = logarithmic & (error > UNDETERMINED) & (error < _UNBOUNDED_ERROR) & (np.arange(kept.size) < number_count)
-    # A vanished number is measured in units of ten times its standard error instead of its value, so that it counts as
+    # A vanished parameter is measured in units of ten times its standard error instead of its value, so that it counts as
     # determined.
     factors = np.where(vanished, 10.0 * error, 1.0)
     determined_part = covariance_of(information * np.outer(factors, factors))
@@ -119,10 +119,10 @@ def information_of(fitted: Fitted) -> Information:
 
 
 class Covariance(NamedTuple):
-    """Covariance of numbers (k,) that are not all determined.
+    """Covariance of parameters (k,) that are not all determined.
 
     **Attributes**: `covariance` (k, k) in the determined directions; `undetermined` (k, u): the other directions; `errors`
-    (u,): their standard errors; `determined` (k,): False for numbers that take part in an undetermined direction.
+    (u,): their standard errors; `determined` (k,): False for parameters that take part in an undetermined direction.
     """
 
     covariance: np.ndarray
@@ -145,7 +145,7 @@ def covariance_of(information: np.ndarray) -> Covariance:
 
 
 def combined_information(fitted: Fitted) -> np.ndarray:
-    """Return the information about the numbers of a fit, the gains of its sensors, and the angle of the first unbalance.
+    """Return the information about the parameters of a fit, the gains of its sensors, and the angle of the first unbalance.
 
     The information about the angle is 0 if the rotor's angle is measured from a different zero position in each run.
     """
@@ -250,7 +250,7 @@ def _sentences(information: Information, axes: np.ndarray, errors: np.ndarray, e
         largest = [k for k in np.argsort(-np.abs(axis)) if abs(axis[k]) > 0.2]
         parts = ", ".join(f"{information.names[k]} by {axis[k]:+.2g}" for k in largest)
         advice_for_direction = (
-            "give one of these numbers as known, add a sensor at another place, or record a run through all resonances"
+            "give one of these parameters as known, add a sensor at another place, or record a run through all resonances"
         )
         text = f"changing {parts} (relative to one another){effect}: {advice_for_direction if advice else ''}"
         sentences.append(Direction(text, information.names, tuple(map(float, axis)), float(error)))
@@ -268,11 +268,11 @@ _KINDS_WITH_KG = {
     "power": "powers",
     "bearing": "frictions of bearings",
 }
-"""Words in the names of numbers whose unit is proportional to kg (kg, N s/m, kg m and others), and their plurals. The readings
-do not change if all these numbers are multiplied by the same factor."""
+"""Words in the names of parameters whose unit is proportional to kg (kg, N s/m, kg m and others), and their plurals. The
+readings do not change if all these parameters are multiplied by the same factor."""
 
 
 def _kind_with_kg(name: str) -> str | None:
-    """Return the kind of a number whose unit is proportional to kg; None for other numbers."""
+    """Return the kind of a parameter whose unit is proportional to kg; None for other parameters."""
     last = name.rpartition(".")[2]
     return next((plural for word, plural in _KINDS_WITH_KG.items() if word in last), None)

@@ -38,8 +38,8 @@ _CONVERGED = 1e-2
 """Length of the next undamped step, in standard errors, below which the fit has converged."""
 
 _VANISHED = 10.0
-"""Standard error of the logarithm of a number above which the number is not reduced further: the data do not distinguish it
-from 0."""
+"""Standard error of the logarithm of a parameter above which the parameter is not reduced further: the data do not distinguish
+it from 0."""
 
 _MAX_PASSES = 8
 _STEADY_NOISE = 0.01
@@ -77,7 +77,7 @@ class Fitted(NamedTuple):
     - `converged`: True if the last descent reached a minimum
     - `is_absorbed`: True if coloured noise would take up a part of the motion; the noise of the fit is white then
     - `misfits` of each run: deviation of the rotor from its torque balance, relative to that from a smooth curve; empty if no
-      number of a motor is unknown
+      parameter of a motor is unknown
     """
 
     x: np.ndarray
@@ -331,7 +331,7 @@ def _minimize_nonlinear(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.nda
 
 
 def positive_indices(problem: Problem) -> np.ndarray:
-    """Return the indices in x of positive numbers, whose logarithms are unknown."""
+    """Return the indices in x of positive parameters, whose logarithms are unknown."""
     return np.flatnonzero(np.asarray(problem.unknowns.positive))
 
 
@@ -348,12 +348,12 @@ def descend(
     With `bend`, each damped step is corrected for the second derivative of the model along it. In a curved valley of the cost,
     such steps are much longer than those of the linearized model.
 
-    A number that tends to 0 stays at a value that the data do not distinguish from 0. With its logarithm as the unknown, the
+    A parameter that tends to 0 stays at a value that the data do not distinguish from 0. With its logarithm as the unknown, the
     expected reduction of the cost would remain the same at every smaller value, and the descent would never end.
 
     **Arguments**: the first trial `best`, with its `cost`; `equations`: returns the equations of a trial; `stepped`: returns
     the trial after a step; `damped_count`: number of the first unknowns, whose steps are damped; `positive`: indices of the
-    positive numbers; `bend`: returns for a trial and a step the product J^T (differences after the step - differences
+    positive parameters; `bend`: returns for a trial and a step the product J^T (differences after the step - differences
     + J step), where J are the derivatives of the model at the trial whose `equations` were computed last.
 
     Source of the correction: Transtrum, Sethna 2012, arXiv 1201.5885 (geodesic acceleration).
@@ -396,7 +396,7 @@ def _damped_step(
     """Return a damped step with its second-order correction; None if the correction is longer than three quarters of the step,
     in multiples of the scale of each unknown.
 
-    The logarithm of a number near 0 hardly changes the model, and its step is long. Such a step is shortened, and the other
+    The logarithm of a parameter near 0 hardly changes the model, and its step is long. Such a step is shortened, and the other
     unknowns adapt to it. If all steps were shortened together, the descent would stop.
     """
     size, step, free = np.sqrt(np.diagonal(damped)), solved(damped, gradient), np.ones(len(gradient), bool)
@@ -414,7 +414,7 @@ def _damped_step(
 
 
 def _without_vanished(equations: Equations, positive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matrix and the gradient in which positive numbers that are not distinguishable from 0 are not reduced."""
+    """Return the matrix and the gradient in which positive parameters that are not distinguishable from 0 are not reduced."""
     information, prior, gradient = equations
     matrix, gradient = information + prior, gradient.copy()
     frozen = positive[(gradient[positive] < 0.0) & (np.diagonal(matrix)[positive] < _VANISHED**-2)]

@@ -49,7 +49,7 @@ _SAME_NOISE = 1.01
 """Noise of a channel in such a fit, relative to the fit before, above which the fit has ended at another, worse minimum."""
 
 _STEP = 1e-4
-"""Relative change of a number in a difference quotient."""
+"""Relative change of a parameter in a difference quotient."""
 
 
 class MachineFit(Result):
@@ -57,18 +57,18 @@ class MachineFit(Result):
 
     Returned by `identify`.
 
-    **Attributes** (k numbers of the scene, m damped modes, g gains)
+    **Attributes** (k parameters of the scene, m damped modes, g gains)
 
     - `status`: a `FitStatus`
     - `notes`: sentences with repairs, doubts and advice
-    - `scene` with the fitted numbers
-    - `names` (k,), `units` (k,) and `estimates` (k,) of the numbers; the interval of an undetermined number is unbounded
-    - `scale` (k,), in `units`: change of each number that counts as the relative change 1, see `covariance` and `information`:
-      the value of a positive number, otherwise the absolute first value
-    - `covariance` (k, k) of the relative errors of the numbers in the determined directions
-    - `information` (k + g + 1, k + g + 1): Fisher information about relative changes of the numbers and of the gains, and about
-      the angle of the first unbalance
-    - `undetermined`: a `Direction` for each combination of numbers that the records do not determine
+    - `scene` with the fitted parameters
+    - `names` (k,), `units` (k,) and `estimates` (k,) of the parameters; the interval of an undetermined parameter is unbounded
+    - `scale` (k,), in `units`: change of each parameter that counts as the relative change 1, see `covariance` and
+      `information`: the value of a positive parameter, otherwise the absolute first value
+    - `covariance` (k, k) of the relative errors of the parameters in the determined directions
+    - `information` (k + g + 1, k + g + 1): Fisher information about relative changes of the parameters and of the gains, and
+      about the angle of the first unbalance
+    - `undetermined`: a `Direction` for each combination of parameters that the records do not determine
     - `by_gain`: a `Direction` for each combination that only the known gains of the sensors determine
     - `frequency` (m,), rad/s, and `damping_ratio` (m,): natural frequencies and damping ratios of the damped modes
     - `gain_names` (g,) and `gains` (g,) of the channels
@@ -109,13 +109,13 @@ class MachineFit(Result):
     fitted: tuple[np.ndarray, ...]
 
     def estimate(self, name: str) -> Estimate:
-        """Return the estimate of the number `name`. **Raises** `InputError` for a number that was not unknown."""
+        """Return the estimate of the parameter `name`. **Raises** `InputError` for a parameter that was not unknown."""
         if name not in self.names:
-            raise InputError("name", f"is {quoted(name)}; the unknown numbers were: {', '.join(self.names)}")
+            raise InputError("name", f"is {quoted(name)}; the unknown parameters were: {', '.join(self.names)}")
         return self.estimates[self.names.index(name)]
 
     def interval_of(self, quantity: Callable[[Scene], float]) -> Estimate:
-        """Return a quantity of the fitted scene with the interval that follows from the errors of the numbers.
+        """Return a quantity of the fitted scene with the interval that follows from the errors of the parameters.
 
         **Arguments**: `quantity`: a function of a scene, such as `lambda scene: jv.natural_frequencies(scene)[0]`.
 
@@ -135,7 +135,7 @@ class MachineFit(Result):
         return propagate(self.scene, self.names, self.scale, self.covariance, axes, errors, values)[0]
 
     def summary(self) -> str:
-        """Return the numbers with their intervals, and the sentences about them, as text."""
+        """Return the parameters with their intervals, and the sentences about them, as text."""
         lines = [self.message]
         for name, unit, each in zip(self.names, self.units, self.estimates, strict=True):
             lines.append(f"{name}: {_with_interval(each)} {unit}".rstrip())
@@ -176,7 +176,7 @@ def identify(
     instrument: float = 0.0,
     throw: bool = True,
 ) -> MachineFit | Identified:
-    """Return the numbers of a machine from recorded runs, or the friction of a pendulum's bearing from a recorded swing.
+    """Return the parameters of a machine from recorded runs, or the friction of a pendulum's bearing from a recorded swing.
 
         M q'' + C q' + K q = -S B^T p''(theta(t)),      readings = gain (motion of the sensors) + offset + noise
 
@@ -184,16 +184,16 @@ def identify(
     rotor follows from the run (a channel of kind "pulses", "angle" or "speed") or from a drive of prescribed speed.
 
     - The least-squares fit uses the whole record, including the transients
-    - The unknowns of the fit are the unknown numbers, the gains of the sensors (known to `gain_error`), the angle of the
+    - The unknowns of the fit are the unknown parameters, the gains of the sensors (known to `gain_error`), the angle of the
       unbalance, the offsets, and the state at the first sample
     - The noise of each channel may be coloured: residuals are whitened by an autoregressive model, and the
       intervals follow from the Fisher information with the estimated noise
     - The loads of a scene with one exciter (balls, rollers, pendulums) must be jammed throughout the runs; their motion is that
       of `vector_field`, and their angles and speeds at the first sample are unknowns
-    - A scene with one exciter without loads can have nonlinear supports, `CubicSupport` and `Stop`. The numbers of a stop that
-      is not touched in the runs are not determined
-    - Numbers of a motor, such as "drive.inertia" and "drive.stall_torque", can be unknown if a channel gives the angle or the
-      speed of its rotor. The torque balance of the rotor, with the torque of the vibration, is then a part of the fit
+    - A scene with one exciter without loads can have nonlinear supports, `CubicSupport` and `Stop`. The parameters of a stop
+      that is not touched in the runs are not determined
+    - Parameters of a motor, such as "drive.inertia" and "drive.stall_torque", can be unknown if a channel gives the angle or
+      the speed of its rotor. The torque balance of the rotor, with the torque of the vibration, is then a part of the fit
 
     For a `BearingPendulum`, see `jaxvib.study.bearing.identify.identify_bearing`:
 
@@ -202,12 +202,12 @@ def identify(
 
     **Arguments**
 
-    - `subject`: a `Scene` whose numbers are first values, or a `BearingPendulum`
+    - `subject`: a `Scene` whose parameters are first values, or a `BearingPendulum`
     - `records`: for a scene a `MeasuredRun` or a list of them; typical: 10 to 60 s at 10 to 50 samples per period. For a
       pendulum a `Record`
-    - `unknown`: names of numbers of the scene or of arrays of them, such as "machine.stiffness"
-    - `known`: values of numbers with their standard errors, such as {"machine.mass[1]": "95 kg +- 1 %"}; without an error the
-      value is exact. Numbers that are neither in `unknown` nor in `known` have the values of the scene exactly
+    - `unknown`: names of parameters of the scene or of arrays of them, such as "machine.stiffness"
+    - `known`: values of parameters with their standard errors, such as {"machine.mass[1]": "95 kg +- 1 %"}; without an error
+      the value is exact. Parameters that are neither in `unknown` nor in `known` have the values of the scene exactly
     - `dry`, `air`, `torque`, `instrument`: only for a pendulum. True to identify the dry friction mu2, the drag b of the air or
       the torque M as well. `instrument`: relative uncertainty of J; typical: 0.01 to 0.03 (default 0)
     - `throw`: True (the default) to raise an error if there is no fit
@@ -262,7 +262,7 @@ def identify(
 
 
 def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted:
-    """Return a fit in which undetermined combinations of numbers have nearly their first values.
+    """Return a fit in which undetermined combinations of parameters have nearly their first values.
 
     A fit alone leaves them at an arbitrary point of a curved valley of equal residuals. Plans of further runs depend on them.
     """
@@ -347,7 +347,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
 
 
 def fitted_scene(problem: Problem, x: np.ndarray, linear: np.ndarray) -> Scene:
-    """Return the scene with the fitted numbers and unbalances."""
+    """Return the scene with the fitted parameters and unbalances."""
     scene: Any = problem.unknowns.scene(problem.scene, np.asarray(x))
     for k, known in enumerate(problem.unbalances):
         if known is None or not known.is_exact:
@@ -395,9 +395,9 @@ def propagate(
 ) -> list[Estimate]:
     """Return the values (m,) of a function of the scene with their intervals, by central differences.
 
-    **Arguments**: `names` (k,) of the uncertain numbers; `scale` (k,), SI: change of each number that counts as the relative
-    change 1; the `covariance` (k, k) of their relative errors; undetermined directions `axes` (k, u) and their `errors` (u,);
-    the `function`, which returns values (m,).
+    **Arguments**: `names` (k,) of the uncertain parameters; `scale` (k,), SI: change of each parameter that counts as the
+    relative change 1; the `covariance` (k, k) of their relative errors; undetermined directions `axes` (k, u) and their
+    `errors` (u,); the `function`, which returns values (m,).
     """
     values, slopes = function(scene), []
     for name, step in zip(names, _STEP * scale, strict=True):

@@ -69,14 +69,14 @@ _MAX_DELAY = 450
 
 
 class Known(NamedTuple):
-    """Known number: its `value`, SI, and its standard `error`, SI, 0 if it is exact."""
+    """Known parameter: its `value`, SI, and its standard `error`, SI, 0 if it is exact."""
 
     value: float
     error: float
 
     @property
     def is_exact(self) -> bool:
-        """True for a number without an error. An exactly known unbalance has the relative error `EXACT` instead of 0."""
+        """True for a parameter without an error. An exactly known unbalance has the relative error `EXACT` instead of 0."""
         return self.error <= 1.001 * EXACT * abs(self.value)
 
 
@@ -91,7 +91,7 @@ class Problem(NamedTuple):
       `bounds` (n, C), 1 for readings clipped from above, -1 from below, otherwise 0; `times` (n,), s; `angles` of the rotors
       (n, E), rad
     - `rotors`: for each run, the angles of the rotors as functions of time
-    - `means` and `precisions` (p,): known values of x, and 1/error^2 of these values; both are 0 for a free number
+    - `means` and `precisions` (p,): known values of x, and 1/error^2 of these values; both are 0 for a free parameter
     - `marked`: True if the zero of the rotor's angle is the same mark in all runs
     - `unbalances`: for each exciter its known value, None if it is free
     - `angle_errors`, rad: standard error of the rotor's angle in each run, without the errors that are unknowns
@@ -151,7 +151,7 @@ def read_known(text: Number, number: NamedNumber, field: str) -> Known:
 
 
 def _unbounded(number: NamedNumber) -> NamedNumber:
-    """Return the number without bounds, to read a difference of its values."""
+    """Return the parameter without bounds, to read a difference of its values."""
     return number._replace(spec=number.spec._replace(bounds=Bounds()))
 
 
@@ -181,7 +181,7 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     unbalances = tuple(_known_unbalance(scene, k, free, known_numbers) for k in range(len(scene.exciters)))
 
     if not nonlinear and all(known is not None and known.is_exact for known in unbalances):
-        raise InputError("unknown", f"is {quoted(unknown)}; these numbers are exactly known, and nothing is left to find")
+        raise InputError("unknown", f"is {quoted(unknown)}; these parameters are exactly known, and nothing is left to find")
 
     values = np.array([float(number.read(scene)[0]) for number in nonlinear])
     positive = (values > 0.0) & np.array([number.spec.bounds.low == 0.0 for number in nonlinear], bool)
@@ -231,14 +231,14 @@ def _known_means(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the means and standard errors of the unknowns whose values are known with an error; 0 and infinity for others.
 
-    **Raises** `InputError` for the value 0 of a positive number, whose logarithm is the unknown.
+    **Raises** `InputError` for the value 0 of a positive parameter, whose logarithm is the unknown.
     """
     means, errors = np.zeros(len(nonlinear)), np.full(len(nonlinear), np.inf)
     for k, number in enumerate(nonlinear):
         if number.name in known_numbers and known_numbers[number.name][1].error > 0.0:
             each = known_numbers[number.name][1]
             if positive[k] and each.value == 0.0:
-                problem = "is 0 with an error; the value of a number that cannot be negative must be above 0"
+                problem = "is 0 with an error; the value of a parameter that cannot be negative must be above 0"
                 raise InputError(f"known[{number.name!r}]", f"{problem}: give a positive value, or 0 without an error")
             means[k] = math.log(each.value / values[k]) if positive[k] else (each.value - values[k]) / scale[k]
             errors[k] = each.error / each.value if positive[k] else each.error / scale[k]
@@ -246,12 +246,12 @@ def _known_means(
 
 
 def is_of_drive(number: NamedNumber) -> bool:
-    """Return True for a number of a drive."""
+    """Return True for a parameter of a drive."""
     return number.path[0] == "exciters" and "drive" in number.path
 
 
 def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs: Sequence[MeasuredRun]) -> None:
-    """Raise if no record determines an unknown number of a drive."""
+    """Raise if no record determines an unknown parameter of a drive."""
     drive, measured = scene.exciters[0].drive, all(run.of_kind(*ROTOR_KINDS) for run in runs)
     if len(scene.exciters) == 1 and not drive.ideal and not drive.state_units() and measured and not is_nonlinear(scene):
         return
@@ -259,9 +259,9 @@ def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs:
         if is_of_drive(number):
             raise InputError(
                 f"unknown.{name}",
-                "is a number of the drive, which the recorded angle does not determine; leave it out. Only the numbers of the "
-                "motor of a scene with linear supports and one exciter without loads can be unknown, if the motor has no "
-                "currents as states and each run has a channel of pulses, angle or speed",
+                "is a parameter of the drive, which the recorded angle does not determine; leave it out. Only the parameters "
+                "of the motor of a scene with linear supports and one exciter without loads can be unknown, if the motor has "
+                "no currents as states and each run has a channel of pulses, angle or speed",
             )
 
 
@@ -340,8 +340,8 @@ def _require_included(scene: Scene, runs: Sequence[MeasuredRun]) -> None:
 
 
 def _singles(scene: Scene, names: Sequence[str], field: str = "unknown") -> list[NamedNumber]:
-    """Return the named numbers, each entry of a named array as one number; zeros of arrays, which are absent parts, are left
-    out."""
+    """Return the named parameters, each entry of a named array as one parameter; zeros of arrays, which are absent parts, are
+    left out."""
     singles: dict[str, NamedNumber] = {}
     for name in names:
         for part in present_numbers(scene, find_number(scene, name, field), field):
@@ -362,7 +362,7 @@ def _known_unbalance(
 
 
 def _changes(scene: Scene, run: MeasuredRun) -> tuple[list[NamedNumber], list[str], list[float]]:
-    """Return the changed numbers of a run, the actions and their amounts in SI.
+    """Return the changed parameters of a run, the actions and their amounts in SI.
 
     **Raises** `InputError` for a change of an unbalance, which is one linear unknown of all runs.
     """

@@ -1,6 +1,6 @@
-"""Profile likelihood: intervals of the numbers for which the cost of a fit is not a quadratic function.
+"""Profile likelihood: intervals of the parameters for which the cost of a fit is not a quadratic function.
 
-A number is fixed at a distance from its fitted value while all other unknowns are fitted again. The rise of the cost is
+A parameter is fixed at a distance from its fitted value while all other unknowns are fitted again. The rise of the cost is
 compared with the quadratic form, (distance/error)^2. If they differ by more than 10 % at two standard errors, the ends of the
 interval are the values at which the cost rises by 1.96^2.
 """
@@ -40,7 +40,8 @@ _VALLEY_STEPS, _SMALL_REDUCTION = 6, 0.05
 """Number of steps into a curved valley of the cost, and reduction of the cost below which they end."""
 
 _TIGHT_ERROR = 1e-3
-"""Standard error of the known value by which a number is fixed, relative to the standard error of the number in the fit."""
+"""Standard error of the known value by which a parameter is fixed, relative to the standard error of the parameter in the
+fit."""
 
 _MAX_DISTANCE = 20.0
 """Distance in standard errors beyond which an interval counts as unbounded."""
@@ -48,18 +49,18 @@ _MAX_DISTANCE = 20.0
 
 @dataclasses.dataclass(frozen=True)
 class _Profile:
-    """Profile of one number of a fit.
+    """Profile of one parameter of a fit.
 
-    The coordinate of the number is its entry of x, or the logarithm of the unbalance.
+    The coordinate of the parameter is its entry of x, or the logarithm of the unbalance.
 
     **Attributes**
 
-    - `fitted`: the fit; `index` of the number in x, or of its exciter if `is_unbalance`
+    - `fitted`: the fit; `index` of the parameter in x, or of its exciter if `is_unbalance`
     - `center` and `spread`: value and standard error of the coordinate
     - `slopes` (p + L,): change of all unknowns per change of the coordinate; an unbalance is (logarithm of its size, angle)
     - `floor`: the least cost
-    - `is_vanished`: True if the number is not distinguishable from 0; distances are then multiples of the standard error of the
-      number itself, not of its logarithm
+    - `is_vanished`: True if the parameter is not distinguishable from 0; distances are then multiples of the standard error of
+      the parameter itself, not of its logarithm
     - `columns` (n, p + L + 1) of a nonlinear motion, see `nonlinear_columns`
     """
 
@@ -113,7 +114,7 @@ class _Profile:
         return best
 
     def _fixed(self, target: float) -> tuple[Problem, float]:
-        """Return the problem with the number fixed at `target`, and the cost of the difference between
+        """Return the problem with the parameter fixed at `target`, and the cost of the difference between
         `target` and the known value of the number."""
         problem, relative_error = self.fitted.problem, _TIGHT_ERROR * min(self.spread, 1.0)
         if self.is_unbalance:
@@ -154,12 +155,13 @@ class _Profile:
 
 
 def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[float, float]]:
-    """Return, for each number for which the cost is not a quadratic function, the distances of both ends of its interval from
-    the fitted value, by name. A distance is a change of the number's entry of x, or of the logarithm of an unbalance.
+    """Return, for each parameter for which the cost is not a quadratic function, the distances of both ends of its interval
+    from the fitted value, by name. A distance is a change of the parameter's entry of x, or of the logarithm of an unbalance.
 
-    The lower distance of a number that is not distinguishable from 0 is minus infinity. Undetermined numbers are left out.
+    The lower distance of a parameter that is not distinguishable from 0 is minus infinity. Undetermined parameters are left
+    out.
 
-    **Arguments**: `fitted`, and `known`: the `Information` about its numbers.
+    **Arguments**: `fitted`, and `known`: the `Information` about its parameters.
     """
     problem, p, number_count = fitted.problem, fitted.x.size, len(fitted.problem.unknowns.numbers)
     data, prior, sizes = in_polar_unbalances(fitted)

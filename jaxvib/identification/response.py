@@ -50,12 +50,12 @@ BLOCK = 64
 class Unknowns(eqx.Module):
     """Unknowns except the linear ones, as deviations x from their first values.
 
-        value = first exp(x) for positive numbers,      value = first + scale x otherwise
+        value = first exp(x) for positive parameters,      value = first + scale x otherwise
 
-    **Attributes** (x has the entries of the numbers, the gains, the turns and the errors, in this order)
+    **Attributes** (x has the entries of the parameters, the gains, the turns and the errors, in this order)
 
     - `numbers` (n,) of the scene; `first` (n,) and `scale` (n,), SI, of the equations above; `positive` (n,): True for positive
-      numbers
+      parameters
     - `gains`: names of the channels whose gains are unknown; each gain is exp(x)
     - `turns`: number of runs whose rotor angle has an unknown zero; x is this zero, rad
     - `errors`: number of unknown errors of rotor angles; x is in standard errors
@@ -75,12 +75,12 @@ class Unknowns(eqx.Module):
         return self.first.shape[0] + len(self.gains) + self.turns + self.errors
 
     def values(self, x: Array | np.ndarray) -> Array:
-        """Return the values (n,) of the scene's numbers, SI."""
+        """Return the values (n,) of the scene's parameters, SI."""
         part = x[: self.first.shape[0]]
         return jnp.where(self.positive, self.first * jnp.exp(part), self.first + self.scale * part)
 
     def scene(self, scene: Scene, x: Array | np.ndarray) -> Scene:
-        """Return the scene with the values of its unknown numbers."""
+        """Return the scene with the values of its unknown parameters."""
         return put_numbers(scene, self.numbers, self.values(x)) if self.numbers else scene
 
     def gain(self, x: Array, name: str) -> Array | float:
@@ -99,7 +99,8 @@ class Samples(eqx.Module):
     - `weights` (N, n, C): 1/noise of each reading, 0 for readings that do not count
     - `taps` (m + 1, C): coefficients of the whitening filter, for the readings of the model
     - `step` h, s
-    - `changed`: numbers of the scene that differ in this run; `actions` ("add", "scale" or "set") and `amounts` of the changes
+    - `changed`: parameters of the scene that differ in this run; `actions` ("add", "scale" or "set") and `amounts` of the
+      changes
     - `channels` that are compared; `turn`: index of the run's unknown zero of the angle, or None
     - `errors`: index of the first error of the rotor's angle among the unknowns, and their number
     - `stretches` in which the motion of loads or on nonlinear supports is integrated: their number, samples of each, steps per

@@ -29,9 +29,9 @@ _QUANTITIES = {"acceleration": "a", "velocity": "v", "displacement": "d", "force
 
 
 class Change(NamedTuple):
-    """Change of a number of the scene for one run: `action` "add", "set" or "scale", and its `amount`.
+    """Change of a parameter of the scene for one run: `action` "add", "set" or "scale", and its `amount`.
 
-    The amount of "add" and "set" is a string with a unit or a number in the unit of the changed number; that of "scale" is a
+    The amount of "add" and "set" is a string with a unit or a number in the unit of the changed parameter; that of "scale" is a
     factor.
     """
 
@@ -49,7 +49,7 @@ class MeasuredRun(Readable):
       pulses, interpolated between samples, and their numbers 0, 1, 2, ...; a number is left out for each pulse that the
       tachometer missed
     - `clipped` (n,): True for samples at the end of the sensor's range, by the name of the channel
-    - `change`: `Change` of numbers of the scene in this run, by their names, such as a mass that was added
+    - `change`: `Change` of parameters of the scene in this run, by their names, such as a mass that was added
     - `notes`: sentences about repairs and about doubtful samples
     - `source`: the file, or another name for messages
 
@@ -82,7 +82,7 @@ class MeasuredRun(Readable):
         - `times`, s: one array (n,) for all channels, or a dictionary with an array for each channel by its name
         - `values`: arrays (n,) in the unit of each channel, by its name; for kind "pulses" the sampled signal, or no entry if
           `times` has the times of the pulses
-        - `change`: numbers of the scene that were different in this run: "+10 kg" and "-10 kg" add to a number, "+5 %" scales
+        - `change`: parameters of the scene that were different in this run: "+10 kg" and "-10 kg" add to a value, "+5 %" scales
           it, "95 kg" replaces it
         - `source`: name of the run in messages
 
@@ -193,7 +193,7 @@ class MeasuredRun(Readable):
 
 
 def parse_change(value: Number, field: str) -> Change:
-    """Return a change of a number of the scene from a number or a string.
+    """Return a change of a parameter of the scene from a number or a string.
 
     >>> parse_change("+10 kg", "change"), parse_change("-5 %", "change"), parse_change("95 kg", "change")
     (Change(action='add', amount='10 kg'), Change(action='scale', amount=0.95), Change(action='set', amount='95 kg'))

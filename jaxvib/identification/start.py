@@ -102,8 +102,8 @@ def _track(unknowns: Unknowns, runs: tuple[Samples, ...], scene: Scene, data: tu
 def track_orders(problem: Problem) -> np.ndarray:
     """Return first values x (p,) of the unknowns from the amplitudes of the runs.
 
-    x is 0, which means the values of the scene, for several unbalances, without unknown numbers of the scene, for runs with too
-    few turns, and if the fit fails.
+    In four cases x is 0, that is, the unknowns have the values of the scene: for several unbalances, without unknown parameters
+    of the scene, for runs with too few turns, and if the fit fails.
     """
     zero = np.zeros(problem.unknowns.count)
     if len(problem.unbalances) > 1 or not len(problem.unknowns.first):

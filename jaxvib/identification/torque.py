@@ -1,21 +1,22 @@
 """Torque balance of a motor whose rotor turns by a recorded angle.
 
-The vibration a(t) at the rotor follows from the recorded angle and the numbers of the machine. It brakes the rotor, and the
+The vibration a(t) at the rotor follows from the recorded angle and the parameters of the machine. It brakes the rotor, and the
 predicted speed w and angle obey
 
     I w' = T(w) + c(t),      c = -Re[conj(i p) (a + i g)],      angle' = w
 
-I is the inertia of the rotor, p(t), kg m, the unbalance times the unit vector in its direction, a the acceleration of the
-rotor's axis (horizontal + i up), both at the recorded angle, and g gravity. The first angle and speed are unknowns, and the
-predicted angle is compared with the pulses (or with samples of an angle or a speed). This comparison has three advantages:
+I is the moment of inertia of the rotor, T the torque of the motor, and c that of vibration and gravity. p(t), kg m, is the
+unbalance times the unit vector in its direction, a the acceleration of the rotor's axis (horizontal + i up), both at the
+recorded angle, and g gravity. The first angle and speed are unknowns, and the predicted angle is compared with the pulses (or
+with samples of an angle or a speed). This comparison has three advantages:
 
 - It needs no derivative of the record
 - The errors of the pulses are independent except for a common delay
 - The torque of the motor depends on the speed, which keeps the prediction near the record
 
-The numbers of the motor, those of the machine and the motion at the first sample are fitted together, because the decrease of
-the speed at a resonance is a measure of the torque of the vibration. T neglects the rotation of a housing that turns with the
-machine.
+The parameters of the motor, those of the machine and the motion at the first sample are fitted together, because the decrease
+of the speed at a resonance is a measure of the torque of the vibration. T neglects the rotation of a housing that turns with
+the machine.
 """
 
 from __future__ import annotations
@@ -187,7 +188,7 @@ class _Trial(NamedTuple):
 def fit_with_torques(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
     """Return the fit of a problem from the unknowns `starts`.
 
-    If a number of a motor is unknown, the vibrations and the rotor speed are fitted together. The fit is then repeated
+    If a parameter of a motor is unknown, the vibrations and the rotor speed are fitted together. The fit is then repeated
     with the predicted angle of the rotor, which contains its ripple within each turn.
     """
     fitted = fit_from(problem, starts)
@@ -207,7 +208,7 @@ def fit_with_torques(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
 def _with_torque_balance(fitted: Fitted, motor: list[int]) -> tuple[Fitted, list[RecordedDrive]]:
     """Return the fit of vibrations and rotors together, and the predicted angle of the rotor in each run.
 
-    **Arguments**: `fitted` to the vibrations alone; indices of the numbers of the `motor` in x.
+    **Arguments**: `fitted` to the vibrations alone; indices of the parameters of the `motor` in x.
     """
     problem, p, size = fitted.problem, fitted.x.size, fitted.x.size + fitted.linear.size
     runs, of_rotors = _runs(fitted)

@@ -1,4 +1,4 @@
-"""Many runs at once, on every core or graphics processor."""
+"""Many runs at once, on every core or accelerator."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def ensemble(
     """Integrate many scenes, or one scene from many starts, from 0 to `until` with equal steps.
 
     - The runs of a batch advance together; each entry of the state is one contiguous array over the batch. Batches are
-      distributed over all cores or graphics processors; under a JAX transformation they are computed one after the other
+      distributed over all cores or accelerators; under a JAX transformation they are computed one after the other
     - Because all runs have equal steps, no run waits for another. Near the boundary between two outcomes, the outcome does not
       depend on an automatic choice of steps
     - Compiled programs are used again for other values and other numbers of runs above `batch`, if `make` is the same function

@@ -159,14 +159,17 @@ def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> Sta
 
     A state that contains this rotation already is returned unchanged.
 
-        c = p' - w axis x (p + r n),    s = - w axis . n        (n the normal of the contact)
+        c = p' - w axis x (p + r n),    s = - w axis . n
+
+    p is the position of the centre of a load, r its radius and n the normal of its contact; w is the rotor speed. c is the slip
+    and s the drilling spin.
 
     **Arguments**
 
     - `scene` whose effects permit the rotation (`FreeSpin`, `Sliding`)
     - `state` without this rotation
     - `rotation`: "rolling" (the default), for loads that roll on their track without spin about the contact normal; or "none",
-      for loads that do not rotate in space (the equation above), so that their contact slides if the scene has `Sliding`;
+      for loads that do not rotate in space (the equations above), so that their contact slides if the scene has `Sliding`;
       typical: slips of 5 to 50 m/s for "none"
 
     **Returns** `State`. **Raises** `InputError` for another name, and for a spin in the state that the scene does not permit

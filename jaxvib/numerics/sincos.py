@@ -53,7 +53,7 @@ def _polynomial(terms: int) -> tuple[float, ...]:
     """Return the coefficients of P(z), lowest power first, with sin r = r + r z P(z), z = r^2 up to (pi/2)^2.
 
     The highest powers of Taylor's series are removed one after another by Chebyshev polynomials (economization). The error
-    exceeds that of the best polynomial by a few per cent.
+    exceeds that of the best polynomial by a few percent.
     """
     scale = 2 / (_PI / 2) ** 2
     chebyshev = [[Fraction(1)], [Fraction(-1), scale]]

@@ -37,14 +37,14 @@ def _close() -> None:
 
 
 class ProgressBar(diffrax.AbstractProgressMeter):
-    """Progress bar of a run, in steps of one per cent."""
+    """Progress bar of a run, in steps of one percent."""
 
     def init(self) -> Array:
         """State of the meter: the progress shown last."""
         return jnp.array(0.0)
 
     def step(self, state: Array, progress: RealScalarLike) -> Array:
-        """Show `progress` if it has increased by one per cent."""
+        """Show `progress` if it has increased by one percent."""
         progress = jnp.asarray(progress, dtype=state.dtype)
         further = (progress - state > 0.01) | (progress >= 1.0)
         jax.lax.cond(further, lambda p: jax.debug.callback(_show, p), lambda p: None, progress)

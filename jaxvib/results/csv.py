@@ -65,8 +65,8 @@ def write_table(
 def main_axis(result: eqx.Module) -> str:
     """Return the most frequent first axis of the arrays of a result; "" if none has an axis.
 
-    If it has one point only, such as the segments of one spectrum, return the longest axis with coordinates, such as
-    frequencies, if there is one.
+    If this axis has only one point, as the axis of segments of a single spectrum, return the longest axis with coordinates
+    instead, such as the axis of frequencies, if there is one.
     """
     arrays = [(name, axes, values) for name, axes, values, _ in columns(result) if axes and values.ndim == len(axes)]
     counts = collections.Counter(axes[0] for _, axes, _ in arrays)

@@ -93,7 +93,7 @@ def _compute_remotely(study: Study, chunk: int, key: str, expected_versions: dic
     """
     for name, version in versions().items():
         if expected_versions[name] != version:
-            return f"has {name} {version}, but the store was created with {expected_versions[name]}: digits would differ"
+            return f"has {name} {version}, but the store was created with {expected_versions[name]}: digits may differ"
     jax.config.update("jax_enable_x64", is_double)
     take_a_device()
     if key not in _STUDIES:  # the first received copy is stored, because the program was compiled for its functions

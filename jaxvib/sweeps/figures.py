@@ -306,7 +306,7 @@ def _axis_words(store: Store, axis: str) -> str:
     scene = scene_from_toml(store.record["scene"])
     try:
         named = find_number(scene, axis, "axis").words(scene)
-    except InputError:  # an axis that is not a number of the scene
+    except InputError:  # an axis that is not a parameter of the scene
         return axis
     return named[0] if len(named) == 1 else axis
 

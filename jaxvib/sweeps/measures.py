@@ -153,7 +153,8 @@ RUN_MEASURES = {
 }
 """Measures of a run by name.
 
-- regime (see `regime`), jam mode (0: not jammed), ripple and rotor speed. They need a scene with one exciter and loads
+- regime (see `regime`), jam mode (0: not jammed), ripple and rotor speed. They need a scene with one exciter that
+  turns anticlockwise and has loads and no unbalance
 - load speeds, amplitudes and foundation force (zero to peak), drift (see `AbstractMeasured`)
 - peak displacement and peak force: the largest displacement of each coordinate from rest and the largest magnitude of the
   foundation force of the whole run (start, passage through resonances, stop), as the quantity `peak_force`
@@ -161,8 +162,9 @@ RUN_MEASURES = {
   measuring window
 - settling time: the time after which each load speed differs from its final value by less than 1 % of the rotor speed, with a
   resolution of 1/64 of the time before the measuring window. It is the end of the run if the loads do not settle
-- stroke to conveying speed: the measures of `VibrationMeasures` with the centre of mass as the point. All of them except torque
-  and power are NaN for a run that does not end in a vibration at the speed of its exciters (see `Run.no_vibration`)
+- the measures from `run.stroke` to `run.conveying_speed`: those of `VibrationMeasures` with the centre of mass as the point.
+  All of them except torque and power are NaN for a run that does not end in a vibration at the speed of its exciters (see
+  `Run.no_vibration`)
 - support load: the sum of the static and the vertical dynamic load
 """
 

@@ -137,7 +137,7 @@ class Store:
         for name, version in versions().items():
             if self.attributes["versions"].get(name) != version:
                 begun = f"was created with {name} {self.attributes['versions'].get(name)}, and this is {version}"
-                raise InputError("store", f"{begun}: digits would differ; continue with that version, or name another store")
+                raise InputError("store", f"{begun}: digits may differ; continue with that version, or name another store")
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:

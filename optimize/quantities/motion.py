@@ -32,7 +32,7 @@ def _times(until: Number, spin_up: Number | None) -> tuple[float, float | None]:
 def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
     """Return the largest foundation force, N, of a run from rest (full equations).
 
-    The force is read at 4000 times of the run. The value is therefore too small by up to some per cent if the run is long and
+    The force is read at 4000 times of the run. The value is therefore too small by up to a few percent if the run is long and
     the peak is short, such as the peak of a collision with a `Stop`. The measure `run.peak_force` of sweeps reads each step;
     its error is that of the steps.
 
@@ -73,7 +73,7 @@ def peak_displacement(
     - `body`: number of the body from 0; typical: 0 (the default)
 
     **Returns** `Quantity`; its derivatives exist in forward mode only; typical: 5 to 30 mm, two to four times the amplitude at
-    working speed. **Raises** `InputError` for times as `peak_force`, and for a point that is not (x, y). A place that the
+    working speed. **Raises** `InputError` for times as in `peak_force`, and for a point that is not (x, y). A place that the
     machine does not have raises it when the quantity is computed.
 
     >>> from optimize import peak_displacement

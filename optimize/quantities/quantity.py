@@ -44,8 +44,8 @@ class Quantity:
 
     - `name` of the quantity
     - `unit`, "" for none
-    - `function` of a `Scene`, or of a `Scene` and its jam modes (`jaxvib.JamModes`), that returns a scalar, differentiable, NaN
-      if the quantity does not exist
+    - `function` of a `Scene`, or of a `Scene` and its jam modes (`jaxvib.JamModes`), that returns a
+      differentiable scalar, NaN if the quantity does not exist
     - `mode`: the jam mode to which the quantity refers, if any; typical: 1, 3, 5
     - `of`: the platform or the pair of platforms whose amplitude the quantity contains, if any
     - `parts`: the quantities from which this quantity is computed, for example the terms of a sum

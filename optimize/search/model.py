@@ -17,7 +17,7 @@ _DIFFERENCE_STEP = 1e-5
 """Step of central differences, as a fraction of the range of a free parameter."""
 
 _MIN_SHARE_AT_KINK = 1e-4
-"""Share of a piece of the objective, as a multiplier, above which the piece counts as one of those that meet at a kink."""
+"""Share of a piece of the objective (its multiplier) above which the piece counts as one of those that meet at a kink."""
 
 _SMALL_OBJECTIVE_SHARE = 1e-4
 """Smallest scale of the objective, relative to the change of the objective over the bounds that is predicted from its slope."""

@@ -163,11 +163,12 @@ def test_common_factor_is_one_sentence():
     np.testing.assert_allclose(lost[1].error, np.hypot(0.8 * 3.0, 0.6 * 5.0))
     assert lost[0].sentence == (
         "multiplying all masses and dampings by one number changes no reading by more than its noise: "
-        "give one of these numbers as known, or record a run with a known mass added"
+        "give one of these parameters as known, or record a run with a known mass added"
     )
     assert lost[1].sentence == (
         "changing machine.mass[0] by +0.71, machine.mass[1] by -0.71 (relative to one another) changes no reading by more than "
-        "its noise: give one of these numbers as known, add a sensor at another place, or record a run through all resonances"
+        "its noise: give one of these parameters as known, add a sensor at another place, or record a run through "
+        "all resonances"
     )
 
 

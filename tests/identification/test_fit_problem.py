@@ -222,7 +222,7 @@ def test_silent_channels_and_long_delays_are_refused():
 
 
 def test_without_a_number_to_find_a_fit_is_refused():
-    with pytest.raises(jv.InputError, match=r"unknown is \['machine.mass'\]; these numbers are exactly known"):
+    with pytest.raises(jv.InputError, match=r"unknown is \['machine.mass'\]; these parameters are exactly known"):
         build_problem(scene_of(), [run_with({"a": np.sin(T)})], ["machine.mass"], {"machine.mass": "80 kg"})
     only = build_problem(scene_of(), [run_with({"a": np.sin(T)})], ["exciters[0].unbalance"], {})
     assert only.unknowns.count == 0 and only.unbalances == (None,)

@@ -113,5 +113,5 @@ def test_numbers_of_a_drive_need_a_motor_and_its_speed(drive, kept):
     run = run_of()
     channels = [each for each in run.channels if each.name in kept]
     run = jv.MeasuredRun(tuple(channels), run.times, run.values, run.clipped, run.change, run.notes, run.source)
-    with pytest.raises(jv.InputError, match="is a number of the drive"):
+    with pytest.raises(jv.InputError, match="is a parameter of the drive"):
         jv.identify(scene(drive), run, unknown=["drive.speed"])

@@ -61,7 +61,7 @@ def _with_options(tables: Tables, given: Mapping[str, str | bool | None]) -> Tab
 @DECIMAL_COMMA
 @shared
 def identify(record: Path, output: Output, **given: str | bool | None) -> None:
-    """Identify numbers of a machine from recorded runs, or the friction of a bearing from a recorded swing.
+    """Identify parameters of a machine from recorded runs, or the friction of a bearing from a recorded swing.
 
     RECORD is an identification file (TOML) that names a scene file, recorded runs and their channels; --out adds the fitted
     scene (found.toml), the figure and the fit (fit.npz). For a bearing, RECORD is a CSV file of time and angle of a pendulum
@@ -122,7 +122,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
 
 
 def _identify_machine(tables: Tables, folder: Path, output: Output, options: list[str]) -> None:
-    """Identify the numbers of the machine of an identification file in `folder`."""
+    """Identify the parameters of the machine of an identification file in `folder`."""
     from jaxvib.exchange.recordings.fit_file import fit_from_tables  # slow imports, which --help does not need
     from jaxvib.machine.rewrite import rewrite_scene
 

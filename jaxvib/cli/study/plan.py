@@ -17,12 +17,12 @@ from jaxvib.errors import InputError
 @click.option("--fit", type=click.Path(path_type=Path), help="A fit.npz of `jaxvib identify`, in place of a new fit.")
 @shared
 def plan(identification: Path, fit: Path | None, output: Output) -> None:
-    """Rank the candidate runs of an IDENTIFICATION file by the reduction of the expected errors of its unknown numbers per
+    """Rank the candidate runs of an IDENTIFICATION file by the reduction of the expected errors of its unknown parameters per
     minute of test.
 
     The file names the runs so far, as for `identify`, and each [[candidate]]: a ramp, a dwell or a coast-down, other places of
-    sensors, or changed numbers of the machine, such as an added mass. With the table [limits], the curve of speed over time of
-    the best candidate is optimized for the smallest expected errors."""
+    sensors, or changed parameters of the machine, such as an added mass. With the table [limits], the curve of speed over time
+    of the best candidate is optimized for the smallest expected errors."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.display import speed_text

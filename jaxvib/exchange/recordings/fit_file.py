@@ -1,4 +1,4 @@
-"""Identification files: a machine, recorded runs, their channels, the unknown numbers, and runs to plan."""
+"""Identification files: a machine, recorded runs, their channels, the unknown parameters, and runs to plan."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ _CANDIDATE_FIELDS = ["name", "drive", "duration", "rate", "at", "noise", "change
 class FitInput(NamedTuple):
     """Contents of an identification file.
 
-    **Attributes**: path of the `scene_file`; arguments of `identify`: `scene`, `runs`, names of `unknown` numbers, and `known`
-    numbers with their errors; arguments of `plan_runs`: `candidates` and `limits` (None without limits).
+    **Attributes**: path of the `scene_file`; arguments of `identify`: `scene`, `runs`, names of `unknown` parameters, and
+    `known` parameters with their errors; arguments of `plan_runs`: `candidates` and `limits` (None without limits).
     """
 
     scene_file: Path

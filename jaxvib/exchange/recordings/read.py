@@ -40,7 +40,7 @@ def read_run(
     - `path` of the file; the extension of its name determines the format
     - `channels` that are read, with names as in the file, with or without their units; typical: 1 to 10
     - `start` and `until`, s: beginning and end of the part that is read; default: the whole record
-    - `change`: numbers of the scene that were different in this run, as for `MeasuredRun.from_arrays`
+    - `change`: parameters of the scene that were different in this run, as for `MeasuredRun.from_arrays`
     - `rate`: sampling rate, Hz, in place of the times in the file; typical: 500 to 10,000
 
     **Returns** `MeasuredRun`. **Raises** `InputError` for a file that cannot be read, a channel that the file does not have,

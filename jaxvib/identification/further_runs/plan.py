@@ -1,4 +1,4 @@
-"""Choice of the next run by the expected errors of the fitted numbers, computed from the Fisher information."""
+"""Choice of the next run by the expected errors of the fitted parameters, computed from the Fisher information."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from jaxvib.units import Number
 class RunPlan(Result):
     """Expected errors after candidate runs. Returned by `plan_runs`.
 
-    **Attributes** (c candidates, k numbers)
+    **Attributes** (c candidates, k parameters)
 
-    - `candidates` (c,): names of the runs, the best one first; `numbers` (k,): names of the numbers
-    - `errors` (c, k): expected relative standard errors after the runs so far and the candidate, infinite for numbers that
+    - `candidates` (c,): names of the runs, the best one first; `numbers` (k,): names of the parameters
+    - `errors` (c, k): expected relative standard errors after the runs so far and the candidate, infinite for parameters that
       remain undetermined
     - `now` (k,): relative standard errors after the runs so far
     - `minutes` (c,): durations, min
-    - `benefit` (c,): sum over the numbers of log(error now / error after the run), per minute of the run. An error above 1, or
-      of an undetermined number, counts as 1
+    - `benefit` (c,): sum over the parameters of log(error now / error after the run), per minute of the run. An error above 1,
+      or of an undetermined parameter, counts as 1
     - `profile`: the `SpeedProfile` of the run with the optimized speed; None if no limits were given, or if the optimized run
       is not better than the candidates
     """
@@ -63,7 +63,7 @@ class RunPlan(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the largest relative error of the numbers after each candidate run."""
+        """Plot the largest relative error of the parameters after each candidate run."""
         from jaxvib.draw.results import points_chart  # slow import
 
         largest = np.max(np.where(np.isfinite(self.errors), self.errors, 1.0), axis=1)
@@ -72,11 +72,12 @@ class RunPlan(Result):
 
 @validated
 def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping[str, Number] | None = None) -> RunPlan:
-    """Return the errors that the fitted numbers would have after each candidate run, computed before any of them is recorded.
+    """Return the errors that the fitted parameters would have after each candidate run, computed before any of them is
+    recorded.
 
         errors^2 = diagonal of (F_so_far + F_candidate)^-1,       F = J^T J / noise^2,       J = d readings / d unknowns
 
-    - F is the Fisher information about the unknown numbers and the gains of the sensors
+    - F is the Fisher information about the unknown parameters and the gains of the sensors
     - Each candidate has further unknowns: its state at the first sample and the offsets of its channels. The zero of the
       rotor's angle is also unknown, unless the candidate has a channel of kind "pulses" or "angle"; the mark of such a channel
       is assumed to be the mark of the runs so far. A wheel with several pulses per turn has a mark if it has a gap

@@ -1,4 +1,4 @@
-"""Run that is not recorded yet, and the information that it would give about the numbers of a fit."""
+"""Run that is not recorded yet, and the information that it would give about the parameters of a fit."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class PlannedRun(Readable):
     - `rate`, Hz, of the samples; typical: 200 to 2000
     - `noise`: standard deviation of the readings by the name of the channel, for channels that no run so far has, in SI units
       or as strings; typical: "0.05 m/s^2". Other channels have the noise of the fit, with the same spectral density
-    - `change`: numbers of the scene that differ in this run, as in `MeasuredRun.from_arrays`
+    - `change`: parameters of the scene that differ in this run, as in `MeasuredRun.from_arrays`
 
     **Raises** `InputError` for a drive whose speed depends on the machine, and for values that are not positive.
 
@@ -85,7 +85,7 @@ class PlannedRun(Readable):
 
 
 class Expected(NamedTuple):
-    """Planned run, evaluated with the numbers of a fit.
+    """Planned run, evaluated with the parameters of a fit.
 
     **Attributes**: `fitted`: the run as a fit without iterations; `indices_in_run` and `indices_in_fit` of the unknowns
     that the run shares with the fit, among the unknowns of the run and in the information of the fit.
@@ -104,7 +104,7 @@ class Expected(NamedTuple):
 
 
 def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
-    """Return a planned run, evaluated with the numbers of a fit.
+    """Return a planned run, evaluated with the parameters of a fit.
 
     A run with loads on the rotor begins with the state at the first sample of the first run of the fit, all others at rest.
 
@@ -164,8 +164,8 @@ def _noises(fit: MachineFit) -> dict[str, tuple[Noise, float]]:
 
 
 def problem_of_run(fit: MachineFit, scene: Scene, run: MeasuredRun) -> Problem:
-    """Return the problem of a run with the numbers of a fit as unknowns, in the units of `fit.scale`. Numbers of the motor are
-    left out, because the vibrations do not determine them.
+    """Return the problem of a run with the parameters of a fit as unknowns, in the units of `fit.scale`. Parameters of the
+    motor are left out, because the vibrations do not determine them.
 
     **Arguments**: `scene`: the fitted scene with the drive of the run.
     """
@@ -210,6 +210,6 @@ def expected_information(fit: MachineFit, expected: Expected) -> np.ndarray:
 
 
 def expected_errors(information: np.ndarray, count: int) -> np.ndarray:
-    """Return the relative standard errors (count,) of the numbers, infinite for those that are not determined."""
+    """Return the relative standard errors (count,) of the parameters, infinite for those that are not determined."""
     result = covariance_of(eliminate(information, np.arange(count)))
     return np.where(result.determined, np.sqrt(np.diagonal(result.covariance)), np.inf)

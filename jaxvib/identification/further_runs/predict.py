@@ -29,7 +29,8 @@ _NOISE_RATIO = 1.5
 `patterned`."""
 
 _NUMBER_ERROR = 1e-6
-"""Relative standard error of the numbers in a nonlinear motion, so small that a fit of the first state does not change them."""
+"""Relative standard error of the parameters in a nonlinear motion, so small that a fit of the first state does not change
+them."""
 
 
 _MIN_FILTERED = 64
@@ -92,15 +93,15 @@ class RunPrediction(Result):
 def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     """Return the prediction of a run that the fit did not use, and its comparison with the readings.
 
-    - The numbers and the gains are those of the fit. The motion at the first sample and the offsets are fitted to the run. The
-      zero of the rotor's angle is also fitted, unless the fit and the run both have the mark of a tachometer and the scene has
-      neither loads nor nonlinear supports, or the scene has several exciters
-    - A likelihood-ratio test compares two hypotheses: the machine has the same numbers in the run as in the fit, or it has
-      other numbers. The test accounts for the errors of the fit and the noise of the run. If the p-value of the deviation is
-      below 1e-5, the run contradicts the fit, and a note names the number whose change explains most of the deviation. In a run
-      with loads or nonlinear supports, no number is named if the residuals are more than 1.5 times the noise
+    - The parameters and the gains are those of the fit. The motion at the first sample and the offsets are fitted to the run.
+      The zero of the rotor's angle is also fitted, unless the fit and the run both have the mark of a tachometer and the scene
+      has neither loads nor nonlinear supports, or the scene has several exciters
+    - A likelihood-ratio test compares two hypotheses: the machine has the same parameters in the run as in the fit, or it has
+      other parameters. The test accounts for the errors of the fit and the noise of the run. If the p-value of the deviation is
+      below 1e-5, the run contradicts the fit, and a note names the parameter whose change explains most of the deviation. In a
+      run with loads or nonlinear supports, no parameter is named if the residuals are more than 1.5 times the noise
 
-    **Arguments**: `fit` from `identify`; `run`: a `MeasuredRun`, with its own `change` of numbers.
+    **Arguments**: `fit` from `identify`; `run`: a `MeasuredRun`, with its own `change` of parameters.
 
     **Returns** `RunPrediction`. **Raises** `InputError` for a run that cannot be used.
 
@@ -131,10 +132,10 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     if deviation.p_value < SIGNIFICANCE_LEVEL:
         status = PredictionStatus.contradicted
         is_far = at.problem.linear is not None and bool(np.any(ratio > _NOISE_RATIO))
-        # Far from the fit, the linearized motion does not show which number has changed.
+        # Far from the fit, the linearized motion does not show which parameter has changed.
         too_far = (
             f"the run deviates from the fit by more than its errors (p-value {deviation.p_value:.1g}), "
-            "too much to name a number"
+            "too much to name a parameter"
         )
         notes.append(too_far if is_far else deviation.sentence("the run"))
     mask, raw = at.problem.masks[0], at.problem.raw[0]
@@ -174,7 +175,7 @@ def _reduced(residuals: np.ndarray, ratio: float) -> float:
 
 
 class _Predicted(NamedTuple):
-    """Run, evaluated with the numbers of a fit.
+    """Run, evaluated with the parameters of a fit.
 
     **Attributes**: its `problem`; unknowns `x`; `linear`: the unknowns on which the readings depend linearly (unbalances,
     state at the first sample, offsets), fitted to the run; `residuals` (n, C); `taps` of the filters to white noise (C,);
@@ -201,7 +202,7 @@ def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
         if name in fit.gain_names:
             x[first + k] = math.log(fit.gains[fit.gain_names.index(name)].value)
     fixed, means, precisions = pairs if has_mark or len(sizes) > 1 else None, problem.means, problem.precisions
-    if is_nonlinear(fit.scene):  # the first state has a nonlinear effect; the numbers are held by their priors
+    if is_nonlinear(fit.scene):  # the first state has a nonlinear effect; the parameters are held by their priors
         held = problem._replace(means=x, precisions=np.full(x.size, _NUMBER_ERROR**-2))
         problem = (with_guided_motion if has_supports(fit.scene) else with_first_motion)(held)[0]
 
@@ -241,6 +242,6 @@ def _deviation(fit: MachineFit, at: _Predicted) -> Disagreement:
     part[np.ix_(in_fit, in_fit)] = eliminate(matrix, in_run)
     gradient[in_fit] = elimination(matrix, in_run).T @ slope
     names = [*fit.names, *(f"the gain of channel {name!r}" for name in fit.gain_names), "the angle (rad) of the unbalance"]
-    # The gradient was computed at the numbers of the fit. Here it becomes that at the optimum of a joint fit of all records.
+    # The gradient was computed at the parameters of the fit. Here it becomes that at the optimum of a joint fit of all records.
     gradient = fit.information @ pseudoinverse(fit.information + part)[0] @ gradient
     return disagreement(fit.information, part, gradient, names)

@@ -74,8 +74,8 @@ def optimized_profile(fit: MachineFit, planned: PlannedRun, expected: Expected, 
     """Return the speed profile, linear between evenly spaced times, at the local minimum of the expected errors near the speed
     of a planned run.
 
-    The objective is half the sum of the logarithms of the variances of the unknown numbers, with the prior standard error 1 of
-    each.
+    The objective is half the sum of the logarithms of the variances of the unknown parameters, with the prior standard error 1
+    of each.
     """
     from scipy.optimize import minimize  # slow to import
 
@@ -102,12 +102,12 @@ def optimized_profile(fit: MachineFit, planned: PlannedRun, expected: Expected, 
 
 
 def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return half the sum of the logarithms of the expected variances of the numbers, and its gradient with respect to the
+    """Return half the sum of the logarithms of the expected variances of the parameters, and its gradient with respect to the
     speeds.
 
-    F is the Fisher information of the run (the matrix of its normal equations). L, the projection onto the numbers that are not
-    eliminated, is kept fixed, so that a change dF changes L^T F L by L^T dF L. The gradient is therefore one vector-Jacobian
-    product of F: the vector contains the derivatives of the objective with respect to the entries of F.
+    F is the Fisher information of the run (the matrix of its normal equations). L, the projection onto the parameters that are
+    not eliminated, is kept fixed, so that a change dF changes L^T F L by L^T dF L. The gradient is therefore one
+    vector-Jacobian product of F: the vector contains the derivatives of the objective with respect to the entries of F.
     """
     fitted, k, p = expected.fitted, len(fit.names), expected.fitted.x.size
     problem, indices = fitted.problem, linear_indices(fitted.problem)[0]

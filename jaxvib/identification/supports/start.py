@@ -131,13 +131,13 @@ def _with_open_stops(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.
 
 
 def untouched_stops(fitted: Fitted) -> Iterator[str]:
-    """Yield sentences about stops whose numbers are unknown and have no influence, because no run touches them."""
+    """Yield sentences about stops whose parameters are unknown and have no influence, because no run touches them."""
     names = [number.name for number in fitted.problem.unknowns.numbers]
     influence = np.diagonal(fitted.information)[: len(names)]
     for k in range(len(fitted.problem.scene.effects)):
         own = [i for i, name in enumerate(names) if name.startswith(f"effects.stop[{k}].")]
         if own and not np.any(influence[own] > 0.0):
             yield (
-                f"effects.stop[{k}] is not touched in the runs, which therefore do not determine its numbers: record a run "
+                f"effects.stop[{k}] is not touched in the runs, which therefore do not determine its parameters: record a run "
                 "with larger vibrations, or leave them out of `unknown`"
             )

@@ -73,7 +73,7 @@ class Sliding(Effect):
 
     - F_t is the force of the contact on the load along the track; the index t denotes the part tangential to the track
     - In a torus max(N, 0) replaces |N|: a ball that does not press on the wall has no friction
-    - F_r is here the force with which the load would roll at the actual acceleration of its centre
+    - F_r is the force with which the load would roll at the actual acceleration of its centre
     - c is the velocity of the point of contact relative to the track along each coordinate of a load (`State.spin.slip`,
       default: 0 at the start; `with_spin(scene, state, "none")` for loads that do not rotate yet)
     - A sliding load moves like a mass without rotation. Friction accelerates its rotation until it rolls; a ball from rest then
@@ -82,12 +82,12 @@ class Sliding(Effect):
 
     If |c| is below `width`, the force is
 
-        F_t = F_r - mu |N| c/width
+        F_t = F_0 - mu |N| c/width
 
-    with F_r of the motion in which the load rolls. If F_t exceeds the limit, its size is reduced to the limit and its direction
-    is kept. The remaining slip then decays as exp(- kappa/(kappa-1) mu |N| t/(m width)). Steps must resolve this decay:
-    about kappa/(kappa-1) mu R w^2/width steps per second. The moment of a `RollingFriction` acts on the rotation of a sliding
-    load; its direction is still that against the motion of the centre.
+    with F_0 the force of the contact in the motion in which the load rolls. If F_t exceeds the limit, its size is reduced to
+    the limit and its direction is kept. The remaining slip then decays as exp(- kappa/(kappa-1) mu |N| t/(m width)). Steps must
+    resolve this decay: about kappa/(kappa-1) mu R w^2/width steps per second. The moment of a `RollingFriction` acts on the
+    rotation of a sliding load; its direction is still that against the motion of the centre.
 
     **Arguments** (SI, or strings with a unit)
 

@@ -226,7 +226,7 @@ def _torque_of(exciter: Exciter, time: Array, speed: Array, load_speed: Array) -
 
 
 def plot_histories(run: Envelope, *, resonances: Sequence[float] = (), unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
-    """Plot an averaged run, with natural frequencies `resonances`, rad/s, in the diagram of the speeds."""
+    """Plot an averaged run, with natural frequencies `resonances`, rad/s, as lines in the panel of the speeds."""
     from jaxvib.draw.motion.histories import amplitude_histories  # slow import
 
     kept, structure = run.window if run.trajectory is None else run.trajectory, run.scene.machine.structure()

@@ -53,7 +53,7 @@ class JamStatus(eqx.Enumeration):
 
     found = "the loads can jam in this mode"
     absent = "this mode does not exist at this rotor speed"
-    at_fold = "the rotor speed is that of a fold: the mode merges with its neighbour and has no gradient"
+    at_fold = "the rotor speed is that of a fold: the mode merges with another one and has no gradient"
     cannot_stay_together = (
         "these loads cannot jam at one angle: one of them needs more torque than the vibration can supply at any phase"
     )

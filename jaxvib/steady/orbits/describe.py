@@ -36,7 +36,7 @@ class OrbitStatus(eqx.Enumeration):
     not_converged = "no periodic motion was found: the torques cannot be balanced"
     under_resolved = "the periodic motion needs more harmonics for the requested accuracy; give more points"
     would_separate = "the loads would separate: staying side by side needs tensile forces between them"
-    at_fold = "the rotor speed is that of a fold: the motion merges with its neighbour and has no gradient"
+    at_fold = "the rotor speed is that of a fold: the motion merges with another one and has no gradient"
     unresolved = (
         "the motion was found, but not its stability: the fastest motion of the carrier is too fast "
         "compared with that of the loads"

@@ -40,7 +40,7 @@ class Floquet(NamedTuple):
 
     **Attributes**
 
-    - `roots` (2 nd + 2 G - 1, P) complex: growth factors of disturbances that keep the loads of a group coincident, over the
+    - `roots` (2 nd + 2 G - 1, P) complex: growth factors of disturbances that keep the loads of a body coincident, over the
       span of the collocation grid, without the trivial root of a shift in time. The span is a period, and the roots are the
       Floquet multipliers. If the motion has the half-turn symmetry, the span is half a period, the disturbance at its end is
       rotated by half a turn, and the multipliers are the squares of the roots
@@ -261,9 +261,11 @@ def floquet(
         Q'' = - M^-1 (C + n G)/Omega q' - M^-1 K/Omega^2 q
         I_g Omega^2 d_g'' = T_rate Omega d_g' + (T_phi + S_g e.a) d_g - Omega^2 (S_g t_g - T_a).B q''
 
-    T is the torque on the body. With dry friction it also depends on the acceleration of the mount, a = Omega^2 B q''.
-    Loads of one body that separate (sum d_j = 0) leave the carrier at rest: they obey the second equation without its last
-    term. Loads that lie side by side are pressed together and do not separate.
+    S_g is the unbalance of body g, I_g its moment of inertia, and B maps the coordinates to the displacement of the mount. T is
+    the torque on the body; T_phi, T_rate and T_a are its derivatives with respect to angle, speed and a. With dry friction it
+    also depends on the acceleration of the mount, a = Omega^2 B q''. Loads of one body that separate (sum d_j = 0) leave the
+    carrier at rest: they obey the second equation without its last term. Loads that lie side by side are pressed together and
+    do not separate.
 
     All orbits are integrated with equal steps of the same length by Dormand and Prince's method of order 8 or, if `implicit`,
     by `radau.transition`, which resolves any drag of the loads and any damping of the carrier.

@@ -5,10 +5,10 @@ speeds, with the amplitude
 
     T_ik = (S_i S_k / 2) w_k^4 |H_ik(w_k)|
 
-and changes the speed of mass i, whose inertia is I_i and whose driving torque has the slope L_i' = dL_i/dw_i, with the
-amplitude T_ik/sqrt((d I_i)^2 + L_i'^2) at the difference d = w_k - w_i. The groups are independent if this change is small
-compared with d. The ratios are added over the masses k of all other groups. The `interaction` of a motion is the largest of
-these sums.
+where w_i is the speed of mass i, S_i its unbalance, and H_ik the influence coefficient of the masses (see `local`). It changes
+the speed of mass i, whose inertia is I_i and whose driving torque has the slope L_i' = dL_i/dw_i, with the amplitude
+T_ik/sqrt((d I_i)^2 + L_i'^2) at the difference d = w_k - w_i. The groups are independent if this change is small compared with
+d. The ratios are added over the masses k of all other groups. The `interaction` of a motion is the largest of these sums.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ _MOTIONS_PER_PROGRAM = 64
 class RegimePartitions(Result):
     """Motions of rotating masses in groups, each with one speed. Returned by `regime_partitions`.
 
-    Stable motions come first, then motions with few groups.
+    Stable motions come first; among the stable ones, and among the others, those with fewer groups come first.
 
     **Attributes** (n motions)
 

@@ -227,9 +227,10 @@ def relaxed(x: Array, balance: TorqueBalance) -> Array:
 
         Omega' = mean of r,     alpha_k' - alpha_0' = r_k - r_0,     r_i = (L_i + V_i)/(largest possible V_i)
 
-    L_i is the torque of drive i, and V_i the torque of the vibration on its rotor. Steps of the implicit Euler method with
-    growing sizes first follow this slow motion and then become those of Newton's method. Newton's method alone leads from most
-    starts to unstable regimes if there are many masses.
+    L_i is the driving torque and V_i the vibrational torque of mass i.
+
+    Steps of the implicit Euler method with growing sizes first follow this slow motion and then become those of Newton's
+    method. Newton's method alone leads from most starts to unstable regimes if there are many masses.
     """
     if balance.unbalance.size <= MAX_COMPLETE:
         return x

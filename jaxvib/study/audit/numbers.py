@@ -66,7 +66,7 @@ def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -
 def gravity_share(radius: float, omega: float, g: float = _G) -> float:
     """Return g/(R Omega^2): the share of gravity in the normal force of a load at `radius` R m that turns at `omega` rad/s.
 
-    >>> round(100.0 * gravity_share(0.08, 169.6), 3)      # per cent, of the published rotor's pendulums in their first jam
+    >>> round(100.0 * gravity_share(0.08, 169.6), 3)      # percent, of the published rotor's pendulums in their first jam
     0.426
 
     Source: Artyunin and Sumenkov 2019, who state that it is below 0.5 %. This is true for load speeds above sqrt(g/(0.005 R)),

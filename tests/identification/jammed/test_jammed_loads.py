@@ -174,7 +174,7 @@ def test_further_run_with_jammed_loads_is_predicted():
     np.testing.assert_allclose(found.ratio, 1.0, atol=0.1)
     other = jv.predict_run(fitted(), jammed_record(JAMMED_NOISE, rng, impact=-0.15, drag=1.52))
     assert other.status_name == "contradicted"
-    assert other.notes[-1].endswith("too much to name a number") and np.min(other.ratio) > 5.0
+    assert other.notes[-1].endswith("too much to name a parameter") and np.min(other.ratio) > 5.0
 
 
 @pytest.mark.slow

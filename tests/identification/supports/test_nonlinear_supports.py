@@ -245,7 +245,7 @@ def test_further_run_on_a_stop_is_predicted():
     assert found.status_name == "predicted" and found.p_value > 1e-3, found.notes
     np.testing.assert_allclose(found.ratio, 1.0, atol=0.15)
     other = jv.predict_run(fitted(), slower_record(2, **{"effects.stop[0].gap": 1.02e-3}))
-    assert other.status_name == "contradicted" and other.notes[-1].endswith("too much to name a number")
+    assert other.status_name == "contradicted" and other.notes[-1].endswith("too much to name a parameter")
 
 
 def test_stop_that_no_run_touches_is_not_determined():

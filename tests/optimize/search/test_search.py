@@ -240,7 +240,7 @@ def test_robust_design_is_better_on_other_samples():
 
 
 def test_influences_on_a_tiny_objective_have_its_unit():
-    """The objective nearly vanishes at the best machine, so that per cent of it mean nothing."""
+    """The objective nearly vanishes at the best machine, so that a percentage of it means nothing."""
     result = found(DesignSpace(SCENE, FREE), NEAREST + Quantity("rest", "N^2/m^2", lambda s: jnp.asarray(1e-3)))
     lines = [line for line in result.findings() if "1 % less / more" in line]
     assert len(lines) == 2
