@@ -197,8 +197,7 @@ class VibrationMeasures(Readable):
 
     @property
     def isolation_efficiency(self) -> Array:
-        """Share of the exciter's force that does not reach the foundation: 1 - transmissibility, negative if the
-        transmissibility is above 1."""
+        """Share of the exciter's force that does not reach the foundation, 1 - transmissibility; below 0 if that is above 1."""
         return 1.0 - self.transmissibility
 
     def notes(self) -> list[str]:
