@@ -7,6 +7,7 @@ from typing import Literal, Union
 
 import jax
 import jax.numpy as jnp
+import matplotlib.figure
 import numpy as np
 import pytest
 from jax import Array
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.boundary import _alternatives, call_user, is_real, is_whole, validated
+from jaxvib.boundary import Axes, Figure, _alternatives, call_user, is_real, is_whole, validated
 from jaxvib.errors import require_path
 from jaxvib.units import Number
 
@@ -159,6 +160,20 @@ def twice(sizes: Sequence[float] = ()) -> list[float]:
 
 def test_an_array_in_place_of_a_list_becomes_a_list():
     assert twice(np.zeros(0)) == [0.0] and twice(np.ones(2)) == twice(jnp.ones(2)) == [2.0, 2.0]
+
+
+@validated
+def drawn_on(ax: Axes, figure: Figure | None = None) -> str:
+    return "drawn"
+
+
+def test_objects_of_matplotlib_are_known_without_its_import():
+    figure = matplotlib.figure.Figure()
+    assert drawn_on(figure.subplots(), figure) == "drawn"
+    with pytest.raises(jv.InputError, match=r"^ax is <Figure .*>; it must be an Axes, of matplotlib$"):
+        drawn_on(figure)
+    with pytest.raises(jv.InputError, match=r"^figure is 3; it must be a Figure, of matplotlib$"):
+        drawn_on(figure.axes[0], 3)
 
 
 def test_figures_of_a_report_are_checked_before_it_is_written(tmp_path):
