@@ -114,6 +114,7 @@ from jaxvib.motion.plan import Tolerance as Tolerance, Accuracy as Accuracy, Equ
 from jaxvib.motion.run import Run as Run, RunStatus as RunStatus
 from jaxvib.motion.envelope.result import Envelope as Envelope, EnvelopeStatus as EnvelopeStatus
 from jaxvib.motion.envelope.run_up import MotorRunUp as MotorRunUp, MotorRunUpStatus as MotorRunUpStatus
+from jaxvib.motion.analysis.ensemble_regimes import EnsembleRegimes as EnsembleRegimes
 from jaxvib.motion.ensemble import Ensemble as Ensemble
 from jaxvib.results.estimate import Share as Share
 from jaxvib.motion.analysis.regime import Regime as Regime, RegimeName as RegimeName

@@ -138,6 +138,15 @@ RESULTS = {
     "Run": cached(lambda: jv.simulate(SCENE, 2.0, start="jam", mode=1, samples=32)),
     "Regime": lambda: RESULTS["Run"]().regime,
     "Ensemble": lambda: jv.ensemble(at_speed, jnp.linspace(40.0, 80.0, 3), 1.0, stepsize_controller=jv.EqualSteps(64)),
+    "EnsembleRegimes": lambda: (
+        jv.ensemble(
+            lambda n: eqx.tree_at(lambda s: s.exciters[1].drive.speed, SCREEN, n),
+            jnp.array([90.0, 100.0]),
+            1.0,
+            stepsize_controller=jv.EqualSteps(400),
+            estimate=False,
+        ).regimes
+    ),
     "Envelope": lambda: jv.envelope(SCENE, 2.0, samples=16),
     "MotorRunUp": lambda: jv.run_up(SCREEN, 2.0),
     "JamModes": cached(lambda: jv.jam_modes(SCENE)),

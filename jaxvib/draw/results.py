@@ -285,6 +285,21 @@ def points_chart(values: np.ndarray, *, x_label: str, y_label: str, ax: Axes | N
     return figure if ax is None else ax
 
 
+def shares_chart(
+    share: np.ndarray, low: np.ndarray, high: np.ndarray, *, names: Sequence[str], ax: Axes | None = None
+) -> Drawn:
+    """Draw shares (n,), %, as bars with their intervals from `low` to `high`.
+
+    >>> import numpy as np
+    >>> shares_chart(np.array([75.0]), np.array([70.0]), np.array([79.0]), names=["regime 1"]).axes[0].get_ylabel()
+    'share of the runs, %'
+    """
+    figure, (axis,) = panels(1, size=(5.0, 3.2), ax=ax)
+    axis.bar(names, share, width=0.6, color=COLORS[0], yerr=[share - low, high - share], capsize=4.0)
+    axis.set(ylabel="share of the runs, %", ylim=(0.0, 100.0))
+    return figure if ax is None else ax
+
+
 def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Drawn:
     """Draw Floquet multipliers (n,) in the complex plane with the unit circle.
 

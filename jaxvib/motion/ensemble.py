@@ -21,6 +21,13 @@ from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.ensemble_regimes import (
+    MAX_RELATIVE_ROTATION,
+    EnsembleRegimes,
+    RotatingMasses,
+    regimes_of_runs,
+    rotating_masses,
+)
 from jaxvib.motion.analysis.measure import turning_angles, turning_directions
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
 from jaxvib.motion.batch import advance, batch_size, divide_run, pack_batch
@@ -42,10 +49,6 @@ from jaxvib.units import Number
 _EQUAL_SPEEDS, _SPEED_GAP, _MAX_SHOWN_GROUPS = 0.01, 0.03, 6
 """Largest difference of the mean speeds of the masses of a run that count as equal, and smallest gap between two groups of
 runs, both relative to the largest speed; largest number of groups in the summary."""
-
-_MAX_RELATIVE_ROTATION = 0.5
-"""Largest `Ensemble.relative_rotation` of a run whose masses turn at one speed, rad. The value lies between that of a small
-swing about constant phases and that of a slow drift of the phases."""
 
 _Ends: TypeAlias = tuple[State, Array, Array, Array, Array, Array]
 """Results of `_run`, for one run or for many."""
@@ -85,6 +88,8 @@ class Ensemble(Result):
     - `relative_rotation` (B,), rad: largest difference between the angles through which two masses turn, each in its
       direction, in the last quarter of the run. A mass is a load, or the rotor of an exciter without loads. The difference is 0
       for a scene with one exciter
+    - `masses`: for several exciters, the `RotatingMasses` of each run: angle turned in the last quarter, phase at the end, and
+      the resonance that catches the mass; `regimes` names the motions that follow from them. None for one exciter
     - `speed_group` (B,): groups of runs by the speed of their masses, from 1, ascending; 0 for runs with different speeds
     - `error` (B,): estimated error of the final state, as for a `Run`, with displacements relative to the largest displacement
       of the same run; typical: below 1e-6 with the default steps. NaN if no estimate was requested or the motion did not stay
@@ -108,6 +113,7 @@ class Ensemble(Result):
     detached: Array = eqx.field(metadata=in_unit("", "run", "load"))
     steps: Array = eqx.field(metadata=in_unit(""))
     seconds: Array = eqx.field(metadata=in_unit("s"))
+    masses: RotatingMasses | None = eqx.field(default=None, metadata=part("run"))
 
     @property
     def status(self) -> EnsembleStatus:
@@ -124,12 +130,23 @@ class Ensemble(Result):
     def synchronous(self) -> Array:
         """True for runs (B,) whose exciters turn at one speed: the motion stayed finite and `relative_rotation` is below
         0.5 rad."""
-        return self.finite & (self.relative_rotation < _MAX_RELATIVE_ROTATION)
+        return self.finite & (self.relative_rotation < MAX_RELATIVE_ROTATION)
 
     @property
     def synchronous_share(self) -> Share:
         """Share of `synchronous` runs, with its confidence interval of 95 %."""
         return estimate_share(self.synchronous)
+
+    @property
+    def regimes(self) -> EnsembleRegimes:
+        """Regimes of the runs of a machine with several exciters, with their shares, see `EnsembleRegimes`.
+
+        **Raises** `InputError` for one exciter.
+        """
+        if self.masses is None:
+            problem = "has runs of a machine with one exciter; regimes are those of several exciters"
+            raise InputError("ensemble", f"{problem}; for one exciter use speed_group, and regime of single runs")
+        return regimes_of_runs(self.masses, np.asarray(self.load_speed), np.asarray(self.finite))
 
     @property
     def speed_group(self) -> np.ndarray:
@@ -170,10 +187,15 @@ class Ensemble(Result):
             return head
         speeds, error = np.asarray(self.load_speed)[finite], np.asarray(self.error)[finite]
         worst = "error not estimated" if np.all(np.isnan(error)) else f"error of the end states up to {np.nanmax(error):.1e}"
-        lines = [head, f"  loads turn at {speed_text([np.min(speeds), np.max(speeds)], 6, ' .. ')}; {worst}"]
-        lines += self._group_lines()
-        if np.any(np.asarray(self.relative_rotation) > 0.0):
-            lines.append(f"  all masses of a run turn at one speed: {self.synchronous_share.text}")
+        turning = "loads" if self.masses is None else "masses"
+        lines = [head, f"  {turning} turn at {speed_text([np.min(speeds), np.max(speeds)], 6, ' .. ')}; {worst}"]
+        if self.masses is None:
+            return "\n".join(lines + self._group_lines())
+        shown = self.regimes.summary().splitlines()
+        lines += [f"  {line}" for line in shown[:_MAX_SHOWN_GROUPS]]
+        if len(shown) > _MAX_SHOWN_GROUPS:
+            lines.append(f"  {len(shown) - _MAX_SHOWN_GROUPS} more regimes in regimes.summary()")
+        lines.append(f"  all masses of a run turn at one speed: {self.synchronous_share.text}")
         return "\n".join(lines)
 
     @validated
@@ -261,13 +283,25 @@ def ensemble(
     if not plan.is_allowed:
         numbers = last, load_speed, error, finite, resolved, detached
         last, load_speed, error, finite, resolved, detached = jax.vmap(without_numbers)(plan.allowed, numbers)
-    relative_rotation = np.zeros(plan.allowed.shape, plan.end.dtype)
+    relative_rotation, masses = np.zeros(plan.allowed.shape, plan.end.dtype), None
     if len(plan.scenes.exciters) > 1:
-        turned = load_speed * turning_directions(plan.scenes) * (plan.end / ENSEMBLE_PARTS)
-        relative_rotation = jnp.max(turned, axis=1) - jnp.min(turned, axis=1)
+        masses = rotating_masses(plan.scenes, last, load_speed, plan.end, plan.end / ENSEMBLE_PARTS)
+        relative_rotation = jnp.max(masses.rotation, axis=1) - jnp.min(masses.rotation, axis=1)
     result = Ensemble(
         *on_device(
-            (last, load_speed, relative_rotation, error, plan.allowed, finite, resolved, detached, step_counts[0], unknown)
+            (
+                last,
+                load_speed,
+                relative_rotation,
+                error,
+                plan.allowed,
+                finite,
+                resolved,
+                detached,
+                step_counts[0],
+                unknown,
+                masses,
+            )
         )
     )
     if not plan.is_known:

@@ -19,6 +19,7 @@ from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import first_moment, lifting_torques, start_notes, validate_scene
+from jaxvib.motion.analysis.ensemble_regimes import catching_resonance
 from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.motion.envelope.result import Envelope, plot_histories
 from jaxvib.motion.start import initial_state
@@ -27,13 +28,6 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import member, status_name
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.units import Number, number
-
-_BELOW_RESONANCE = 1.05
-"""Speed, relative to a natural frequency, up to which an exciter counts as not having passed the resonance. Exciters are caught
-slightly below the natural frequency."""
-
-_WORKING_SHARE = 0.95
-"""Largest natural frequency, relative to the no-load speed of a motor, that counts as a resonance of its run-up."""
 
 _SAMPLES = 4096
 """Number of stored times of a run-up, from which peaks are read."""
@@ -276,11 +270,9 @@ def _judgement(scene: Scene, run: Envelope, resonances: np.ndarray) -> tuple[np.
     """Return the speed of each exciter, the number of the resonance that catches it, and the name of the status."""
     directions = np.array([exciter.direction for exciter in scene.exciters])
     speed = directions * np.array([float(np.mean(np.asarray(n))) for n in run.window.rotor_speeds])
-    caught = np.zeros(len(speed), int)
-    for k, exciter in enumerate(scene.exciters):
-        on_the_way = resonances < _WORKING_SHARE * float(exciter.drive.speed)
-        missed = np.flatnonzero(on_the_way & ~(speed[k] > _BELOW_RESONANCE * resonances))
-        caught[k] = 0 if exciter.drive.ideal or missed.size == 0 else missed[0] + 1
+    drives = [exciter.drive for exciter in scene.exciters]
+    numbers = [catching_resonance(*each, resonances) for each in zip(speed, [drive.speed for drive in drives], strict=True)]
+    caught = np.where([drive.ideal for drive in drives], 0, np.asarray(numbers))
     name = status_name(run.status)
     if name == "not_turning":
         return speed, caught, "not_turning"
