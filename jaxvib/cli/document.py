@@ -21,6 +21,9 @@ SEPARATION = click.option(
 _DECK_KEY = "jaxvib.deck_point"
 """Key of the values of --deck and --slope in the context of click."""
 
+_MAX_DECK_SIZES = 20
+"""Largest coordinate of a point of the deck, relative to the largest one of supports and exciters."""
+
 _NOTED_KEY = "jaxvib.noted_measures"
 """Key in the context of click. Its value is True if a note about implausible measures was printed."""
 
@@ -99,11 +102,25 @@ def deck_of_options() -> dict[str, Any]:
 
 
 def require_deck_options(scene: jv.Scene) -> None:
-    """**Raises** `InputError` for the options of the deck with a machine that is not a body in a plane."""
+    """**Raises** `InputError` for the options of the deck with a machine that is not a body in a plane, and for points far
+    outside of the machine, which are in another unit."""
     deck = deck_of_options()
     if deck and scene.machine.places != "plane":
         option = "--deck" if "at" in deck else f"--{next(iter(deck))}"
         raise InputError(option, f"is for bodies in a plane, not for a machine of kind '{scene.machine.kind}'; leave it out")
+    for x, y in deck.get("at", []):
+        size = largest_coordinate(scene)
+        if max(abs(x), abs(y)) > _MAX_DECK_SIZES * size:
+            problem = f"is the point ({x:g}, {y:g}) m, more than {_MAX_DECK_SIZES} times as far from the centre of mass as any "
+            advice = f"numbers without a unit are metres; for millimetres write '{x:g} mm,{y:g} mm'"
+            raise InputError("--deck", f"{problem}support or exciter ({size:.3g} m); {advice}")
+
+
+def largest_coordinate(scene: jv.Scene) -> float:
+    """Return the largest coordinate of the supports and exciters of bodies in a plane, m, at least 0.1 m."""
+    supports = getattr(scene.machine, "supports")  # noqa: B009
+    places = [support.at for support in supports] + [exciter.position for exciter in scene.exciters]
+    return max([0.1, *(float(abs(x)) for place in places if place is not None for x in place)])
 
 
 def run_measures(run: jv.Run | jv.Envelope) -> jv.VibrationMeasures | None:

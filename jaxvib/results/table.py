@@ -195,6 +195,11 @@ def _lines(path: Path, max_lines: int | None = None) -> Iterator[tuple[int, str]
             if file.seek(0, io.SEEK_END) > _MAX_BYTES:
                 raise InputError(str(path), f"is larger than {_MAX_BYTES >> 20} MB; give the path of a CSV file")
             file.seek(0)
+            if file.read(2) == b"PK":
+                problem = "is an archive, such as a saved result, not a recording"
+                advice = 'write the run to a CSV file, as by run.to_pandas("time").to_csv("run.csv", index=False)'
+                raise InputError(str(path), f"{problem}; give the path of a CSV file ({advice})")
+            file.seek(0)
             text = io.TextIOWrapper(file, encoding="utf-8-sig")
             for k in itertools.count(1) if max_lines is None else range(1, max_lines + 1):
                 line = text.readline(_MAX_LINE + 1)

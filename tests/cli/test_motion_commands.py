@@ -361,6 +361,11 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     assert (
         "--deck is '0.4'; give X,Y from the centre of mass, m, such as" in typed("regimes", "screen.toml", "--deck", "0.4")[2]
     )
+    code, _, err = typed("regimes", "screen.toml", "--deck", "400,100")
+    assert (
+        code == 2 and "(400, 100) m, more than 20 times as far from the centre of mass as any support or exciter (0.6 m)" in err
+    )
+    assert "numbers without a unit are metres; for millimetres write '400 mm,100 mm'" in err
     shown = float(out.split("throw number ")[1].split(",")[0])
     scene = jv.load_scene(tmp_path / "screen.toml")
     np.testing.assert_allclose(shown, jv.working_regime(scene).ellipse((0.4, 0.1), slope="-5 deg").throw_number, rtol=5e-3)

@@ -70,10 +70,13 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.machine.files import read_toml
+    from jaxvib.results.table import read_table
     from jaxvib.study.bearing.identify import identify_bearing
     from jaxvib.study.bearing.measurement import measurement_from_tables
 
     is_file = record.suffix.lower() == ".toml"
+    if not is_file:
+        read_table(record, "time and angle of a pendulum")  # a wrong file is refused before the missing numbers of the pendulum
     tables: Tables = read_toml(record) if is_file else {"record": {"file": record.name}}
     if not {"machine", "run", "channel"}.isdisjoint(tables):
         _identify_machine(tables, record.parent, output, [name for name, value in given.items() if value is not None])
