@@ -34,6 +34,10 @@ ELECTRICAL = "rad/s of a supply"
 """Unit of frequencies that are shown in Hz where speeds are shown in rpm."""
 
 
+GRAVITIES = "g0"
+"""Unit of accelerations relative to that of gravity, 9.80665 m/s^2."""
+
+
 class _CurrentUnits:
     """Display units of this process: that of speeds, and True in `si` for SI units of all other quantities."""
 
@@ -100,6 +104,10 @@ def shown_unit(unit: str, size: float) -> tuple[str, float]:
         return "N/mm", 1e-3
     if unit in ("m", "meter") and 0.0 < size < 1.0:
         return ("mm", 1e3) if size >= 1e-5 else ("um", 1e6)
+    if unit == "m/s" and 0.0 < size < 1.0:
+        return "mm/s", 1e3
+    if unit == GRAVITIES:
+        return "g", 1.0
     if unit == "rad":
         return "deg", 180.0 / np.pi
     if unit == "kg" and 0.0 < size < 1.0:

@@ -13,12 +13,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import equinox as eqx
+import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.display import Figure
 from jaxvib.errors import written
 from jaxvib.machine.scene import Scene
-from jaxvib.report.tables import Units, accuracy_table, escaped, in_display_units, parameter_tables, result_tables
+from jaxvib.report.tables import COMPLEX, Units, accuracy_table, escaped, in_display_units, parameter_tables, result_tables
 from jaxvib.results.fields import Plain, as_dict
 from jaxvib.results.result import Result
 from jaxvib.steady.measures import VibrationMeasures
@@ -127,12 +128,14 @@ def units_of_document(document: Mapping[str, Plain], result: eqx.Module | None) 
 
 
 def units_of(result: eqx.Module) -> dict[str, str]:
-    """Return the units of the numbers of a result and of its parts, by the names of their fields."""
+    """Return the units of the numbers of a result and of its parts, by the names of their fields; those of complex numbers end
+    in `COMPLEX`."""
     units: dict[str, str] = {}
     for field_of_result in dataclasses.fields(result):
         value = getattr(result, field_of_result.name)
         if field_of_result.metadata.get("unit"):
-            units.setdefault(field_of_result.name, field_of_result.metadata["unit"])
+            mark = COMPLEX if np.iscomplexobj(value) else ""
+            units.setdefault(field_of_result.name, f"{field_of_result.metadata['unit']}{mark}")
         elif "part" in field_of_result.metadata and isinstance(value, eqx.Module):
             for name, unit in units_of(value).items():
                 units.setdefault(name, unit)

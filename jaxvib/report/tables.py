@@ -5,12 +5,12 @@ from __future__ import annotations
 import html
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TypeAlias, TypeGuard, cast
 
 import equinox as eqx
 
-from jaxvib.display import quantity_text, shown_unit
+from jaxvib.display import GRAVITIES, quantity_text, shown_unit
 from jaxvib.machine.files import EFFECTS, scene_to_toml
 from jaxvib.machine.numbers import number_specs
 from jaxvib.machine.scene import Exciter, Scene
@@ -38,6 +38,13 @@ _MAX_ROWS = 200
 """Maximum number of rows of a table."""
 
 
+_GRAVITIES_TEXT = "g = 9.80665 m/s²"
+"""Unit of accelerations in reports."""
+
+COMPLEX = ", complex"
+"""End of the unit of complex numbers, see `in_display_units`."""
+
+
 def escaped(text: object) -> str:
     """Return a text with escaped special characters of HTML."""
     return html.escape(str(text), quote=True)
@@ -50,7 +57,7 @@ def in_display_units(
 
     Each name has one unit. It is chosen for the largest value with this name in the document, including lists and rows of
     tables. Values at the coordinates of a machine have a unit such as "m or rad"; if the `coordinate_units` differ, each value
-    is a text with its own unit.
+    is a text with its own unit. Units of complex numbers, which are pairs in the document, end in `COMPLEX`.
 
     >>> in_display_units({"omega": 10.0, "jams": [{"amplitude": [0.002]}]}, {"omega": "rad/s", "amplitude": "m"})
     ({'omega': 95.49296585513721, 'jams': [{'amplitude': [2.0]}]}, {'omega': 'rpm', 'amplitude': 'mm'})
@@ -58,10 +65,11 @@ def in_display_units(
     ({'amplitude': ['2 mm', '1 mm', '0.572958 deg']}, {'amplitude': ''})
     """
     kinds = {"m": 0, "rad": 1}
+    pairs = {name for name, unit in units.items() if unit.endswith(COMPLEX)}
+    units = {name: unit.removesuffix(COMPLEX) for name, unit in units.items()}
     if len(set(coordinate_units)) == 1:
         units = {name: _choice(unit, kinds[coordinate_units[0]]) for name, unit in units.items()}
-    # Two numbers could also be the real and the imaginary part of one number.
-    mixed = {name for name, unit in units.items() if " or " in unit and len(coordinate_units) > 2}
+    mixed = {name for name, unit in units.items() if " or " in unit and len(set(coordinate_units)) > 1}
     sizes = dict.fromkeys(units, 0.0)
 
     def note_size(name: str, x: float, place: tuple[int, int]) -> float:
@@ -74,10 +82,11 @@ def in_display_units(
             return quantity_text(x, _choice(units[name], kinds[coordinate_units[k]] if count else 0), 6)
         return shown[name][1] * x if name in shown else x
 
-    _map_numbers(document, "", note_size)
+    _map_numbers(document, "", note_size, pairs)
     shown = {name: ("", 1.0) if name in mixed else shown_unit(unit, sizes[name]) for name, unit in units.items()}
-    scaled = _map_numbers(document, "", shown_number)
-    return cast("Mapping[str, Plain]", scaled), {name: unit for name, (unit, _) in shown.items()}
+    scaled = _map_numbers(document, "", shown_number, pairs)
+    named = {name: _GRAVITIES_TEXT if units[name] == GRAVITIES else unit for name, (unit, _) in shown.items()}
+    return cast("Mapping[str, Plain]", scaled), named
 
 
 def _choice(unit: str, kind: int) -> str:
@@ -89,14 +98,19 @@ def _map_numbers(
     value: Plain | Mapping[str, Plain],
     name: str,
     convert: Callable[[str, float, tuple[int, int]], float | str],
+    pairs: Collection[str],
     place: tuple[int, int] = (0, 0),
 ) -> Plain:
     """Apply `convert` to all numbers of a plain value except Booleans. Its arguments are the name, the number, and a pair: the
-    index of the number in its list and the length of the list, (0, 0) outside lists."""
+    index of the number in its list and the length of the list, (0, 0) outside lists. For the names in `pairs`, the innermost
+    lists are complex numbers, and the index is that of the complex number."""
     if isinstance(value, Mapping):
-        return {key: _map_numbers(entry, key, convert) for key, entry in value.items()}
+        return {key: _map_numbers(entry, key, convert, pairs) for key, entry in value.items()}
     if isinstance(value, list):
-        return [_map_numbers(entry, name, convert, (k, len(value))) for k, entry in enumerate(value)]
+        is_number = name in pairs and not any(isinstance(entry, list) for entry in value)
+        return [
+            _map_numbers(entry, name, convert, pairs, place if is_number else (k, len(value))) for k, entry in enumerate(value)
+        ]
     return convert(name, value, place) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
 
 

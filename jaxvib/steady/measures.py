@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import quantity_text
+from jaxvib.display import GRAVITIES, quantity_text
 from jaxvib.equations.jammed_bodies import friction_on_light_loads
 from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model, peak_force, rotating_direction
 from jaxvib.equations.torque_balance import resultant_of
@@ -174,7 +174,7 @@ class VibrationMeasures(Readable):
 
     speed: Array = eqx.field(metadata=in_unit("rad/s"))
     stroke: Array = eqx.field(metadata=in_unit("m", "translation"))
-    acceleration: Array = eqx.field(metadata=in_unit("", "translation"))
+    acceleration: Array = eqx.field(metadata=in_unit(GRAVITIES, "translation"))
     velocity: Array = eqx.field(metadata=in_unit("m/s", "translation"))
     exciter_force: Array = eqx.field(metadata=in_unit("N"))
     transmissibility: Array = eqx.field(metadata=in_unit(""))
@@ -187,7 +187,7 @@ class VibrationMeasures(Readable):
     power: Array = eqx.field(metadata=in_unit("W", "exciter"))
     point: Array | None = eqx.field(metadata=in_unit("m", "direction"), default=None)
     point_stroke: Array | None = eqx.field(metadata=in_unit("m"), default=None)
-    point_acceleration: Array | None = eqx.field(metadata=in_unit(""), default=None)
+    point_acceleration: Array | None = eqx.field(metadata=in_unit(GRAVITIES), default=None)
     throw_angle: Array | None = eqx.field(metadata=in_unit("rad"), default=None)
     throw_number: Array | None = eqx.field(metadata=in_unit(""), default=None)
     conveying_speed: Array | None = eqx.field(metadata=in_unit("m/s"), default=None)

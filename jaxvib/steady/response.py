@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import Drawn, Onto, SpeedUnit, quantity_text, speed_text
+from jaxvib.display import GRAVITIES, Drawn, Onto, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.averaged import AVERAGED_TERMS, decays, require_rotating_masses
 from jaxvib.equations.linear import peak_force
 from jaxvib.equations.torque_balance import UnbalancedModel, common_speeds, common_torques, unbalanced_model
@@ -80,7 +80,7 @@ class AbstractResponse(Readable):
     displacement: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
     amplitude: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
     phase: Array = eqx.field(metadata=in_unit("rad", "*", "coordinate"))
-    acceleration: Array = eqx.field(metadata=in_unit("", "*", "translation"))
+    acceleration: Array = eqx.field(metadata=in_unit(GRAVITIES, "*", "translation"))
     velocity: Array = eqx.field(metadata=in_unit("m/s", "*", "translation"))
     exciter_force: Array = eqx.field(metadata=in_unit("N", "*"))
     foundation_force: Array = eqx.field(metadata=in_unit("N", "*"))

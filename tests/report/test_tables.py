@@ -7,7 +7,7 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.machine.files import SCREENS
-from jaxvib.report.tables import accuracy_table, in_display_units, parameter_tables, result_tables
+from jaxvib.report.tables import COMPLEX, accuracy_table, in_display_units, parameter_tables, result_tables
 from jaxvib.results.fields import plain
 
 UNITS = {"force": "N", "rows": "m"}
@@ -68,6 +68,16 @@ def test_values_of_coordinates_have_their_own_units():
     shown, units = in_display_units(document, units, ("m", "m", "rad"))
     assert cells(result_tables(shown, units), "th") == ["amplitude", "margin", "amplitude"]
     assert cells(result_tables(shown, units)) == ["2 mm, 1.5 mm, 0.572958 deg", "inf", "3 mm"]
+
+
+def test_two_coordinates_have_their_own_units():
+    units = {"amplitude": "m or rad", "displacement": f"m or rad{COMPLEX}"}
+    document = {"amplitude": [0.002, 0.01], "displacement": [[0.002, 0.001], [0.01, 0.0]]}
+    shown, _ = in_display_units(document, units, ("m", "rad"))
+    assert shown["amplitude"] == ["2 mm", "0.572958 deg"]
+    assert shown["displacement"] == [["2 mm", "1 mm"], ["0.572958 deg", "0 deg"]]
+    shown, units = in_display_units(document, units, ("m", "m"))
+    assert units == {"amplitude": "mm", "displacement": "mm"} and shown["displacement"] == [[2.0, 1.0], [10.0, 0.0]]
 
 
 def test_reports_show_infinite_numbers_that_json_omits():
