@@ -274,8 +274,8 @@ class DesignSpace(Readable):
         return {n.name: (n.leaf(scene) if n.entry is None else n.leaf(scene)[n.entry]).tolist() for n in self.free}
 
     def words(self) -> list[tuple[str, str]]:
-        """Return the name for tables and the SI unit of each free parameter."""
-        return [(word, each.unit) for each in self.free for word in each.words(self.scene)]
+        """Return the name for tables and the unit for `jaxvib.display.shown_unit` of each free parameter."""
+        return [(word, each.unit_of_tables) for each in self.free for word in each.words(self.scene)]
 
     @validated
     def within(self, low: np.ndarray, high: np.ndarray) -> DesignSpace:

@@ -427,7 +427,8 @@ def _table(
         start, end = (np.asarray(number.read(each)) for each in (space.scene, scene))
         is_new = number.spec.zero_is_absent & (start == 0.0) & (end != 0.0)
         for word, new, a, b in zip(number.words(space.scene), is_new, start, end, strict=True):
-            table.append(Row(f"{word}{' (new)' * bool(new)}{mark}", number.unit, float(a), float(b), math.nan, math.nan))
+            what = f"{word}{' (new)' * bool(new)}{mark}"
+            table.append(Row(what, number.unit_of_tables, float(a), float(b), math.nan, math.nan))
     if space.counts:
         counts = float(space.scene.loads.count), float(scene.loads.count)
         table.append(Row("number of loads", "", *counts, math.nan, math.nan))

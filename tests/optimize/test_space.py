@@ -7,6 +7,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
+from jaxvib.display import shown_unit
 from jaxvib.machine.files import SCREENS, scene_from_toml
 from optimize import DesignSpace, hold, jam_frequency, total
 
@@ -187,3 +188,14 @@ def test_designs_of_wrong_size_are_refused(wrong):
             ask(wrong)
     with pytest.raises(jv.InputError, match=r"^scene is 3; it must be a Scene"):
         jam_frequency(mode=3)(3)
+
+
+def test_frequencies_of_a_supply_are_shown_in_hertz():
+    motor = jv.NamePlateMotor("7.5 kW", "1470 rpm", 2.5, 0.2, frequency="50 Hz")
+    screen = scene_from_toml(SCREENS["circular_screen"])
+    screen = eqx.tree_at(lambda s: s.exciters[0].drive, screen, motor)
+    space = DesignSpace(screen, {"drive.frequency": ("45 Hz", "60 Hz")})
+    ((words, unit),) = space.words()
+    name, factor = shown_unit(unit, 314.0)
+    assert words.startswith("frequency of the supply") and name == "Hz"
+    np.testing.assert_allclose(100.0 * np.pi * factor, 50.0, rtol=1e-12)

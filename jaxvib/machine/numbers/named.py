@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.display import ELECTRICAL
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drives.drive import Drive
@@ -61,6 +62,11 @@ class NamedNumber(NamedTuple):
     def unit(self) -> str:
         """Unit of the parameter, or of all entries."""
         return self.spec.units[self.entry if self.entry is not None and len(self.spec.units) > 1 else 0]
+
+    @property
+    def unit_of_tables(self) -> str:
+        """Unit for `jaxvib.display.shown_unit`."""
+        return ELECTRICAL if self.spec.electrical else self.unit
 
     @property
     def entries(self) -> set[tuple[_Path, int]]:
