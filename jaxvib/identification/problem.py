@@ -17,7 +17,7 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.angle import RotorAngle, rotor_angles
 from jaxvib.identification.records.agreement import ROTOR_KINDS
-from jaxvib.identification.records.channel import Channel
+from jaxvib.identification.records.channel import Channel, gain_errors
 from jaxvib.identification.records.decimation import MIN_SAMPLES, decimated
 from jaxvib.identification.response import BLOCK, STRETCH, Samples, Unknowns, rows_of_channel, state_count
 from jaxvib.identification.run import MeasuredRun
@@ -194,7 +194,7 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     angles = [rotor_angles(_changed(scene, run), run) for run in runs]
     notes += [note for each in angles for angle in each for note in angle.notes]
     marked = [all(angle.marked for angle in each) for each in angles]
-    gains = {c.name: c.gain_error for run in runs for c in run.of_kind(*MOTIONS) if c.gain_error > 0.0}
+    gains = gain_errors(channel for run in runs for channel in run.of_kind(*MOTIONS))
     # With several exciters, each drive's schedule fixes its angle in every run.
     turns = [k for k, is_marked in enumerate(marked) if k and not (is_marked and marked[0]) and len(scene.exciters) == 1]
     arrays = jnp.asarray(values), jnp.asarray(scale), jnp.asarray(positive)

@@ -204,6 +204,22 @@ def test_unknowns_with_their_known_values():
     np.testing.assert_allclose(found.runs[1].scene(found.scene).machine.link_stiffness, [9e4])
 
 
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        (
+            channel("a", gain_error=0.03),
+            "channel 'a': gain_error is 0.02 in one run and 0.03 in another, but channels with the",
+        ),
+        (channel("a", kind="displacement", gain_error=0.02), "channel 'a': kind is 'velocity' in one run and 'displacement'"),
+    ],
+)
+def test_one_name_of_two_sensors_is_refused(other, words):
+    runs = [run_with({"a": np.sin(T)}, channels=[each]) for each in (channel("a", gain_error=0.02), other)]
+    with pytest.raises(jv.InputError, match=words):
+        build_problem(scene_of(), runs, ["machine.stiffness"], {})
+
+
 def test_readings_of_the_motion_before_the_record_do_not_count():
     run = run_with({"a": np.sin(T), "b": np.sin(T)}, channels=[channel("a", delay=0.0695), channel("b")])
     (mask,) = build_problem(scene_of(), [run], ["machine.stiffness"], {}).masks

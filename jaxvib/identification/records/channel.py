@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -42,7 +42,8 @@ class Channel(Readable):
 
     **Arguments**
 
-    - `name` of the column or channel in the file
+    - `name` of the column or channel in the file. It also names the sensor: channels of several runs with the same name have
+      the same gain in `identify`, wherever they are
     - `kind`: "acceleration", "velocity", "displacement", "force" (on the foundation), "pulses" (of a tachometer), "speed",
       "angle" or "torque" of the rotor, "current" of the motor
     - `at`: number of the platform, from 1, or (x, y), m, of a point of a body, for kinds that measure a motion; default: the
@@ -123,6 +124,26 @@ class Channel(Readable):
     def factor(self) -> float:
         """Factor from the channel's unit to SI; 1 for a channel without a unit."""
         return 1.0 if self.unit is None or self.kind == "pulses" else unit_factor(self.unit, UNITS[self.kind]) or 1.0
+
+
+def gain_errors(channels: Iterable[Channel]) -> dict[str, float]:
+    """Return the standard uncertainty of the gain of each sensor whose gain is uncertain, by the name of its channels.
+
+    **Raises** `InputError` for channels with the same name that are not of one sensor.
+    """
+    sensors: dict[str, Channel] = {}
+    for channel in channels:
+        first = sensors.setdefault(channel.name, channel)
+        for field in ("kind", "gain_error"):
+            one, other = getattr(first, field), getattr(channel, field)
+            if one != other:
+                problem = (
+                    f"is {quoted(one)} in one run and {quoted(other)} in another, but channels with the same name have one"
+                )
+                raise InputError(
+                    f"channel {quoted(channel.name)}: {field}", f"{problem} gain; give different sensors different names"
+                )
+    return {name: channel.gain_error for name, channel in sensors.items() if channel.gain_error > 0.0}
 
 
 def _known(value: Number, unit: str, field: str) -> float:
