@@ -224,6 +224,7 @@ def _with_torque_balance(fitted: Fitted, motor: list[int]) -> tuple[Fitted, list
         x=x,
         linear=linear,
         information=information,
+        prior=prior_equations(problem, x, linear)[0],
         differences=tuple(differences_of(problem, x, linear)),
         converged=converged,
         misfits=tuple(float(np.std(_deviations_of(problem, run, y)[0]) / run.rotor.scatter) for run in runs),

@@ -9,8 +9,10 @@ import pytest
 from run_ups_by_scipy import TRUTH, line_torque, motor_run_up, record, scene_of
 
 import jaxvib as jv
+from jaxvib.identification import torque
+from jaxvib.identification.fit import information_at
 from jaxvib.identification.problem import build_problem
-from jaxvib.identification.torque import _predicted_drive, _runs
+from jaxvib.identification.torque import _predicted_drive, _runs, _Trial, _with_torque_balance
 
 T, NOISE = 0.016 * np.arange(1000), 0.05
 FEW = 400
@@ -60,6 +62,21 @@ def test_predicted_angle_is_that_of_scipy():
     np.testing.assert_allclose(jax.vmap(drive.angle_at)(T[:FEW]), angle, atol=2e-4)
     ripple = np.std(acceleration[-100:])
     np.testing.assert_allclose(jax.vmap(drive.acceleration_at)(T[:FEW]), acceleration, atol=0.01 * ripple)
+
+
+def test_known_unbalance_is_that_of_the_result(monkeypatch):
+    """The information from a known unbalance is along its direction, which the torque balance changes."""
+    channels = [jv.Channel("frame", "acceleration", at=1), jv.Channel("rotor", "angle")]
+    run = jv.MeasuredRun.from_arrays(channels, T[:FEW], {"frame": np.sin(T[:FEW]), "rotor": 3.0 * T[:FEW] ** 2})
+    known = {"exciters[0].unbalance": "0.05 kg m +- 2 %"}
+    problem = build_problem(scene(line()), [run], ["drive.inertia"], known)
+    fitted = information_at(problem, np.array([0.05, 0.0, *np.zeros(5)]))
+    turned = np.concatenate([fitted.x, [0.03, 0.04], np.zeros(8)])
+    trial = _Trial(turned, 1.0, (np.eye(turned.size), np.zeros((turned.size,) * 2), np.zeros(turned.size)))
+    monkeypatch.setattr(torque, "_minimum", lambda *_: (trial, True))
+    found, _ = _with_torque_balance(fitted, [0])
+    p = fitted.x.size
+    np.testing.assert_allclose(found.prior[p : p + 2, p : p + 2], np.outer([0.6, 0.8], [0.6, 0.8]) / 0.001**2)
 
 
 @pytest.mark.slow
