@@ -1,8 +1,7 @@
 """Angle of a rotor over time, from the pulses of a tachometer, an angle, a speed, or a prescribed drive.
 
-Pulses and samples are fitted by a spline of degree 5 with evenly spaced knots. The number of knots minimizes the Bayesian
-information criterion. The second derivative of the spline, on which the force of an unbalance depends, is smooth. If a wheel
-has several marks, each mark has an unknown offset from its place, because marks are unevenly spaced. All pulses may be early or
+Pulses and samples are fitted by a spline of degree 5 (`records/spline.py`). If a wheel has several marks, each mark has an
+unknown offset from its place, because marks are unevenly spaced. All pulses may be early or
 late by a common time with the standard error of one pulse, because recorders round times up, down, or to the nearest sample.
 The functions e_m(t) follow from the covariance of the coefficients:
 
@@ -26,17 +25,14 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.identification.records.channel import Channel
+from jaxvib.identification.records.spline import DEGREE, fit_spline
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive, IdealDrive
 from jaxvib.machine.numbers import unit
 from jaxvib.machine.scene import Exciter, Scene
 
-_DEGREE = 5
 _MIN_PULSES = 12
 """Number of pulses below which the angle between them is unknown."""
-
-_MAX_INTERVALS = 512
-"""Largest number of intervals of a spline."""
 
 _MAX_SPEED_CHANGE = 0.1
 """Relative change of the speed between two pulses above which the angle between them is uncertain."""
@@ -52,28 +48,24 @@ _ERRORS_TOGETHER = 8
 
 
 class RecordedDrive(IdealDrive):
-    """Drive that follows a recorded angle, given by polynomials of the relative time in each of equal intervals.
+    """Drive that follows a recorded angle, given by polynomials of the time since the start of each of several intervals.
 
     **Attributes**: `speed`, rad/s: the largest absolute speed; `table` (intervals, powers, 1 + m): coefficients of the angle
-    and of its errors e_m; `begin`, s: start of the first interval; `width`, s, of all intervals; `last`: index of the last
-    interval (further rows of the table are padding).
+    and of its errors e_m; `starts` (intervals,), s: start of each interval, infinite for rows that are padding.
     """
 
     speed: Array = eqx.field(metadata=unit("rad/s"))
     table: Array = eqx.field(metadata=unit("rad"))
-    begin: Array = eqx.field(metadata=unit("s"))
-    width: Array = eqx.field(metadata=unit("s"))
-    last: Array
+    starts: Array = eqx.field(metadata=unit("s"))
     kind: str = eqx.field(static=True, default="recorded", kw_only=True)
 
     def columns_at(self, t: Array, order: int) -> Array:
         """Return the derivatives of the given `order` of the angle and of its errors e_m (1 + m,) at time `t`; order 0: the
         values."""
-        place = (t - self.begin) / self.width
-        k = jnp.clip(jnp.floor(place), 0.0, self.last)
-        rows = self.table[k.astype(int)]
-        factors = [math.perm(p, order) * (place - k) ** (p - order) for p in range(order, rows.shape[0])]
-        return jnp.stack(factors) @ rows[order:] / self.width**order
+        k = jnp.maximum(jnp.searchsorted(self.starts, t, side="right") - 1, 0)
+        rows, since = self.table[k], t - self.starts[k]
+        factors = [math.perm(p, order) * since ** (p - order) for p in range(order, rows.shape[0])]
+        return jnp.stack(factors) @ rows[order:]
 
     def angle_at(self, t: Array) -> Array:
         """Return the angle, rad."""
@@ -194,11 +186,11 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
     marks, spread, marked = np.zeros(time.size, int), np.ones(time.size), channel.kind == "angle"
     if channel.kind == "speed":
         value = np.abs(value)
-        speed, scatter = fit_spline(time, value)
+        speed, scatter = fit_spline(time, value, jump_order=1)
         spline = speed.antiderivative()
     elif channel.kind == "angle":
         value = value * np.sign(value[-1] - value[0])
-        spline, scatter = fit_spline(time, value)
+        spline, scatter = fit_spline(time, value, jump_order=2)
     else:
         tooth = _tooth_after_gap(value, channel.per_turn)
         value, marked = value - (tooth or 0), channel.per_turn == 1 or tooth is not None
@@ -206,7 +198,7 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
         value = 2.0 * np.pi * value / channel.per_turn
         rough_speed = np.convolve(np.pad(np.gradient(value, time), 2, mode="edge"), np.full(5, 0.2), mode="valid")
         spread = np.maximum(rough_speed, _MIN_SPEED * np.max(rough_speed))  # the errors of pulses are errors of their times
-        spline, scatter = fit_spline(time, value, marks, spread)
+        spline, scatter = fit_spline(time, value, marks, spread, jump_order=2)
         speed = spline(0.5 * (time[1:] + time[:-1]), 1)[:, 0]
         is_fast = np.abs(speed[1:]) > 0.2 * np.max(np.abs(speed))  # slower rotors excite almost no vibration
         change = float(np.max(np.abs(np.diff(speed) / speed[1:]), where=is_fast, initial=0.0))
@@ -219,9 +211,8 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
     sizes = np.sqrt(np.mean(grid**2, axis=0))
     error, left_out = float(np.linalg.norm(sizes)), float(np.linalg.norm(sizes[MAX_ERRORS:]))
     span = float(time[0]), float(time[-1])
-    knots, samples = np.unique(spline.t), RotorSamples(channel.kind, time, value, marks, spread, scatter)
-    drive = recorded_drive(knots, [spline(knots, order) for order in range(3)])
-    return RotorAngle(drive, spline, span, marked, error, left_out, tuple(notes), samples)
+    samples = RotorSamples(channel.kind, time, value, marks, spread, scatter)
+    return RotorAngle(drive_of_spline(spline), spline, span, marked, error, left_out, tuple(notes), samples)
 
 
 def _tooth_after_gap(number: np.ndarray, per_turn: int) -> int | None:
@@ -238,144 +229,38 @@ def _tooth_after_gap(number: np.ndarray, per_turn: int) -> int | None:
     return int(after[0]) if after.size == 1 and number[-1] - number[0] >= 2 * per_turn else None
 
 
+def drive_of_spline(spline: Any) -> RecordedDrive:
+    """Return the drive whose angle and errors are the columns of a spline."""
+    from scipy.interpolate import BSpline, PPoly  # slow to import
+
+    pieces = [PPoly.from_spline(BSpline(spline.t, column, spline.k)) for column in spline.c.T[: 1 + MAX_ERRORS]]
+    is_piece = np.diff(pieces[0].x) > 0.0
+    coefficients = np.stack([each.c[::-1, is_piece].T for each in pieces], axis=2)
+    return _drive_of(pieces[0].x[:-1][is_piece], coefficients, spline(np.unique(spline.t), 1)[:, 0])
+
+
 def recorded_drive(time: np.ndarray, columns: Sequence[np.ndarray]) -> RecordedDrive:
     """Return the drive whose angle and errors are interpolated by polynomials of degree 5.
 
     **Arguments**: evenly spaced times (n,), s; `columns`: three arrays (n, 1 + m) with the angle and its m errors at these
     times and with their first and second derivatives.
     """
-    count, intervals, width = min(1 + MAX_ERRORS, columns[0].shape[1]), time.size - 1, (time[-1] - time[0]) / (time.size - 1)
-    value, slope, curvature = (each[:, :count] * width**order for order, each in enumerate(columns))
-    table = np.zeros(
-        (2 ** math.ceil(math.log2(intervals)), _DEGREE + 1, 1 - (1 - count) // _ERRORS_TOGETHER * _ERRORS_TOGETHER)
-    )
+    width = (time[-1] - time[0]) / (time.size - 1)
+    value, slope, curvature = (each[:, : 1 + MAX_ERRORS] * width**order for order, each in enumerate(columns))
     low = np.stack([value[:-1], slope[:-1], 0.5 * curvature[:-1]], axis=1)
     ends = np.stack(
         [value[1:] - low.sum(axis=1), slope[1:] - low[:, 1] - 2.0 * low[:, 2], curvature[1:] - 2.0 * low[:, 2]], axis=1
     )
-    table[:intervals, :3, :count] = low
-    table[:intervals, 3:, :count] = np.array([[10.0, -4.0, 0.5], [-15.0, 7.0, -1.0], [6.0, -3.0, 0.5]]) @ ends
-    speed = np.max(np.abs(columns[1][:, 0]))
-    speed, begin, width, last = (jnp.asarray(float(each)) for each in (speed, time[0], width, intervals - 1))
-    return RecordedDrive(speed, jnp.asarray(table), begin, width, last)
+    high = np.array([[10.0, -4.0, 0.5], [-15.0, 7.0, -1.0], [6.0, -3.0, 0.5]]) @ ends
+    coefficients = np.concatenate([low, high], axis=1) / width ** np.arange(DEGREE + 1.0)[:, None]
+    return _drive_of(time[:-1], coefficients, columns[1][:, 0])
 
 
-def fit_spline(
-    time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None, rates: np.ndarray | None = None
-) -> tuple[Any, float]:
-    """Return a smoothing spline of degree 5 with 1 + m columns (the values and their m errors), and the scatter.
-
-    The scatter is the standard deviation of the values about the spline; with `rates` it is the standard deviation of the
-    times, s. The errors are principal components of the covariance of the coefficients, the largest first.
-
-    **Arguments**: `time` (n,) s, ascending; `value` (n,); `marks` (n,): index of the mark of each value; each mark has an
-    unknown offset, 0 on average; `rates` (n,): time derivatives of the values, for values whose errors are errors of their
-    times. A common delay of all times is then included in the covariance.
-
-    >>> t = np.linspace(0.0, 2.0, 200)
-    >>> spline, _ = fit_spline(t, 30.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=t.size))
-    >>> bool(abs(spline(1.0, 2)[0] - 60.0) < 0.1), bool(5e-5 < np.linalg.norm(spline(1.0)[1:]) < 5e-4)
-    (True, True)
-    """
-    from scipy.interpolate import BSpline  # slow to import
-
-    weights = np.ones(time.size) if rates is None else np.mean(rates) / rates
-    offsets = _mark_offsets(np.zeros(time.size, int) if marks is None else marks, weights)
-    fits = []
-    intervals = 1
-    while intervals <= min(_MAX_INTERVALS, time.size // 4):
-        fits.append(_fit_knots(time, value * weights, weights, offsets, intervals))
-        intervals = max(intervals + 1, int(1.4 * intervals))
-    best = min(fits, key=lambda each: each.criterion)
-    covariance, scatter = best.covariance(), math.sqrt(best.variance) / (1.0 if rates is None else float(np.mean(rates)))
-    if rates is not None:
-        delay_column = scatter * _derivative(best)
-        covariance += np.outer(delay_column, delay_column)
-    sizes, axes = np.linalg.eigh(covariance)
-    root = axes * np.sqrt(np.maximum(sizes, 0.0))
-    grid = BSpline.design_matrix(np.linspace(time[0], time[-1], 4 * len(best.coefficients)), best.knots, _DEGREE)
-    errors = root @ np.linalg.svd(grid @ root, full_matrices=False)[2].T
-    return BSpline(best.knots, np.concatenate([best.coefficients[:, None], errors], axis=1), _DEGREE), scatter
-
-
-class _Offsets(NamedTuple):
-    """Offsets of all marks but the first, whose offset is minus their sum.
-
-    **Attributes**: `columns` (n, o): sparse matrix of the weighted values by the offsets; `gram` (o, o): its normal equations.
-    """
-
-    columns: Any
-    gram: np.ndarray
-
-
-def _mark_offsets(marks: np.ndarray, weights: np.ndarray) -> _Offsets:
-    from scipy.sparse import csr_matrix  # slow to import
-
-    count, first, others = int(np.max(marks)), np.flatnonzero(marks == 0), np.flatnonzero(marks)
-    rows = np.concatenate([others, np.repeat(first, count)])
-    columns = np.concatenate([marks[others] - 1, np.tile(np.arange(count), first.size)])
-    entries = np.concatenate([weights[others], -np.repeat(weights[first], count)])
-    squares = np.bincount(marks, weights**2)
-    return _Offsets(csr_matrix((entries, (rows, columns)), shape=(marks.size, count)), np.diag(squares[1:]) + squares[0])
-
-
-class _KnotsFit(NamedTuple):
-    """Fit of a spline with given `knots`.
-
-    **Attributes**: `coefficients` (k,) of the spline; Bayesian information `criterion`; `variance` of the values; `band`:
-    diagonals of the normal equations N of the coefficients; `offset_changes` (k, o): N^-1 B, where B (k, o) couples the
-    coefficients with the o offsets; `offset_covariance` (o, o): inverse of the Schur complement of N, which is the covariance
-    of the offsets divided by the variance.
-    """
-
-    knots: np.ndarray
-    coefficients: np.ndarray
-    criterion: float
-    variance: float
-    band: np.ndarray
-    offset_changes: np.ndarray
-    offset_covariance: np.ndarray
-
-    def covariance(self) -> np.ndarray:
-        """Return the covariance (k, k) of the coefficients."""
-        from scipy.linalg import solveh_banded  # slow to import
-
-        inverse_band = solveh_banded(self.band, np.eye(len(self.coefficients)), lower=True)
-        return self.variance * (inverse_band + self.offset_changes @ self.offset_covariance @ self.offset_changes.T)
-
-
-def _derivative(spline_fit: _KnotsFit) -> np.ndarray:
-    """Return the coefficients (k,) of the spline with the same knots that interpolates the derivative."""
-    from scipy.interpolate import BSpline  # slow to import
-
-    places = np.lib.stride_tricks.sliding_window_view(spline_fit.knots[1:-1], _DEGREE).mean(axis=1)
-    places = np.clip(places, spline_fit.knots[0], spline_fit.knots[-1])  # rounding errors
-    basis = BSpline.design_matrix(places, spline_fit.knots, _DEGREE).toarray()
-    return np.linalg.solve(basis, BSpline(spline_fit.knots, spline_fit.coefficients, _DEGREE)(places, 1))
-
-
-def _fit_knots(time: np.ndarray, value: np.ndarray, weights: np.ndarray, offsets: _Offsets, intervals: int) -> _KnotsFit:
-    """Return the fit of weighted values by a spline with equal intervals."""
-    from scipy.interpolate import BSpline  # slow to import
-    from scipy.linalg import solveh_banded
-    from scipy.sparse import diags
-
-    n = time.size
-    knots = np.concatenate([[time[0]] * _DEGREE, np.linspace(time[0], time[-1], intervals + 1), [time[-1]] * _DEGREE])
-    basis: Any = diags(weights) @ BSpline.design_matrix(time, knots, _DEGREE)
-    gram = basis.T @ basis
-    size, count = gram.shape[0], gram.shape[0] + len(offsets.gram)
-    band = np.stack([np.pad(gram.diagonal(k), (0, k)) for k in range(_DEGREE + 1)])
-    band[0] += 1e-12 * np.mean(band[0])  # otherwise the matrix is singular for intervals without a value
-    coupling = (basis.T @ offsets.columns).toarray()
-    offset_changes = solveh_banded(band, coupling, lower=True) if coupling.size else coupling
-    offset_covariance = np.linalg.inv(offsets.gram - coupling.T @ offset_changes)
-    coefficients, offset_values, residuals = np.zeros(size), np.zeros(len(offsets.gram)), value
-    for _ in range(2):  # the second solution corrects rounding errors of the first
-        without_offsets = solveh_banded(band, basis.T @ residuals, lower=True)
-        step = offset_covariance @ (offsets.columns.T @ (residuals - basis @ without_offsets))
-        coefficients, offset_values = coefficients + without_offsets - offset_changes @ step, offset_values + step
-        residuals = value - basis @ coefficients - offsets.columns @ offset_values
-    square_sum = float(residuals @ residuals)
-    criterion = n * math.log(max(square_sum / n, 1e-26)) + count * math.log(n)
-    return _KnotsFit(knots, coefficients, criterion, square_sum / max(n - count, 1), band, offset_changes, offset_covariance)
+def _drive_of(starts: np.ndarray, coefficients: np.ndarray, speeds: np.ndarray) -> RecordedDrive:
+    """Return the drive with polynomials (intervals, powers, 1 + m), padded to a power of two and to 1 + 8 k columns."""
+    intervals, powers, count = coefficients.shape
+    padded = 2 ** math.ceil(math.log2(intervals))
+    table = np.zeros((padded, powers, 1 - (1 - count) // _ERRORS_TOGETHER * _ERRORS_TOGETHER))
+    table[:intervals, :, :count] = coefficients
+    starts = np.concatenate([starts, np.full(padded - intervals, np.inf)])
+    return RecordedDrive(jnp.asarray(float(np.max(np.abs(speeds)))), jnp.asarray(table), jnp.asarray(starts))

@@ -38,6 +38,13 @@ def ramp(t):
     )
 
 
+def ending_ramp(t):
+    """Return angle, speed and acceleration of a rotor that speeds up at a constant rate to 90 rad/s within 7.5 s, and stays
+    there."""
+    rising, rate = np.minimum(t, 7.5), 12.0
+    return rate * rising * (t - 0.5 * rising), rate * rising, np.where(np.asarray(t) < 7.5, rate, 0.0)
+
+
 class Ramp(jv.IdealDrive):
     """`ramp` as a prescribed drive."""
 

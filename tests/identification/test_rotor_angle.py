@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from run_ups_by_scipy import ending_ramp, pulse_times
 
 import jaxvib as jv
 from jaxvib.identification.angle import _measured
@@ -65,6 +66,18 @@ def test_times_rounded_down_are_within_the_error_of_the_angle():
     away = (found.at(t) - angle_at(t)) / np.linalg.norm(found.spline(t)[:, 1:], axis=1)
     np.testing.assert_allclose(away, np.sqrt(3.0), atol=0.7)
     assert found.error == pytest.approx(1e-3 / np.sqrt(12.0) * 53.0, rel=0.2)
+
+
+def test_error_at_the_end_of_a_ramp_is_as_stated():
+    """One pulse per turn; a spline that is smooth at the end of the ramp is wrong by more than a turn near rest."""
+    numbers = np.arange(1.0, 176.0)
+    t = np.linspace(1.1, 15.9, 2000)
+    _, edges = pulse_times(ending_ramp, 15.98, 1)
+    found = measured("pulses", 1e-4 * np.round(edges / 1e-4), numbers)
+    errors = found.at(t) - ending_ramp(t)[0]
+    assert np.max(np.abs(errors)) < 4e-3 and found.error < 4e-3  # 1e-4 s / sqrt(12) * 90 rad/s = 2.6e-3 rad
+    assert np.max(np.abs(errors) / np.linalg.norm(found.spline(t)[:, 1:], axis=1)) < 3.0
+    assert [float(found.drive.acceleration_at(at)) for at in (7.4, 7.6)] == pytest.approx([12.0, 0.0], abs=0.5)
 
 
 def test_large_changes_of_speed_between_pulses_are_noted():

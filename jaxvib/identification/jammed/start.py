@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import InputError
-from jaxvib.identification.angle import RecordedDrive, fit_spline, recorded_drive
+from jaxvib.identification.angle import RecordedDrive, drive_of_spline
 from jaxvib.identification.fit import (
     Equations,
     descend,
@@ -32,6 +32,7 @@ from jaxvib.identification.fit import (
 )
 from jaxvib.identification.jammed.motion import ShiftedDrive, closed_motion, linearized, weighted_columns
 from jaxvib.identification.problem import Problem, channel_sizes, damped_modes, with_noise
+from jaxvib.identification.records.spline import fit_spline
 from jaxvib.identification.response import Unknowns, model_states
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
@@ -231,8 +232,7 @@ def _jam_of(problem: Problem, r: int) -> _Jam:
         phase[part] = phase[part][0] + slope * (time[part] - time[part][0])
     thinned = slice(None, None, max(1, int(1.0 / (peak * step))))
     spline, _ = fit_spline(time[thinned], phase[thinned])
-    knots = np.unique(spline.t)
-    drive = recorded_drive(knots, [spline(knots, order)[:, :1] for order in range(3)])
+    drive = drive_of_spline(type(spline)(spline.t, spline.c[:, :1], spline.k))  # without its errors
     return _Jam(drive, spline(time)[:, 0], spline(time, 1)[:, 0])
 
 

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 
 import numpy as np
-from run_ups_by_scipy import TRUTH, accelerations, bound, motor_run_up, ramp, record, scene_of
+from run_ups_by_scipy import TRUTH, accelerations, bound, ending_ramp, motor_run_up, ramp, record, scene_of
 
 import jaxvib as jv
 from repeated_records import jammed, supports
@@ -26,11 +26,13 @@ CASES = {
     "random gains, standard deviation 1 %": {"gain_error": 0.01},
     "motor whose speed falls at the resonances": {"motor": True},
     "one pulse per turn, times rounded to 1 ms": {"pulses": 1, "resolution": 1e-3},
+    "run-up that ends within the record": {"ending": True},
     "readings clipped at 60 % of the largest": {"full_scale": 0.6},
     "two jammed balls and an unbalance": {"balls": True},
     "two jammed balls and an unbalance, without an impact": {"balls": True, "impact": 0.0},
 }
-"""Options of `record` by the name of a case; `motor`: run-up of a motor in place of the prescribed speed; `balls`: records of
+"""Options of `record` by the name of a case; `motor`: run-up of a motor in place of the prescribed speed; `ending`: its
+acceleration jumps to 0; `balls`: records of
 `repeated_records.jammed`."""
 
 JAMMED_CASES = {
@@ -88,18 +90,19 @@ class Repeated:
 
 
 @functools.cache
-def run_up(motor):
+def run_up(motor, ending=False):
     """Return the accelerations (n, 2) and the turning of the rotor."""
-    return motor_run_up(TIMES, TRUTH) if motor else (accelerations(TIMES, [TRUTH])[0], ramp)
+    turning = ending_ramp if ending else ramp
+    return motor_run_up(TIMES, TRUTH) if motor else (accelerations(TIMES, [TRUTH], turning=turning)[0], turning)
 
 
-def repeated(count, seed=0, motor=False, balls=False, support=None, **options):
+def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None, **options):
     """Return the fits of `count` records from stiffnesses 10 % off and dampings 50 % off, in random directions, see `FACTORS`.
 
     In records of jammed balls, the mass and the drag of the balls are 10 % and 20 % off, the dampings 30 %, and the stiffnesses
     5 %.
     """
-    clean, turning = (jammed.clean(), None) if balls else run_up(motor)
+    clean, turning = (jammed.clean(), None) if balls else run_up(motor, ending)
     if "full_scale" in options:
         options = options | {"full_scale": options["full_scale"] * np.max(np.abs(clean))}
     truth, scene = (jammed.TRUTH, jammed.scene_of) if balls else (TRUTH, scene_of)

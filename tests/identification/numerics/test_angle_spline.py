@@ -6,16 +6,8 @@ import pytest
 from scipy.interpolate import BSpline
 
 import jaxvib as jv
-from jaxvib.identification.angle import (
-    RecordedDrive,
-    RotorAngle,
-    _fit_knots,
-    _mark_offsets,
-    _measured,
-    fit_spline,
-    recorded_drive,
-    rotor_angles,
-)
+from jaxvib.identification.angle import RecordedDrive, RotorAngle, _measured, drive_of_spline, recorded_drive, rotor_angles
+from jaxvib.identification.records.spline import _breaks, _data, _fit_knots, _mark_offsets, fit_spline
 
 T = np.sort(np.random.default_rng(1).uniform(0.0, 3.0, 150))
 
@@ -40,9 +32,9 @@ def test_fit_is_the_weighted_least_squares(marks):
         value = value + np.array([0.02, 0.03, -0.05])[marks]
     weights, intervals = np.mean(spread) / spread, 4
     _, basis = basis_of(T, intervals)
-    of_marks = _mark_offsets(np.zeros(T.size, int) if marks is None else marks, weights)
-    np.testing.assert_allclose(of_marks.columns.toarray(), offsets * weights[:, None], rtol=1e-14)
-    fit = _fit_knots(T, value * weights, weights, of_marks, intervals)
+    data = _data(T, value, np.zeros(T.size, int) if marks is None else marks, spread)
+    np.testing.assert_allclose(data.columns.toarray(), offsets * weights[:, None], rtol=1e-14)
+    fit = _fit_knots(data, intervals)
     columns = np.concatenate([basis, offsets], axis=1) * weights[:, None]
     found = np.linalg.lstsq(columns, value * weights, rcond=None)[0]
     size = basis.shape[1]
@@ -53,12 +45,9 @@ def test_fit_is_the_weighted_least_squares(marks):
     covariance = square / (n - k) * np.linalg.inv(columns.T @ columns)[:size, :size]
     np.testing.assert_allclose(fit.covariance(), covariance, rtol=1e-5, atol=1e-7 * np.max(covariance))
     spline, scatter = fit_spline(T, value, marks, spread)
-    counts = [len(_fit_knots(T, value * weights, weights, of_marks, each).coefficients) for each in (1, 2)]
+    counts = [len(_fit_knots(data, each).coefficients) for each in (1, 2)]
     assert spline.c.shape[0] in counts  # a parabola needs one interval, or few
-    best = min(
-        (_fit_knots(T, value * weights, weights, of_marks, each) for each in (1, 2, 3, 4, 5, 7, 9, 12)),
-        key=lambda each: each.criterion,
-    )
+    best = min((_fit_knots(data, each) for each in (1, 2, 3, 4, 5, 7, 9, 12)), key=lambda each: each.criterion)
     np.testing.assert_allclose(spline.c[:, 0], best.coefficients)
     assert scatter == pytest.approx(np.sqrt(best.variance) / np.mean(spread))
     # The errors have the covariance of the coefficients, and are orthogonal over time, the largest first.
@@ -78,9 +67,9 @@ def test_fit_is_the_weighted_least_squares(marks):
 
 def test_offsets_of_many_marks_take_little_memory():
     marks, weights = np.arange(20_000) % 256, np.linspace(1.0, 2.0, 20_000)
-    offsets = _mark_offsets(marks, weights)
-    assert offsets.columns.nnz < 2.1 * marks.size
-    np.testing.assert_allclose(offsets.gram, (offsets.columns.T @ offsets.columns).toarray(), rtol=1e-12)
+    columns, gram = _mark_offsets(marks, weights)
+    assert columns.nnz < 2.1 * marks.size
+    np.testing.assert_allclose(gram, (columns.T @ columns).toarray(), rtol=1e-12)
 
 
 def test_intervals_follow_from_the_information_criterion():
@@ -91,6 +80,64 @@ def test_intervals_follow_from_the_information_criterion():
     assert 15 < wavy.c.shape[0] < 40
     np.testing.assert_allclose(wavy(t)[:, 0], curve(t) + 0.1 * np.sin(9.0 * t), atol=1e-3)
     assert np.linalg.norm(wavy(1.5)[1:]) == pytest.approx(1e-3 * np.sqrt(wavy.c.shape[0] / t.size), rel=0.3)
+
+
+def bent(t, jumps=((1.0, -14.0), (2.2, 6.0))):
+    """Return an angle whose acceleration jumps at two times."""
+    return curve(t) + sum(0.5 * jump * np.maximum(t - at, 0.0) ** 2 for at, jump in jumps)
+
+
+@pytest.mark.parametrize(("wave", "every"), [(0.0, 1), (0.05, 1), (0.05, 13)])
+def test_jumps_of_the_acceleration_are_found(wave, every):
+    """`every` > 1: so many values that a part of them serves for the search."""
+    t, rng = np.linspace(0.0, 3.0, 400 * every), np.random.default_rng(0)
+    smooth = wave * np.sin(7.0 * t)
+    value = bent(t) + smooth + 1e-4 * np.sqrt(every) * rng.normal(size=t.size)
+    spline, scatter = fit_spline(t, value, jump_order=2)
+    jumps = [each for each in np.unique(spline.t) if np.count_nonzero(spline.t == each) == 5]
+    # A jump of 6 rad/s^2 is found to about 2e-4 s: 1e-4 / (6 * 3 s * sqrt(400 / 12)).
+    np.testing.assert_allclose(jumps, [1.0, 2.2], atol=2e-3)
+    assert scatter == pytest.approx(1e-4 * np.sqrt(every), rel=0.1)
+    away = (spline(t)[:, 0] - bent(t) - smooth) / np.linalg.norm(spline(t)[:, 1:], axis=1)
+    assert np.max(np.abs(away)) < 4.0 and np.sqrt(np.mean(away**2)) < 1.5
+    without, _ = fit_spline(t, value)
+    assert without.c.shape[0] > 1.5 * spline.c.shape[0]
+
+
+def test_a_jump_of_the_slope_of_a_speed_is_found():
+    t = np.linspace(0.0, 3.0, 300)
+    speed = np.minimum(20.0 * t, 30.0) + 0.01 * np.random.default_rng(0).normal(size=t.size)
+    spline, _ = fit_spline(t, speed, jump_order=1)
+    (jump,) = (each for each in np.unique(spline.t) if np.count_nonzero(spline.t == each) == 5)
+    assert jump == pytest.approx(1.5, abs=1e-3)
+
+
+def test_smooth_curves_have_no_jumps():
+    t = np.linspace(0.0, 3.0, 400)
+    for seed in range(5):
+        value = curve(t) + 0.1 * np.sin(9.0 * t) + 1e-3 * np.random.default_rng(seed).normal(size=t.size)
+        np.testing.assert_array_equal(fit_spline(t, value, jump_order=2)[0].t, fit_spline(t, value)[0].t)
+
+
+def test_every_interval_has_values():
+    """A rotor that starts from rest has few pulses at first; jumps keep their places."""
+    t = np.sqrt(np.linspace(0.05, 9.0, 60))
+    for jumps in ((), (0.77, 2.05)):
+        breaks = _breaks(t, 40, jumps)
+        assert np.min(np.histogram(t, breaks)[0]) >= 2 and set(jumps) <= set(breaks) and breaks.size > 20
+    assert _breaks(t, 4, ()) == pytest.approx(np.linspace(t[0], t[-1], 5))
+
+
+def test_drive_of_a_spline_jumps_with_it():
+    t = np.linspace(0.0, 3.0, 400)
+    spline, _ = fit_spline(t, bent(t) + 1e-4 * np.random.default_rng(0).normal(size=t.size), jump_order=2)
+    drive = drive_of_spline(spline)
+    for at in (0.0, 0.4, 0.99, 1.01, 1.7, 2.3, 3.0):
+        for order in range(3):
+            count = spline.c.shape[1]
+            np.testing.assert_allclose(drive.columns_at(at, order)[:count], spline(at, order), rtol=1e-9, atol=1e-9)
+    assert [float(drive.acceleration_at(at)) for at in (0.98, 1.02)] == pytest.approx([10.0, -4.0], abs=0.5)
+    assert float(drive.speed) == pytest.approx(30.0, rel=0.01)
 
 
 def drive_of(errors=3):

@@ -47,10 +47,10 @@ def angle(t):
 @functools.cache
 def drive():
     """Return the recorded drive of `angle`, in intervals of 0.1 s from 0.2 s."""
-    width, starts = 0.1, 0.2 + 0.1 * np.arange(4)
+    starts = 0.2 + 0.1 * np.arange(4)
     values = angle(starts)
-    table = np.stack([values[p].T * width**p / (1.0, 1.0, 2.0)[p] for p in range(3)], axis=1)
-    return RecordedDrive(*map(jnp.asarray, (70.0, table, 0.2, width, 3.0)))
+    table = np.stack([values[p].T / (1.0, 1.0, 2.0)[p] for p in range(3)], axis=1)
+    return RecordedDrive(*map(jnp.asarray, (70.0, table, starts)))
 
 
 @functools.cache
