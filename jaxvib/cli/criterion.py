@@ -71,7 +71,7 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
         lines = [
             document["status"],
             table("characteristic speeds, no damping", ["", unit], rows),
-            table("sign changes with this damping", ["", unit], damped),
+            table("sign changes of the criterion, with this damping", ["", unit], damped),
             table("rotor speeds", ["", f"from, {unit}", f"to, {unit}"], spans),
         ]
         if check:
@@ -93,7 +93,7 @@ def _ends(span: Sequence[float | None], scale: float) -> list[str]:
     nargs=2,
     type=SPEED_TYPE,
     metavar="LOW HIGH",
-    help="Also find the rotor speeds between these two at which each arrangement is stable, such as '300 rpm' '1500 rpm'.",
+    help="Two rotor speeds, such as '300 rpm' '1500 rpm'; between them find all speeds at which each arrangement is stable.",
 )
 @click.option("--points", type=int, default=200, show_default=True, help="Number of speeds for --between.")
 @WITHOUT

@@ -25,11 +25,11 @@ def threshold_chart(
     if error is not None:
         low, high = np.clip([fraction - error, fraction + error], 0.0, 1.0)
         axis.fill_between(speed, low, high, color=COLORS[0], alpha=0.2, lw=0.0)
-        label = "share, with its standard error"
+        label = "fraction, with its standard error"
     axis.plot(speed, fraction, marker="o", ms=3.0, color=COLORS[0], label=label)
     if np.isfinite(threshold):
         axis.axvline(threshold, color=COLORS[1], ls="--", label=f"threshold {threshold:.3f}")
-    axis.set(xlabel="initial speed relative to the rotor / rotor speed", ylabel="share of starts captured", ylim=(-0.05, 1.05))
+    axis.set(xlabel="initial speed relative to the rotor / rotor speed", ylabel="fraction captured", ylim=(-0.05, 1.05))
     legend_above(axis)
     return figure if ax is None else ax
 

@@ -81,7 +81,7 @@ def drag_of(
     Conditions that are not checked:
 
     - oil: the oil turns with the rotor. The formula is that of a ball far from walls; a ball on its track, and more so in a
-      channel narrower than about five balls, has a larger drag. Measure it
+      channel narrower than about five ball diameters, has a larger drag. Measure it
     - bearing: the values of mu for rolling bearings hold for open bearings with good lubrication, at about a tenth of their
       dynamic load rating. Seals add their own friction
 

@@ -40,8 +40,8 @@ _MAX_GROWTH_RATIO_OF_QUARTERS = 0.85
 exponential. The ratio is 0.71 for growth proportional to time, and 1 for exponential growth."""
 
 _UNSEPARATED_LOG_GROWTH = 0.1
-"""Largest error of the logarithm of the growth over the later half if two equal disturbances with nearly equal rates grow. With
-the difference of the rates times the whole time x the error is ln((1 + e^-x)/(1 + e^-2x))/2, at most 0.094."""
+"""Largest error of the logarithm of the growth over the later half if two equal disturbances with nearly equal rates grow. It
+is ln((1 + e^-x)/(1 + e^-2x))/2, at most 0.094, where x is the difference of the rates times the whole time."""
 
 _RETURN_DISTANCE = 1e-2
 """Distance from a previous state below which a motion has returned to it, relative to the largest distance in between."""
@@ -71,10 +71,10 @@ class Growth(Result):
     - `exponent`: the largest Lyapunov exponent, 1/s, over the later half of the stretches, and its `uncertainty`: the largest
       of the standard error, half of the change of the rate between the quarters of this half, and 0.1 divided by the length of
       this half (exponents that are closer to each other cannot be separated)
-    - `horizon`: the time, s, after which rounding errors have grown to the size of the motion itself, ln(1/eps)/exponent. A
-      derivative with respect to a parameter has then grown by 1/eps, and predicts nothing about a change that is larger than
-      rounding. The horizon is infinite for a regular motion; for an undecided one it is a lower bound,
-      ln(1/eps)/(exponent + 3 uncertainty)
+    - `horizon`: the time, s, after which rounding errors have grown to the size of the motion itself, ln(1/eps)/exponent, with
+      the relative rounding error eps. A derivative with respect to a parameter has then grown by 1/eps, and predicts nothing
+      about a change that is larger than rounding. The horizon is infinite for a regular motion; for an undecided one it is a
+      lower bound, ln(1/eps)/(exponent + 3 uncertainty)
     - `rates` (stretches,): growth rate in each stretch, 1/s; `time` (stretches,): end of each stretch, s
     """
 
@@ -113,8 +113,8 @@ def growth(
 
         exponent = mean of ln(d_k / d_0) / T over the later stretches of length T
 
-    A second motion starts at the distance d_0. After each stretch its distance is reset to d_0 in the current direction
-    (Benettin's method).
+    A second motion starts at the distance d_0. At the end of stretch k its distance is d_k; it is then reset to d_0 in the
+    current direction (Benettin's method).
 
     Derivatives of a run grow at the same rate. If the rate is positive, a derivative of a run that is longer than the horizon
     is meaningless, however exactly it is computed. Use derivatives of shorter runs, of averages over many starts, or of exact

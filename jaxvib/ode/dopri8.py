@@ -154,8 +154,8 @@ class UnrolledDopri8(AbstractDopri8):
     """Dormand and Prince's pair of order 8(7), its 13 stages and the rates at the end of a step written out one after another.
 
     The results are those of `diffrax.Dopri8`. There is no loop over stages and no array of stages, so that a small time loop
-    compiles into one piece of code. Each stage is fenced. Without the fences, XLA's fusion recomputes each stage for each use,
-    and a step of 900 multiplications needs 4500.
+    compiles into one piece of code. Each stage is fenced (see `jaxvib.numerics.fence`). Without the fences, XLA's fusion
+    recomputes each stage for each use, and a step of 900 multiplications needs 4500.
 
     Compilation takes longer than for `LoopDopri8`; with derivatives it takes several times as long.
 

@@ -101,7 +101,7 @@ def as_dict(result: eqx.Module, *, infinity: bool = False) -> dict[str, Plain]:
     """Return a result as plain Python values for JSON, in SI units, with the `status` and the `message` before the fields.
 
     Statuses are represented by their names, complex numbers by pairs [real, imaginary], and NaN and infinity by None. With
-    `infinity`, infinite numbers are kept, for documents for readers.
+    `infinity`, infinite numbers are kept, for documents that people read.
     """
     status = getattr(result, "status", None)
     head = {} if status is None else {"status": plain(status), "message": sentence(status)}

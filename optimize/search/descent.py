@@ -150,10 +150,10 @@ def _run_steps(problem: Problem, states: _SearchState, rates: Array) -> tuple[_S
 def descend(problem: Problem, point: Point, steps: int, rate: float, report: Callable[[float, Point], None]) -> Descended:
     """Descend by Adam from all starts at once; each step keeps the held quantities and corrects their deviations.
 
-    Demands are included by the augmented Lagrangian sum_i (max(0, l_i + w g_i)^2 - l_i^2)/(2 w) with multipliers l_i and the
-    weight w, which are updated every 20 steps. A step is rejected, and the step length of this search is halved, if a quantity
-    does not exist for the new design or if a held quantity deviates by more than 10 %. `report` is called with the progress
-    (0 to 1) and the point.
+    Demands are included by the augmented Lagrangian sum_i (max(0, l_i + w g_i)^2 - l_i^2)/(2 w) with the excesses g_i, the
+    multipliers l_i and the weight w, which are updated every 20 steps. A step is rejected, and the step length of this search
+    is halved, if a quantity does not exist for the new design or if a held quantity deviates by more than 10 %. `report` is
+    called with the progress (0 to 1) and the point.
 
     **Returns** `Descended`.
     """

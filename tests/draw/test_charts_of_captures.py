@@ -17,7 +17,7 @@ def test_a_share_has_its_error_within_0_and_1():
     corners = axis.collections[0].get_paths()[0].vertices
     assert {(-0.5, 0.0), (-0.1, 0.7), (-0.1, 1.0)} <= {tuple(np.round(corner, 12).tolist()) for corner in corners}
     assert axis.lines[0].get_xydata().tolist() == [[-0.5, 0.05], [-0.1, 0.9]]
-    assert [line.get_label() for line in axis.lines] == ["share, with its standard error", "threshold -0.300"]
+    assert [line.get_label() for line in axis.lines] == ["fraction, with its standard error", "threshold -0.300"]
     plain = threshold_chart(speed, share, None, np.nan).axes[0]
     assert not plain.collections and [line.get_label() for line in plain.lines] == ["share"]
 

@@ -94,8 +94,8 @@ class Drive(Part):
 class Directed(Drive):
     """Drive that turns its rotor in a direction: angles, speeds and torques are those of `drive` times `direction`.
 
-    `direction` is an array of 1 or -1, so that one compiled program serves both directions; None means clockwise, without
-    operations for the direction. The attribute `speed` is that of `drive`, without a sign.
+    `direction` is an array of 1 or -1, so that one compiled program serves both directions. None means clockwise;
+    signs are then changed without a product. The attribute `speed` is that of `drive`, without a sign.
     """
 
     drive: Drive

@@ -89,7 +89,7 @@ class CharacteristicSpeeds(Result):
                 line += "  " + ", ".join(_entry_text(complex(x)) for x in relative)
             lines.append(line)
         damped = ", ".join(f"{label} {scale * speed:.6g}" for label, speed in self.labelled(damped=True))
-        lines.append(f"sign changes with this damping: {damped} {unit}")
+        lines.append(f"sign changes of the criterion, with this damping: {damped} {unit}")
         return "\n".join(lines)
 
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:

@@ -304,7 +304,7 @@ def _threshold_index(captured: np.ndarray) -> int:
 
 
 def _with_finer_steps(scan: Callable[[int], Capture], doublings: int, tolerance: float) -> tuple[Capture, float]:
-    """Double the steps until the border changes by at most the tolerance; return the last result and the last change."""
+    """Double the steps until the threshold changes by at most the tolerance; return the last result and the last change."""
     result, change = scan(1), math.nan
     for doubling in range(1, doublings + 1):
         coarser, result = result, scan(2**doubling)
@@ -315,7 +315,7 @@ def _with_finer_steps(scan: Callable[[int], Capture], doublings: int, tolerance:
 
 
 def _change(first: float, second: float) -> float:
-    """Return the absolute difference of two borders: 0 between two NaN, infinite between NaN and a number."""
+    """Return the absolute difference of two thresholds: 0 between two NaN, infinite between NaN and a number."""
     if math.isnan(first) or math.isnan(second):
         return 0.0 if math.isnan(first) and math.isnan(second) else math.inf
     return abs(first - second)

@@ -136,7 +136,7 @@ def threshold_curve(
 
 
 def _uncertainty(result: Capture) -> float:
-    """Return the uncertainty of the border, which is the `last_change` alone if every start was captured."""
+    """Return the uncertainty of the threshold, which is the `last_change` alone if every start was captured."""
     if result.border == -1.0:
         return 0.0 if np.isnan(result.last_change) else float(result.last_change)
     return float(result.uncertainty)

@@ -197,7 +197,7 @@ def test_port_of_two_directions_without_damping(s):
     # Rounding errors of mode shapes are not shown, and speeds with damping are not assigned to those without.
     *rows, damped = speeds.summary().splitlines()
     assert "e-" not in "".join(rows[1:]) and "+0j" not in "".join(rows)
-    assert damped.startswith("sign changes with this damping: resonance 1 ")
+    assert damped.startswith("sign changes of the criterion, with this damping: resonance 1 ")
 
 
 def test_twenty_platforms():
