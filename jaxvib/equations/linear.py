@@ -278,9 +278,9 @@ def natural_frequencies(scene: Scene) -> Array:
     **Returns** an array (nd,), rad/s; typical: 10 to 100 for platforms on springs, 100 to 500 for rotors. Derivatives are
     finite for equal frequencies, and taken as 0 at frequency 0 (a carrier that is free to drift).
 
-    **Raises** `ComputationError` (status "lost_digits") if a frequency is lost in rounding errors, for example in single
-    precision that of a soft spring next to a link 1e8 times as stiff. Under a JAX transformation such a frequency is NaN, and
-    all are NaN if a parameter has a value that its constructor would reject.
+    **Raises** `ComputationError` (status "lost_digits") if a frequency is lost in rounding errors, for example that of a soft
+    spring next to a link 1e8 times as stiff, in single precision. Under a JAX transformation such a frequency is NaN, and all
+    are NaN if a parameter has a value that its constructor would reject.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

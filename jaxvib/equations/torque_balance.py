@@ -423,13 +423,13 @@ def response_of(balance: TorqueBalance, omega: Array) -> Array:
 def torques_at(unbalance: Array, influence: Array, omega: Array, phasors: Array) -> Array:
     """Return the mean torques V (count,), N m, of the vibration on masses that turn at `omega`, rad/s.
 
-        V_j = (w^4/2) S_j sum_k S_k Im[exp(i (a_k - a_j)) e^H L_j D(w)^-1 L_k^T e],     S = m R
-        D(w) = K - w^2 (M + sum_j m_j L_j^T L_j) + i w (C + n G)
+        V_j = (w^4/2) S_j sum_k S_k Im[exp(i (a_k - a_j)) e^H B_j D(w)^-1 B_k^T e],     S = m R
+        D(w) = K - w^2 (M + sum_j m_j B_j^T B_j) + i w (C + n G)
 
-    w is `omega`; e = (1, -i) for two directions of the mount, 1 for one. L_j (directions of the mount, nd) maps the carrier's
+    w is `omega`; e = (1, -i) for two directions of the mount, 1 for one. B_j (directions of the mount, nd) maps the carrier's
     coordinates to the displacement of the mount at mass j; M, C, K and G are the matrices of the carrier, n is the rotor speed.
 
-    **Arguments**: `unbalance` S (count,); `influence` e^H L_j D^-1 L_k^T e (count, count), see `influence_of`; `phasors`
+    **Arguments**: `unbalance` S (count,); `influence` e^H B_j D^-1 B_k^T e (count, count), see `influence_of`; `phasors`
     exp(i a) (count,).
 
     Source: Artyunin 2013, the pendulums' equation of (1), averaged over a turn.

@@ -115,7 +115,7 @@ class _Profile:
 
     def _fixed(self, target: float) -> tuple[Problem, float]:
         """Return the problem with the parameter fixed at `target`, and the cost of the difference between
-        `target` and the known value of the number."""
+        `target` and the known value of the parameter."""
         problem, relative_error = self.fitted.problem, _TIGHT_ERROR * min(self.spread, 1.0)
         if self.is_unbalance:
             known, value = problem.unbalances[self.index], math.exp(target)

@@ -88,7 +88,7 @@ def _special_text(points: list[dict], scale: float) -> str:
 @app.command("onset")
 @click.argument("scene", type=click.Path(path_type=Path))
 @_VARY
-@click.option("--kind", required=True, help="Kind of the special point: fold, torus (torus bifurcation), symmetry or another.")
+@click.option("--kind", required=True, help="Kind: fold, torus (torus bifurcation), period_doubling or symmetry.")
 @click.option(
     "--between", nargs=2, required=True, metavar="LOW HIGH", help="A value without the special point, and a higher one with it."
 )

@@ -82,8 +82,8 @@ class Regime(Result):
     - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed`, rad/s
     - `mode`: estimated number of the jam mode; 0 if the loads are not jammed. Let natural frequency k be the last one below the
       mean load speed. Mode 2 k begins at this frequency; mode 2 k + 1 ends at the next one, or at the rotor speed if that is
-      lower. The estimate is the mode whose end is nearer to the mean load speed. Beyond the last of nd frequencies, loads close
-      to the rotor speed are therefore in mode 2 nd + 1
+      lower. The estimate is mode 2 k if the mean load speed is nearer to its beginning than to the end of mode 2 k + 1,
+      otherwise mode 2 k + 1. Beyond the last of nd frequencies, loads close to the rotor speed are therefore in mode 2 nd + 1
     - `caught`: True if the rotor itself stays at a resonance, below the no-load speed of its motor
     - `change`: largest change of a load's mean speed from the first to the second half, relative to the rotor speed; the motion
       is steady below 0.003. If all loads turn with the rotor, it is at least the largest change of their mean phases, rad

@@ -325,7 +325,7 @@ def grid_near_poles(model: LinearModel, per_side: int, highest: Array | None = N
 
 
 def resampled_grid(grid: Array, points: int, top: Array) -> Array:
-    """Return a number of `points`, ascending load speeds up to `top`, with the density of `grid`.
+    """Return `points` ascending load speeds up to `top`, with the density of `grid`.
 
     They are equally spaced in the index of this grid. Points that would lie above `top` are replaced by evenly spaced ones
     below it.

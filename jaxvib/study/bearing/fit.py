@@ -26,11 +26,11 @@ TOLERANCE = 1e-9
 
 
 class Unknowns(NamedTuple):
-    """Parameters of a fit.
+    """Unknowns of a fit.
 
     **Attributes**: `angle` rad and `rate` rad/s at the first sample, measured from the rest position, which a constant torque
     shifts from the hanging position; `offset` rad: the recorded angle of the rest position; `frequency` rad/s of small swings;
-    `friction`. With these parameters, the estimate of the torque is nearly uncorrelated with the estimates of the others.
+    `friction`. With these unknowns, the estimate of the torque is nearly uncorrelated with the estimates of the others.
     """
 
     angle: Array
@@ -61,12 +61,13 @@ class Fit(NamedTuple):
 def first_guess(
     pendulum: BearingPendulum, record: Record, turns: TurningPoints, dry: bool, air: bool = False, torque: bool = False
 ) -> tuple[Unknowns, Array]:
-    """Return the initial parameters of a fit, from the turning points, and the smoothing width of dry friction, rad/s.
+    """Return the initial unknowns of a fit, from the turning points, and the smoothing width of dry friction, rad/s.
 
     **Arguments**: `dry`, `air`, `torque`: True if this part of the law is an unknown of the fit; the initial drag of the air
     and the initial torque are 0.
 
-    A swing loses pi mu1/(2 J w) of its amplitude in half a period to viscous friction and 2 T_f/(m g l) to dry friction.
+    A swing loses pi mu1/(2 J w) of its amplitude in half a period to viscous friction, and 2 T_f/(m g l) to dry
+    friction with the torque T_f.
     """
     a = turns.amplitude
     stretch = period_stretch(a)
