@@ -36,8 +36,8 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
 
     Platforms are drawn above each other, numbered from the foundation upward. A rotor is drawn along its axis, a rotor with
     tilt also from the side. Loads are spread over their circle so that each is visible. Only the loads and their circle are to
-    scale. A body in a plane is drawn to scale about the points to which something is attached, with its springs in their
-    directions.
+    scale. A body in a plane is drawn to scale, with an outline about the points to which something is attached, and with its
+    springs in their directions.
 
     **Arguments**
 
