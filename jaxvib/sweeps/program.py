@@ -106,8 +106,8 @@ def _measure_cases_compiled(scene: Scene, values: Array, program: str, *choices:
 
 @cached
 def _rates(scene: Scene, values: Array, targets: tuple[Target, ...]) -> Array:
-    """Return rates (cases, 5) of cases (cases, axes): fastest and -slowest rate, decay, rotor speed, and the sum of the squared
-    natural frequencies.
+    """Return rates (cases, 5) of cases (cases, axes): fastest rate, minus the slowest rate, decay, rotor speed, and the sum of
+    the squared natural frequencies.
 
     The sum serves the search of `extreme_cases`, which changes one axis at a time: if the rotor is faster than all vibrations,
     a stiffness does not change the fastest rate, but it changes the sum.

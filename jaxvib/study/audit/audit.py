@@ -51,7 +51,8 @@ class Audit(Result):
     - `motion`: description of the compared motion
     - `kind` of the motion of the scene as given, before any effect is removed or added; its `omega`, rad/s, `amplitude`
       (nd,), m (rad for tilts), and `foundation_force`, N; `fold`: the rotor speed at which the jam ends, rad/s
-    - `operations` of its equations of motion, `seconds` of a run of 100 turns and `compile`, s (NaN if times were not measured)
+    - `operations` of its equations of motion, `seconds` of a run of 100 turns, and `compile`, the time of its compilation, s
+      (NaN if times were not measured)
     - `effects`, `tiers` and `numbers`: lists of `EffectRow`, `TierRow`, `NumberRow`
     - `coordinates`: the names of the coordinates
     """

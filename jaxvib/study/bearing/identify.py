@@ -40,7 +40,7 @@ class IdentifyStatus(eqx.Enumeration):
     """Outcomes of a fit. The value of each member is the message shown to the user."""
 
     found = "the fit explains the record up to noise"
-    patterned = "the residuals of the fit are not noise: the friction law is incomplete, and its numbers depend on the swing"
+    patterned = "the residuals of the fit are not noise: the friction law is incomplete; its coefficients depend on the swing"
     negative = "a coefficient of friction is below 0: the swing grows, or its decay does not follow this law"
     contradicted = "the period contradicts the length and inertia of the pendulum: check both, because mu1 is proportional to J"
     undetermined = "the record does not determine the friction: it is too short, too noisy, or has swings of one amplitude only"
