@@ -80,15 +80,15 @@ def tolerance_ranges(
     - `scene` of the design
     - `quantities`, or demands of quantities; typical: 1 to 5
     - `tolerances`: texts of one of two forms. NAME=PERCENT, such as "stiffness=5%": 95 of 100 machines are within the
-      tolerance, and the deviations of all numbers are independent. NAME=LOW..HIGH, such as "machine.mass[0]=100kg..130kg": all
-      values of the range are equally likely. Short names are stiffness and damping (of all springs and dampers), mass, drag and
-      unbalance. "material=0..20kg" is material on platform or body 1, at its centre of mass, "material[2]=..." on platform or
-      body 2
+      tolerance, and the deviations of all parameters are independent. NAME=LOW..HIGH, such as "machine.mass[0]=100kg..130kg":
+      all values of the range are equally likely. Short names are stiffness and damping (of all springs and dampers), mass, drag
+      and unbalance. "material=0..20kg" is material on platform or body 1, at its centre of mass, "material[2]=..." on platform
+      or body 2
     - `samples`: number of machines; typical: 64 to 1000 (default 128)
     - `seed` of the random deviations
 
     **Returns** a list of `ToleranceRange`, one for each of the `quantities`. **Raises** `InputError` for a text of another
-    form, an unknown name, and a number that is named twice, even if one of the two names is short.
+    form, an unknown name, and a parameter that is named twice, even if one of the two names is short.
 
     >>> import jaxvib as jv
     >>> from optimize import jam_frequency
@@ -139,7 +139,7 @@ class Tolerances(NamedTuple):
 
 def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
     """Return tolerances from texts, see `tolerance_ranges`. **Raises** `InputError` for a text of another form, an unknown
-    name, or a number that is named twice."""
+    name, or a parameter that is named twice."""
     errors: list[tuple[str, float]] = []
     ranges: list[_NumberRange] = []
     present = numbers_of(scene)
@@ -149,7 +149,7 @@ def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
             raise InputError("tolerances", f"is {quoted(text)}; write NAME=PERCENT or NAME=LOW..HIGH, such as stiffness=5%")
         if "." not in name and name not in _SHORT_NAMES and not _MATERIAL.fullmatch(name):
             known = suggest_name(name, [*_SHORT_NAMES, "material"])
-            raise InputError(f"tolerances.{name}", f"is no short name; {known}, and parameters such as machine.mass")
+            raise InputError(f"tolerances.{name}", f"is not a short name; {known}, and parameters such as machine.mass")
         if percent := _PERCENT.fullmatch(value):
             size = float(percent[1]) / 100.0
             if not 0.0 < size < 1.0:

@@ -23,13 +23,13 @@ COUNT = "loads.count"
 
 _LOAD_NUMBERS = ("loads.mass", "loads.radius", "loads.drag")
 _MACHINE_NUMBERS = ("machine.mass", "machine.stiffness", "machine.link_stiffness", "machine.damping", "machine.link_damping")
-"""Numbers of loads and of a machine that have sliders."""
+"""Parameters of loads and of a machine that have sliders."""
 
 _MACHINE_FIELDS = ("stiffness", "link_stiffness", "angle", "mass", "inertia", "damping", "link_damping")
 """Fields of a machine, or of its supports and bodies, that have sliders if its exciters have unbalances."""
 
 _HALF_TURN = 180
-"""Half the range of the slider of an angle, in degrees, which are also its steps."""
+"""Half the range of the slider of an angle, in degrees. Its steps are 1 degree."""
 
 _MAX_SINGLE_SLIDERS = 15
 """Maximum number of sliders for single parameters of a machine. A machine with more parameters has one slider for all of a

@@ -37,9 +37,9 @@ _MAX_IMPLICIT_SIZE = 64
 
 @cached
 def fastest_decay(scene: Scene) -> Array:
-    """Return the fastest decay rate, 1/s, due to the drag of the loads or the damping of the carrier.
+    """Return the fastest decay rate, 1/s, due to the drag of the loads or the damping of the carrier: the larger of
 
-        max_j(-Q'_j / H_j) / (1 - mu sum_j m_j / kappa_j),      the largest eigenvalue of M^-1 C
+        max_j(-Q'_j / H_j) / (1 - mu sum_j m_j / kappa_j)   and   the largest eigenvalue of M^-1 C
 
     Q' is the derivative of the resistance of a load with respect to its rate, H its inertia, mu the trace of P M^-1 P^T with
     the rows P of the mount (the motion of the carrier reduces the effective inertia of the loads). The denominator is at least

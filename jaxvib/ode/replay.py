@@ -104,8 +104,8 @@ def _solve(
 def _require_reverse(inputs: _Inputs) -> _Inputs:
     """Return the inputs; a program that contains their forward derivatives raises `InputError` when it is compiled or run.
 
-    JAX reports such a program by an error of its own, `can't apply forward-mode autodiff to a custom_vjp function`, and only
-    when it is compiled, because `linearize` may be the beginning of a reverse derivative.
+    Without this function JAX would raise its own error, `can't apply forward-mode autodiff to a custom_vjp function`. Neither
+    error can be raised before the program is compiled, because `linearize` may be the beginning of a reverse derivative.
     """
     if not CAN_DEFINE_PRIMITIVES:
         return inputs

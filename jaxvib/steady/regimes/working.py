@@ -51,9 +51,9 @@ def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
 
         Lambda = -(Omega^4/4) sum_ik S_i S_k Re(exp(i (alpha_k - alpha_i)) H_ik)
 
-    Without damping this regime is the deepest minimum of Lambda, which the exciters reach from most initial states. (A minimum
-    can be unstable if the rotors are light; such a regime is not returned.) If none of these regimes is stable, groups of
-    slower regimes follow, each 5 % wide.
+    with the symbols of `synchronous_regimes`. Without damping this regime is the deepest minimum of Lambda, which the exciters
+    reach from most initial states. (A minimum can be unstable if the rotors are light; such a regime is not returned.) If none
+    of these regimes is stable, groups of slower regimes follow, each 5 % wide.
 
     The search takes a hundredth of the time of `synchronous_regimes`, and works under `jit`, `vmap` and `grad`. Derivatives are
     those of the implicit function theorem. With more than 6 exciters, each start is first moved toward a stable regime, as in
