@@ -10,21 +10,18 @@ import pytest
 import jaxvib as jv
 
 
-def test_an_import_loads_little():
-    """The package alone needs nothing; a jam mode needs neither pictures nor the time integrator."""
-    code = """
-import sys, jaxvib
-assert not {"jax", "matplotlib", "diffrax", "pint"} & set(sys.modules)
-jaxvib.jam_modes
-assert "jax" in sys.modules and not {"matplotlib", "diffrax", "pint", "rich", "optax"} & set(sys.modules)
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_no_name_loads_pictures():
-    """A user who draws nothing does not wait for matplotlib: only the names that draw load it."""
+def test_names_load_little():
+    """The package alone needs nothing; a jam mode needs neither pictures nor the time integrator. A user who draws nothing does
+    not wait for matplotlib: only the names that draw load it."""
     names = sorted(set(jv.__all__) - {"animate", "sketch"})
-    code = f"import sys, jaxvib; [getattr(jaxvib, name) for name in {names}]; assert 'matplotlib' not in sys.modules"
+    code = f"""
+import sys, jaxvib
+assert not {{"jax", "matplotlib", "diffrax", "pint"}} & set(sys.modules)
+jaxvib.jam_modes
+assert "jax" in sys.modules and not {{"matplotlib", "diffrax", "pint", "rich", "optax"}} & set(sys.modules)
+[getattr(jaxvib, name) for name in {names}]
+assert "matplotlib" not in sys.modules
+"""
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
