@@ -10,7 +10,7 @@ from plugins.drive import Turbine
 from plugins.effect import SealFriction
 from plugins.load import TorusPoints
 from plugins.machine import Beam
-from scenes import jam_rotor_speed, machines, published
+from scenes import jam_rotor_speed, machines, published, rates_at
 
 import jaxvib as jv
 from jaxvib.equations.averaged import averaged_field
@@ -82,7 +82,7 @@ def test_every_tier_answers_or_refuses_by_a_property():
 def test_the_power_of_an_effect_from_outside_balances_the_energy():
     scene = with_friction()
     state = jv.State(jnp.asarray([0.1, -0.2]), jnp.asarray([0.3, 0.1]), (jnp.asarray([0.4]),), (jnp.asarray([1.1]),))
-    change = jv.vector_field(scene)(jnp.asarray(0.0), state)
+    change = rates_at(scene, jnp.asarray(0.0), state)
     rate = jax.jvp(lambda y: jv.energy(scene, y), (state,), (change,))[1]
     supplied, lost = jv.power(scene, jnp.asarray(0.0), state)
     np.testing.assert_allclose(rate, supplied - lost, rtol=1e-11)
@@ -102,7 +102,7 @@ def test_two_coordinate_loads_balance_power_in_ensembles():
     scene = on_torus()
     angle, rate = (jnp.asarray([0.1, 2.0]), jnp.asarray([1.2, 1.9])), (jnp.full(2, 40.0), jnp.zeros(2))
     start = jv.State(jnp.asarray([1e-3, 0.0]), jnp.zeros(2), angle, rate)
-    change = jv.vector_field(scene)(jnp.asarray(0.0), start)
+    change = rates_at(scene, jnp.asarray(0.0), start)
     growth = jax.jvp(lambda y: jv.energy(scene, y), (start,), (change,))[1]
     supplied, lost = jv.power(scene, jnp.asarray(0.0), start)
     np.testing.assert_allclose(growth, supplied - lost, rtol=1e-10)

@@ -13,6 +13,11 @@ from jaxvib.equations.averaged import Amplitudes, _with_conjugate, amplitudes_of
 from jaxvib.equations.linear import linear_model
 
 
+@eqx.filter_jit
+def averaged_change(scene, t, state):
+    return averaged_model(linear_model(scene))(jnp.asarray(t), state)
+
+
 def at_jam(jam):
     return Amplitudes(jam.displacement, 1j * jam.omega * jam.displacement, jam.omega[None], jnp.zeros(1))
 
@@ -159,8 +164,9 @@ def test_ideal_drives_turn_unbalances_at_their_acceleration():
         jv.Exciter(drive=jv.ConstantSpeed(35.0), unbalance=0.2, at=2),
         jv.Exciter(drive=profile, loads=jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5), at=2),
     ]
-    field, zero = averaged_model(linear_model(jv.Scene(machine, exciters=exciters))), jnp.zeros(2, complex)
-    change = field(jnp.asarray(1.5), Amplitudes(zero, zero, jnp.asarray([30.0, 35.0, 20.0, 25.0]), jnp.zeros(4)))
+    zero = jnp.zeros(2, complex)
+    state = Amplitudes(zero, zero, jnp.asarray([30.0, 35.0, 20.0, 25.0]), jnp.zeros(4))
+    change = averaged_change(jv.Scene(machine, exciters=exciters), 1.5, state)
     np.testing.assert_allclose(change.rate[:2], [profile.rotor_acceleration(1.5), 0.0], rtol=1e-12)
     assert float(profile.rotor_acceleration(1.5)) > 5.0
 
@@ -179,7 +185,7 @@ def test_motors_accelerate_by_torque_and_vibration(count):
     rng = np.random.default_rng(0)
     y, v = rng.normal(size=(2, 3, 2)) @ np.array([1e-2, 1e-2j])
     w, psi = 60.0 + rng.normal(size=count), rng.normal(size=count)
-    change = averaged_model(linear_model(scene))(jnp.asarray(0.0), Amplitudes(*map(jnp.asarray, (y, v, w, psi))))
+    change = averaged_change(scene, 0.0, Amplitudes(*map(jnp.asarray, (y, v, w, psi))))
     acceleration = np.asarray(change.velocity) + 1j * np.mean(w) * v
     carrier, force = scene.machine.carrier(), 0.0
     for k, (exciter, motor) in enumerate(zip(exciters, motors, strict=True)):

@@ -1,5 +1,6 @@
 """Equations of motion of several exciters against the Lagrangian by automatic differentiation."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,6 +64,11 @@ def state_of(scene, seed=0):
     leaves, structure = jax.tree.flatten(jv.initial_state(scene))
     sizes = [3.0 * rng.normal(size=np.shape(leaf)) for leaf in leaves]
     return jax.tree.unflatten(structure, [jnp.asarray(x) for x in sizes])
+
+
+@eqx.filter_jit
+def field(scene, state):
+    return jv.vector_field(scene)(T, state)
 
 
 def first_moments(e):
@@ -156,7 +162,7 @@ def flat(scene, change):
 def test_several_exciters_are_euler_lagrange(name, n):
     scene = scene_of(name, n)
     state = state_of(scene)
-    found = flat(scene, jax.jit(lambda y: jv.vector_field(scene)(T, y))(state))
+    found = flat(scene, field(scene, state))
     expected = jax.jit(lambda y: lagrange(scene, y))(state)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * float(jnp.max(jnp.abs(expected))))
 
@@ -169,7 +175,7 @@ def test_a_group_of_exciters_is_euler_lagrange(name, kind):
     scene = jv.Scene(machine, exciters=[alike[0], exciter(0, places), *alike[1:]], effects=GRAVITY)
     assert sorted(len(group.members) for group in jv.vector_field(scene).groups) == [1, 8]
     state = state_of(scene)
-    found = flat(scene, jax.jit(lambda y: jv.vector_field(scene)(T, y))(state))
+    found = flat(scene, field(scene, state))
     expected = jax.jit(lambda y: lagrange(scene, y))(state)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * float(jnp.max(jnp.abs(expected))))
 
@@ -200,8 +206,8 @@ def test_two_half_exciters_at_one_place_are_one(direction):
 
     one, two = (jv.Scene(ROTOR, exciters=each, effects=GRAVITY) for each in ([half(1.0)], [half(0.5)] * 2))
     state = state_of(one)
-    whole = jv.vector_field(one)(T, state)
-    parted = jv.vector_field(two)(T, jv.State(state.displacement, state.velocity, exciters=state.exciters * 2))
+    whole = field(one, state)
+    parted = field(two, jv.State(state.displacement, state.velocity, exciters=state.exciters * 2))
     np.testing.assert_allclose(parted.velocity, whole.velocity, rtol=1e-12)
     for own in parted.exciters:
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-12), own, whole.exciters[0])
@@ -226,6 +232,6 @@ def test_clockwise_exciter_is_the_mirror_image():
         return jv.State(flip * state.displacement, flip * state.velocity, exciters=[other])
 
     state = state_of(scene(1))
-    there = jv.vector_field(scene(-1))(T, mirrored(state, jnp.pi))
-    expected = mirrored(jv.vector_field(scene(1))(T, state), 0.0)
+    there = field(scene(-1), mirrored(state, jnp.pi))
+    expected = mirrored(field(scene(1), state), 0.0)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-11), there, expected)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rotors import CASES, case, rotor_state
+from scenes import rates_at
 
 import jaxvib as jv
 
@@ -15,7 +16,7 @@ import jaxvib as jv
 def test_energy_changes_by_the_power_that_comes_and_goes(name):
     s = case(name)
     state, t = rotor_state(s, 3), jnp.asarray(0.7)
-    field = jv.vector_field(s)(t, state)
+    field = rates_at(s, t, state)
     _, change = jax.jvp(functools.partial(jv.energy, s), (state, t), (field, jnp.ones_like(t)))
     supplied, lost = jv.power(s, t, state)
     size = abs(float(supplied)) + abs(float(lost))

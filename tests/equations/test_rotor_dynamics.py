@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from lagrange import residual
 from rotors import CASES, MASS, STATIONS, case, machine, pendulums, rotor_state
+from scenes import rates_at
 
 import jaxvib as jv
 
@@ -39,7 +40,7 @@ def test_published_equations_of_the_rotor():
         (jv.Gravity(), jv.StaticImbalance(big * e), jv.MomentImbalance((a_ - c_) * moment, angle=-gamma)),
     )
     state, t = rotor_state(s, 5), 1.1
-    field = jv.vector_field(s)(jnp.asarray(t), state)
+    field = rates_at(s, jnp.asarray(t), state)
     (y, z, th, ps), (dy, dz, dth, dps), (ddy, ddz, ddth, ddps) = state.displacement, state.velocity, field.velocity
     f, df, ddf, st = state.angle[0], state.rate[0], field.rate[0], np.array(STATIONS)
     w, phi = accel * t, accel * t**2 / 2
@@ -85,7 +86,7 @@ def test_a_rotor_held_in_its_plane_is_the_planar_rotor():
         (jnp.concatenate([state.displacement, jnp.zeros(2)]), jnp.concatenate([state.velocity, jnp.zeros(2)])),
     )
     t = jnp.asarray(0.3)
-    a, b = jv.vector_field(whole)(t, padded), jv.vector_field(plane)(t, state)
+    a, b = rates_at(whole, t, padded), rates_at(plane, t, state)
     np.testing.assert_allclose(a.velocity[2:], 0.0, atol=1e-12)
     np.testing.assert_allclose(a.velocity[:2], b.velocity, rtol=1e-12)
     np.testing.assert_allclose(a.rate[0], b.rate[0], rtol=1e-12)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import rates_at
 
 import jaxvib as jv
 from jaxvib.equations.averaged import averaged_loads
@@ -92,7 +93,7 @@ def test_refusal_names_every_effect_and_term():
 @pytest.mark.parametrize("term", [TERMS[1], TERMS[2], TERMS[5], TERMS[8]], ids=lambda term: type(term).__name__)
 def test_power_of_a_term_balances_the_energy(term):
     given = scene(term)
-    change = jv.vector_field(given)(jnp.asarray(0.0), state())
+    change = rates_at(given, jnp.asarray(0.0), state())
     growth = jax.jvp(lambda y: jv.energy(given, y), (state(),), (change,))[1]
     supplied, lost = jv.power(given, jnp.asarray(0.0), state())
     np.testing.assert_allclose(growth, supplied - lost, rtol=1e-11)
@@ -106,7 +107,7 @@ def test_resistance_brakes_each_load_by_its_force():
 
 
 def test_linear_support_force_equals_a_stiffer_spring():
-    added, stiffer = (jv.vector_field(s)(jnp.asarray(0.0), state()) for s in (scene(TERMS[8]), scene(stiffness=4.3e4)))
+    added, stiffer = (rates_at(s, jnp.asarray(0.0), state()) for s in (scene(TERMS[8]), scene(stiffness=4.3e4)))
     np.testing.assert_allclose(added.velocity, stiffer.velocity, rtol=1e-12)
     np.testing.assert_allclose(added.rate[0], stiffer.rate[0], rtol=1e-12)
 

@@ -1,5 +1,6 @@
 """Platforms, loads on a circle, and states of scenes with them, which many tests share."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -67,14 +68,22 @@ def some_state(s):
     return jv.State(draw[0], draw[1], (draw[2],), (30.0 + draw[3],))
 
 
+@eqx.filter_jit
+def rates_at(scene, t, state):
+    """Rates of change of a state, from one program: operation by operation each of some hundred is compiled."""
+    return jv.vector_field(scene)(t, state)
+
+
 def assembled(scene):
     """The scene's carrier with its coincident loads, as exact jams take it."""
     return jammed_bodies(jammed_model(scene))
 
 
+@eqx.filter_jit
 def jam_rotor_speed(scene, omega):
     return rotor_speed_at(jammed_model(scene), omega)
 
 
+@eqx.filter_jit
 def steady_displacement(scene, omega):
     return jammed_model(scene).displacement(omega)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rotors import STATIONS, machine
-from scenes import loads, machines
+from scenes import loads, machines, rates_at
 
 import jaxvib as jv
 
@@ -68,7 +68,7 @@ def test_loads_on_two_discs_are_euler_lagrange():
     scene = jv.Scene(Pair(), loads()["balls"], jv.ConstantSpeed(40.0), (jv.Gravity(),))
     rng = np.random.default_rng(4)
     state = jv.State(*(jnp.asarray(x) for x in rng.normal(size=(2, 2))), *((jnp.asarray(x),) for x in rng.normal(size=(2, 3))))
-    change = jv.vector_field(scene)(0.0, state)
+    change = rates_at(scene, 0.0, state)
     m, r, kappa, drag = 0.8, 0.12, 1.4, 1.5 * 0.12**2
     carrier, disc = scene.machine.carrier(), np.array([0, 1, 0])
     x, v = (jnp.concatenate(pair) for pair in ((state.displacement, state.angle[0]), (state.velocity, state.rate[0])))

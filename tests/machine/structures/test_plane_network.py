@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import rates_at
 
 import jaxvib as jv
 from jaxvib.machine.numbers.named import numbers_of
@@ -86,7 +87,7 @@ def flat(state, rates):
 
 def test_equations_of_motion_are_euler_lagrange():
     state = random_state()
-    change = jv.vector_field(SCENE)(T, state)
+    change = rates_at(SCENE, T, state)
     x, v, a = flat(state, False), flat(state, True), flat(change, True)
     inertial = jax.jvp(jax.grad(kinetic, 1), (x, v), (v, a))[1]
     left = inertial - jax.grad(kinetic)(x, v) + jax.grad(potential)(x)
@@ -103,7 +104,7 @@ def test_equations_of_motion_are_euler_lagrange():
 
 def test_energy_changes_by_the_power_of_the_drives():
     state = random_state()
-    change = jv.vector_field(SCENE)(T, state)
+    change = rates_at(SCENE, T, state)
     rate = jax.jvp(lambda y, t: jv.energy(SCENE, y, t), (state, T), (change, 1.0))[1]
     given, lost = jv.power(SCENE, T, state)
     np.testing.assert_allclose(rate, given - lost, rtol=1e-12, atol=1e-12 * float(abs(given) + abs(lost)))
