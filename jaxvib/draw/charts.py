@@ -15,8 +15,8 @@ from jaxvib.draw.style import (
     GUIDE,
     HATCHED,
     MARKERS,
-    OPERATING,
     UNSTABLE,
+    WORKING,
     Look,
     label_colors,
     legend_above,
@@ -63,10 +63,10 @@ def branch_diagram(
       None: all m
     - `force` (n,): foundation force, N
     - `resonances`: resonances, rad/s, drawn as horizontal lines
-    - `modes` (n,): numbers of the jam modes, written on the line of the operating speed
+    - `modes` (n,): numbers of the jam modes, written on the line of the working speed
     - `marks`: points, each (label, rotor speeds, load speeds), rad/s
     - `names` (nd,): names of the coordinates
-    - `at`: operating speed, rad/s, drawn as a vertical line
+    - `at`: working speed, rad/s, drawn as a vertical line
     - `show`: panels to draw, some of `PARTS`
     - `linear`: True for linear axes of amplitudes and force, False for logarithmic ones
     """
@@ -102,7 +102,7 @@ def branch_diagram(
             axis.set(yscale="log", ylim=log_limits([values for _, values in group], rotor_speed, omega, resonances))
             log_ticks(axis)
         if at is not None:
-            _operating_line(axis, scale * at, crossed, [values for _, values in group])
+            _working_line(axis, scale * at, crossed, [values for _, values in group])
     if ax is None:
         legend_outside(figure, axes, 4 if columns > 1 else 2)
     else:
@@ -112,9 +112,9 @@ def branch_diagram(
     return figure if ax is None else ax
 
 
-def _operating_line(axis: Axes, at: float, crossed: list[tuple[int, float, str, bool]], curves: Sequence[np.ndarray]) -> None:
-    """Draw the line of the operating speed, with the numbers of the jams where it crosses the curves, see `crossings`."""
-    axis.axvline(at, label="operating speed; numbers: jam modes", **OPERATING)
+def _working_line(axis: Axes, at: float, crossed: list[tuple[int, float, str, bool]], curves: Sequence[np.ndarray]) -> None:
+    """Draw the line of the working speed, with the numbers of the jams where it crosses the curves, see `crossings`."""
+    axis.axvline(at, label="working speed; numbers: jam modes", **WORKING)
     points = []
     for i, share, number, filled in crossed:
         heights = [float(np.interp(share, [0, 1], values[i : i + 2])) for values in curves]

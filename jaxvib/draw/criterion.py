@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import NullLocator
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
-from jaxvib.draw.style import GUIDE, OPERATING, legend_above, log_ticks, panels
+from jaxvib.draw.style import GUIDE, WORKING, legend_above, log_ticks, panels
 
 _KINDS = (
     ("loads gather (both agree)", "#ececec"),
@@ -78,7 +78,7 @@ def criterion_chart(
     """Draw the `functional` of the criterion (S,), kg m^2, over the rotor `speed` (S,), rad/s, drawn in `unit`.
 
     The intervals `balancing` of the criterion (start, end), rad/s, are shaded; None is an open end. The intervals `exact` of
-    the exact stability, rad/s, are bars at the bottom. `at` is the operating speed, rad/s. The functional spans many decades
+    the exact stability, rad/s, are bars at the bottom. `at` is the working speed, rad/s. The functional spans many decades
     near resonances; therefore its scale is that of arsinh, which is logarithmic for large values of both signs and smooth at 0.
 
     >>> import matplotlib.pyplot as plt, numpy as np
@@ -111,7 +111,7 @@ def criterion_chart(
     legend: list[Patch | Line2D] = [Patch(color=_KINDS[1][1], alpha=0.5, label="balancing, by the criterion")]
     legend += [Patch(color="black", label="balancing, exactly")] if exact is not None else []
     if at is not None:
-        legend.append(ax.axvline(scale * at, label="operating speed", **OPERATING))
+        legend.append(ax.axvline(scale * at, label="working speed", **WORKING))
     legend_above(ax, handles=legend)
     for y, words in ((0.96, "f > 0: loads gather"), (0.05, "f < 0: loads balance the rotor")):
         ax.text(0.99, y, words, transform=ax.transAxes, ha="right", va="center", fontsize="small", color="#555555")

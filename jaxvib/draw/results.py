@@ -13,9 +13,9 @@ from jaxvib.draw.style import (
     COLORS,
     GUIDE,
     MARKERS,
-    OPERATING,
     STROKES,
     UNSTABLE,
+    WORKING,
     Look,
     legend_above,
     log_ticks,
@@ -386,7 +386,7 @@ def drag_diagram(
     axis.plot([], [], color="black", lw=_WIDTHS[0], label="stable")
     axis.plot([], [], color="black", ls=UNSTABLE, lw=_WIDTHS[1], label="unstable")
     axis.axhline(scale * rotor_speed, color=GUIDE, lw=1.2, label="rotor speed")
-    axis.axvline(at, label="the scene's drag; points: its jams", **OPERATING)
+    axis.axvline(at, label="the scene's drag; points: its jams", **WORKING)
     if jams is not None:
         speed, stable = jams
         for kind, face in ((~stable, "white"), (stable, "black")):

@@ -58,8 +58,8 @@ UNSTABLE = (0, (3, 2))
 GUIDE = "#8a8a8a"
 """Colour of reference lines: resonances, limits, the rotor speed."""
 
-OPERATING: Look = {"color": "black", "lw": 1.0, "ls": (0, (8, 2, 2, 2)), "zorder": 1.5}
-"""Style of the line of the operating speed."""
+WORKING: Look = {"color": "black", "lw": 1.0, "ls": (0, (8, 2, 2, 2)), "zorder": 1.5}
+"""Style of the line of the working speed."""
 
 _STYLE: Any = {
     "font.size": 10.0,

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import Drawn, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, OPERATING, WHITE_OUTLINE, legend_above, panels
+from jaxvib.draw.style import COLORS, GUIDE, WHITE_OUTLINE, WORKING, legend_above, panels
 
 _SENSES = {
     "forward": (COLORS[0], "-", "forward whirl"),
@@ -35,7 +35,7 @@ def campbell_diagram(
     - `sense` (ns, nd): "forward", "backward" or "straight"
     - `critical`: critical speeds (k,), rad/s, and their senses (k,), marked with their values on the line whirl frequency =
       rotor speed
-    - `at`: operating speed, rad/s; default: the rotor speed if there is only one, otherwise none
+    - `at`: working speed, rad/s; default: the rotor speed if there is only one, otherwise none
 
     >>> import numpy as np
     >>> n = np.linspace(0.0, 2.0, 5)
@@ -57,7 +57,7 @@ def campbell_diagram(
         _critical_marks(axis, scale * critical[0], critical[1], right, top)
         axis.plot([], [], "o", ms=6.0, mfc="white", mec="black", label=f"critical speeds (no damping), {unit}", ls="")
     if at is not None:
-        axis.axvline(scale * at, label="operating speed", **OPERATING)
+        axis.axvline(scale * at, label="working speed", **WORKING)
     left = scale * float(np.min(rotor_speed)) if len(rotor_speed) > 1 else 0.0
     axis.set(xlim=(left, right), ylim=(0.0, top), xlabel=f"rotor speed, {unit}", ylabel=f"whirl frequency, {unit}")
     legend_above(axis, 3)

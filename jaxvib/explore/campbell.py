@@ -9,7 +9,7 @@ from jaxvib.draw.machine.parts import Text
 from jaxvib.draw.machine.svg import svg
 from jaxvib.draw.style import COLORS, GUIDE
 from jaxvib.draw.whirl import critical_groups, whirl_lines
-from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, dot, legend
+from jaxvib.explore.panel import APART, FIRST, LAST, ROTOR, TALL, WIDE, WORKING, Panel, dot, legend
 from jaxvib.steady.whirl import Whirl
 
 _SENSE_STYLES = {
@@ -28,7 +28,7 @@ _LEGEND = {
     "forward whirl": _SENSE_STYLES["forward"],
     "backward whirl": _SENSE_STYLES["backward"],
     "whirl frequency = rotor speed": ROTOR,
-    "operating speed": OPERATING,
+    "working speed": WORKING,
     "critical speeds (no damping), rpm": _CRITICAL,
 }
 """Styles of the lines and dots in the legend, by their names."""
@@ -37,7 +37,7 @@ _LEGEND = {
 def campbell(result: Whirl, at: float) -> str:
     """Draw the whirl frequencies over the rotor speed, with the critical speeds, in rpm, like `Whirl.plot`.
 
-    **Arguments**: `result`: whirl frequencies of one scene at several rotor speeds; `at`: the operating speed, rad/s.
+    **Arguments**: `result`: whirl frequencies of one scene at several rotor speeds; `at`: the working speed, rad/s.
 
     **Returns** the text of an SVG file.
 
@@ -61,7 +61,7 @@ def campbell(result: Whirl, at: float) -> str:
     for word, look in _SENSE_STYLES.items():
         parts += [panel.line(scale * rotor_speed, scale * values, look) for values in whirl_lines(speed, sense == word)]
     end = min(top, right)
-    parts += [panel.line([0.0, end], [0.0, end], ROTOR), panel.line([scale * at] * 2, panel.y, OPERATING)]
+    parts += [panel.line([0.0, end], [0.0, end], ROTOR), panel.line([scale * at] * 2, panel.y, WORKING)]
     for k in shown:
         w = float(critical[k])
         look = {**_CRITICAL, "ec": _SENSE_STYLES[str(critical_sense[k])]["color"]}

@@ -11,7 +11,7 @@ from jaxvib.draw.charts import crossings, log_limits, scaled_amplitudes, stretch
 from jaxvib.draw.machine.parts import Part, Text
 from jaxvib.draw.machine.svg import svg
 from jaxvib.draw.style import COLORS, GUIDE, join_names
-from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, dot, legend
+from jaxvib.explore.panel import APART, FIRST, LAST, ROTOR, TALL, WIDE, WORKING, Panel, dot, legend
 from jaxvib.steady.branches import Branches
 from jaxvib.steady.jams.branch_plot import MARKS
 from jaxvib.steady.jams.jam import STABILITY_CRITERION
@@ -25,7 +25,7 @@ _LEGEND = {
     "unstable": {**_UNSTABLE, "color": "black"},
     "resonance": _RESONANCE,
     "rotor speed": ROTOR,
-    "operating speed; numbers: jam modes": OPERATING,
+    "working speed; numbers: jam modes": WORKING,
 }
 """Styles of the lines in the legend, by their names."""
 
@@ -62,8 +62,8 @@ def chart(result: Branches, max_speed: float) -> str:
             for values, color in zip(curves.values(), COLORS, strict=False)
             for along, solid in stretches(stable)
         ]
-        dots, numbers = _jams_at_operating_speed(panel, [*curves.values()], crossed, scale * at)
-        parts += [panel.line([scale * at] * 2, panel.y, OPERATING), *dots]
+        dots, numbers = _jams_at_working_speed(panel, [*curves.values()], crossed, scale * at)
+        parts += [panel.line([scale * at] * 2, panel.y, WORKING), *dots]
         texts += numbers
     folds = [
         (scale * n, scale * w)
@@ -99,10 +99,10 @@ def _panels(result: Branches, scale: float, rotor_speed: np.ndarray) -> list[tup
     return panels
 
 
-def _jams_at_operating_speed(
+def _jams_at_working_speed(
     panel: Panel, curves: Sequence[np.ndarray], crossed: Sequence[tuple[int, float, str, bool]], at: float
 ) -> tuple[list[Part], list[Text]]:
-    """Return the dots at which the curves cross the operating speed `at`, and the numbers of the jams beside the highest."""
+    """Return the dots at which the curves cross the working speed `at`, and the numbers of the jams beside the highest."""
     dots, numbers = [], []
     for i, share, name, filled in crossed:
         heights = [panel.at(at, float(np.interp(share, [0, 1], values[i : i + 2])))[1] for values in curves]

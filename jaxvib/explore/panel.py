@@ -18,8 +18,8 @@ WIDE, TALL, FIRST, APART, LAST = 4.2, 3.6, 0.75, 1.1, 0.25
 units of the drawing."""
 
 ROTOR = {"color": GUIDE, "lw": 0.8}
-OPERATING = {"color": "black", "lw": 1.0, "ls": "-."}
-"""Styles of the line on which a speed is equal to the rotor speed, and of the operating speed."""
+WORKING = {"color": "black", "lw": 1.0, "ls": "-."}
+"""Styles of the line on which a speed is equal to the rotor speed, and of the working speed."""
 
 _MAX_TICKS = 5
 """Maximum number of ticks of an axis."""

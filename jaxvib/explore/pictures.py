@@ -147,7 +147,7 @@ def heading(scene: Scene) -> str:
     if has_branches(scene):
         return (
             "Jams of light loads: load speed, amplitudes and foundation force over the rotor speed. Solid lines: stable by "
-            "slope, for loads that stay together; dashed lines: unstable. The numbers on the vertical line of the operating "
+            "slope, for loads that stay together; dashed lines: unstable. The numbers on the vertical line of the working "
             "speed are those of the jam modes at this rotor speed."
         )
     return (

@@ -16,7 +16,7 @@ from jaxvib.draw.machine.svg import svg
 from jaxvib.draw.style import COLORS, GUIDE
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
-from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, legend
+from jaxvib.explore.panel import APART, FIRST, LAST, ROTOR, TALL, WIDE, WORKING, Panel, legend
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.regimes.synchronous import SynchronousRegime, synchronous_regimes
@@ -34,7 +34,7 @@ _LEGEND = {
     "regime": {**_LINE, "color": "black"},
     "resonance": _RESONANCE,
     "rotor speed = motor speed": ROTOR,
-    "operating speed": OPERATING,
+    "working speed": WORKING,
 }
 """Styles of the lines in the legend, by their names."""
 
@@ -84,7 +84,7 @@ def regime_chart(scene: Scene, max_speed: float) -> str:
     parts, texts = [], []
     panels = _panels(scene, curves, motor_speed, resonances, high)
     for panel, drawn in panels:
-        parts += [*panel.frame(), panel.line([scale * at] * 2, panel.y, OPERATING)]
+        parts += [*panel.frame(), panel.line([scale * at] * 2, panel.y, WORKING)]
         texts += panel.texts()
         parts += [
             panel.line(scale * motor_speed, values, {**_LINE, "color": color})

@@ -136,7 +136,7 @@ class Whirl(Result):
         """Plot the Campbell diagram: speeds of forward, backward and straight whirls over the rotor speed.
 
         Critical speeds are marked on the line on which the whirl frequency is equal to the rotor speed. A vertical line marks
-        the operating speed `at` if it is given.
+        the working speed `at` if it is given.
 
         **Arguments**: `at`, rad/s; `unit` of the speeds.
         """

@@ -282,7 +282,7 @@ def _margin(evaluation: Evaluation, tier: Tier) -> Array:
 
 
 def resonance_distance() -> Quantity:
-    """Return the distance of the working speed from the nearest natural frequency, relative to the working speed.
+    """Return the distance of the speed of the working regime from the nearest natural frequency, relative to this speed.
 
         min_r |w_r / Omega - 1|,    w_r natural frequencies, Omega speed of the working regime
 

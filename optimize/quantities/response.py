@@ -247,12 +247,12 @@ def _field(model: UnbalancedModel, w: Array, name: str) -> Array:
 
 
 def fold_distance() -> Quantity:
-    """Return the distance of the working speed of a motor from the nearest fold of the response, relative to this speed.
+    """Return the distance of the speed of a motor from the nearest fold of the response, relative to this speed.
 
         min_f |w_f / w - 1|
 
     w is the highest speed at which the motor can run, w_f the speed of a fold, see `TorqueFolds`. If the motor becomes weaker,
-    or the damping larger, the operating point at the working speed disappears at a fold.
+    or the damping larger, the operating point at the speed w disappears at a fold.
 
     **Returns** `Quantity`; typical: 0.2 to 0.9; 1 without a fold. A scene with several exciters or with an ideal drive raises
     `InputError` when the quantity is computed.

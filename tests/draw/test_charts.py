@@ -169,7 +169,7 @@ def test_the_scale_of_the_criterion_has_no_kink():
     step = 1e-6
     slopes = [(axis.transScale.transform((1.0, y + step)) - axis.transScale.transform((1.0, y)))[1] for y in (0.999, 1.001)]
     assert slopes[0] == pytest.approx(slopes[1], rel=0.01)  # at the median, where a symlog scale has a kink
-    assert "operating speed" in [text.get_text() for text in axis.get_legend().get_texts()]
+    assert "working speed" in [text.get_text() for text in axis.get_legend().get_texts()]
     assert all(text.get_fontsize() < axis.xaxis.label.get_fontsize() for text in axis.texts) and len(axis.texts) == 2
     assert list(axis.lines[-1].get_xdata()) == pytest.approx([2.0 * 30.0 / np.pi] * 2)
 

@@ -161,7 +161,7 @@ def test_whirls_have_a_line_for_each_sense():
 
 def test_one_rotor_speed_is_the_operating_speed():
     axis = campbell_diagram(np.array([10.0]), np.array([[4.0]]), np.array([["forward"]]), unit="rad/s").axes[0]
-    assert named(axis)["operating speed"][0][0] == 10.0 and axis.get_xlim() == pytest.approx((0.0, 10.5))
+    assert named(axis)["working speed"][0][0] == 10.0 and axis.get_xlim() == pytest.approx((0.0, 10.5))
 
 
 def test_critical_speeds_are_grouped_by_their_neighbour():

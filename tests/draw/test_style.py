@@ -82,7 +82,7 @@ def diagram(**options):
 def test_branch_diagram_labels_lines_and_modes():
     figure, speed, omega = diagram(unit="rpm")
     told = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert {"stable", "unstable", "resonance", "rotor speed", "operating speed; numbers: jam modes", "y1", "y2"} < set(told)
+    assert {"stable", "unstable", "resonance", "rotor speed", "working speed; numbers: jam modes", "y1", "y2"} < set(told)
     assert "fold: the jam ends" in told and figure.get_supxlabel() == "stable by slope"
     assert [(axis.get_title(loc="left"), axis.get_ylabel()) for axis in figure.axes] == [
         ("load speed", "rpm"),
