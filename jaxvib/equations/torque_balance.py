@@ -29,7 +29,7 @@ from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torqu
 from jaxvib.equations.linear import ExcitedModel, LinearModel, linear_model, rotating_direction
 from jaxvib.equations.model import grouped
 from jaxvib.machine.carrier import Mount
-from jaxvib.machine.drives.drive import ConstantSpeed, Drive, Motor
+from jaxvib.machine.drives.drive import Drive, Motor
 from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.loads import CircularLoads
@@ -138,7 +138,7 @@ def balance_of(model: LinearModel) -> TorqueBalance:
     for exciter, mount, count in zip(model.scene.exciters, model.mounts, averaged.counts, strict=True):
         rows = mount.load_rows(count) if count else mount.rows[0][None]
         directions.append(jnp.einsum("jka,k->ja", rows, rotating_direction(mount, exciter.direction)))
-    drives = tuple(ConstantSpeed(drive.speed) if drive.ideal else drive for drive in averaged.drives)
+    drives = tuple(drive.at_working_speed() for drive in averaged.drives)
     averaged = dataclasses.replace(averaged, groups=grouped(drives, averaged.counts))
     direction = directions[0] if len(directions) == 1 else jnp.concatenate(directions)
     return TorqueBalance(model, averaged, direction, _motor_torque(averaged))

@@ -314,7 +314,7 @@ def _require_one_no_load_speed(scene: Scene) -> None:
 @cached
 def _common_torques(scene: Scene) -> tuple[Array, Array]:
     """Return a grid of speeds, rad/s, and the sum of the torques of all motors, N m."""
-    drives = tuple(exciter.drive for exciter in scene.exciters)
+    drives = tuple(exciter.drive.at_working_speed() for exciter in scene.exciters)
     return common_speeds(drives), common_torques(drives)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.drives.drive import INERTIA, ConstantSpeed, Drive, IdealDrive, Motor, MotorWrapper
+from jaxvib.machine.drives.drive import INERTIA, Drive, IdealDrive, Motor, MotorWrapper
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number, Numbers
 from jaxvib.units.known import require_if_known, when_known
@@ -177,7 +177,7 @@ class SpeedProfile(IdealDrive):
         """Return `ConstantSpeed` at the last speed. **Raises** `InputError` if the rotor comes to rest."""
         problem = "end at 0, so there is no steady motion; use simulate, or a profile whose last speed is greater than 0"
         require_if_known(lambda speeds: speeds[-1] != 0.0, self.speeds, field="drive.speeds", problem=problem)
-        return ConstantSpeed(cast(Array, self.speed))
+        return self.at_working_speed()
 
 
 class Converter(MotorWrapper):
@@ -239,8 +239,12 @@ class Converter(MotorWrapper):
         return self.reference.jump_ts()
 
     def settled(self) -> Drive:
-        """Return the converter at the working speed."""
+        """Return the converter at the working speed. **Raises** `InputError` if the reference comes to rest."""
         return Converter(self.motor, cast(IdealDrive, self.reference.settled()))
+
+    def at_working_speed(self) -> Drive:
+        """Return the converter at the working speed."""
+        return Converter(self.motor, cast(IdealDrive, self.reference.at_working_speed()))
 
 
 class SpeedControl(Motor):

@@ -90,6 +90,10 @@ class Drive(Part):
         time as one that is off from the start."""
         return self
 
+    def at_working_speed(self) -> "Drive":
+        """Return the drive with its prescribed speed, if it has one, at the working speed, also if the rotor comes to rest."""
+        return self
+
 
 class Directed(Drive):
     """Drive that turns its rotor in a direction: angles, speeds and torques are those of `drive` times `direction`.
@@ -198,6 +202,10 @@ class IdealDrive(Drive):
         """Return None, because no torque changes the speed."""
 
     def settled(self) -> Drive:
+        """Return `ConstantSpeed`."""
+        return self.at_working_speed()
+
+    def at_working_speed(self) -> Drive:
         """Return `ConstantSpeed`."""
         return self if self.constant else ConstantSpeed(cast(Array, self.speed))
 
