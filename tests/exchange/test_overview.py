@@ -44,6 +44,8 @@ def test_problems_are_notes():
     assert short.notes == ("channel 'frame' has 399 times but 400 values",) and np.isnan(short.rate) and short.end == T[-2]
     no_times = overview_of(Recorded("frame", "g", None, np.full(30, np.nan)))
     assert np.isnan([no_times.rate, no_times.start, no_times.low]).all() and no_times.missing == 30 and no_times.notes == ()
+    partly = overview_of(Recorded("frame", "g", None, np.array([1.0, np.nan, 3.0])))
+    assert (partly.samples, partly.missing, partly.low, partly.high, partly.rms) == (3, 1, 1.0, 3.0, 1.0)
 
 
 CHANNELS = [
