@@ -7,7 +7,7 @@ from scenes import rates_at
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.show.views import view_of
-from jaxvib.show.wheel import at_rest
+from jaxvib.show.wheel import Wheel, at_rest
 
 REACH = 20.0
 PLATFORMS = ["one_mass", "two_mass", "three_mass", "network"]
@@ -130,3 +130,16 @@ def test_a_spring_and_its_damper_lie_beside_each_other(kind):
     across = (spring[0] + spring[-1]) / 2.0 - (np.min(damper, axis=0) + np.max(damper, axis=0)) / 2.0
     along = spring[-1] - spring[0]
     assert np.hypot(*across) == pytest.approx(0.34) and abs(along @ across) < 1e-9 * np.hypot(*along)
+
+
+@pytest.mark.parametrize(("ball_radius", "size"), [(None, 0.06), ("20 mm", 0.14), ("1 mm", 0.05)])
+def test_the_rim_of_a_rotor_encloses_its_loads(ball_radius, size):
+    loads = jv.balls(count=2, mass=0.5, radius=0.05, drag=1.0, ball_radius=ball_radius)
+    wheel = Wheel(jv.Exciter(loads, jv.ConstantSpeed(100.0)), 0.35)
+    assert (wheel.scale, wheel.size) == pytest.approx((7.0, size))
+    assert wheel.rim == pytest.approx(0.35 + max(1.15 * size, 0.1))
+
+
+def test_a_rotor_without_loads_has_a_radius_of_100_mm():
+    wheel = Wheel(jv.Exciter(drive=jv.ConstantSpeed(100.0), unbalance=0.1), 0.35)
+    assert (wheel.scale, wheel.size, wheel.rim) == pytest.approx((3.5, 0.06, 0.45))

@@ -1,0 +1,60 @@
+"""Axes, lines and legend of a chart as outlines, point by point."""
+
+import numpy as np
+import pytest
+
+from jaxvib.explore.panel import TALL, WIDE, Panel, dot, legend
+
+PANEL = Panel(1.0, "force, N", (0.0, 10.0), (0.0, 100.0))
+
+
+def test_axes_are_drawn_along_the_left_and_the_bottom():
+    *grid, edge = PANEL.frame()
+    np.testing.assert_allclose(edge.points, [[1.0, TALL], [1.0, 0.0], [1.0 + WIDE, 0.0]])
+    upright = [part.points for part in grid if part.points[0, 0] == part.points[-1, 0]]
+    level = [part.points for part in grid if part.points[0, 1] == part.points[-1, 1]]
+    np.testing.assert_allclose([points[0, 0] for points in upright], 1.0 + WIDE * np.arange(0.0, 1.1, 0.2))
+    np.testing.assert_allclose([points[:, 1] for points in upright], [[0.0, TALL]] * 6)
+    np.testing.assert_allclose([points[0, 1] for points in level], TALL * np.arange(0.0, 1.1, 0.2))
+    np.testing.assert_allclose([points[:, 0] for points in level], [[1.0, 1.0 + WIDE]] * 6)
+
+
+def test_numbers_stand_at_their_ticks():
+    texts = {text.text: (text.x, text.y, text.look.get("ha")) for text in PANEL.texts()}
+    for place, name in ((0.2, "2"), (0.8, "8"), (1.0, "10")):
+        assert texts[name] == (pytest.approx(1.0 + WIDE * place), -0.18, "center")
+    for place, name in ((0.2, "20"), (0.8, "80"), (1.0, "100")):
+        assert texts[name] == (pytest.approx(0.92), pytest.approx(TALL * place), "right")
+    assert texts["rotor speed, rpm"][:2] == (pytest.approx(1.0 + 0.5 * WIDE), -0.46)
+    assert texts["force, N"][:2] == (pytest.approx(0.3), pytest.approx(TALL + 0.22))
+
+
+def test_a_line_has_a_gap_outside_and_no_close_points():
+    x = np.linspace(0.0, 10.0, 2001)
+    y = np.where(x < 4.0, 40.0, np.where(x < 6.0, 101.0, 30.0))
+    points = PANEL.line(x, y, {}).points
+    inside = points[np.isfinite(points[:, 0])]
+    assert len(inside) < 200 and inside[0].tolist() == pytest.approx([1.0, 0.4 * TALL])
+    gap = WIDE * np.array([x[x < 4.0][-1], x[x >= 6.0][0]]) / 10.0 + 1.0
+    assert np.isnan(points).any() and set(np.round(gap, 9)) <= set(np.round(inside[:, 0], 9))
+    np.testing.assert_allclose(points[-1], [1.0 + WIDE, 0.3 * TALL])
+    steps = np.diff(inside[inside[:, 0] < gap[0], 0])
+    assert np.all(steps[:-1] > 0.02) and np.all(steps < 0.05)
+
+
+def test_dots_are_round_or_square():
+    around = dot(2.0, 3.0, {"fc": "white"})
+    np.testing.assert_allclose(np.hypot(*(around.points - [2.0, 3.0]).T), 0.05)
+    square = dot(2.0, 3.0, {}, square=True).points
+    assert (np.min(square, axis=0).tolist(), np.max(square, axis=0).tolist()) == ([1.955, 2.955], [2.045, 3.045])
+    assert around.filled
+
+
+def test_a_legend_has_two_entries_in_a_column():
+    line, point = {"color": "red"}, {"fc": "white"}
+    parts, texts = legend([{"a": line, "b": point, "c": line}, {"d": line}])
+    places = {text.text: (text.x, text.y) for text in texts}
+    expected = {"a": (0.55, TALL + 0.95), "b": (0.55, TALL + 0.68), "c": (2.1, TALL + 0.95), "d": (8.8, TALL + 0.95)}
+    assert places == {name: pytest.approx(place) for name, place in expected.items()}
+    np.testing.assert_allclose(parts[0].points, [[0.05, TALL + 0.95], [0.45, TALL + 0.95]])
+    np.testing.assert_allclose(np.mean(parts[1].points[:-1], axis=0), [0.25, TALL + 0.68])
