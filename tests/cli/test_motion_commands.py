@@ -271,14 +271,15 @@ def test_response_of_several_exciters_lists_each_torque(typed, tmp_path):
 
 def test_response_lists_operating_points_peaks_and_folds(typed, tmp_path):
     (tmp_path / "table.toml").write_text(UNBALANCED)
-    code, out, err = typed("response", "table.toml", "--csv", "curve.csv")
+    code, out, err = typed("response", "table.toml", "--points", "300", "--csv", "curve.csv")
     assert (code, err) == (0, "") and max(map(len, out.splitlines())) <= 80
     assert out.count("(zone D)") == 2 and "jump to, rpm" in out
-    document = json.loads(typed("response", "table.toml", "--json")[1])
-    found = jv.response(jv.load_scene(tmp_path / "table.toml"))
+    document = json.loads(typed("response", "table.toml", "--points", "300", "--json")[1])
+    found = jv.response(jv.load_scene(tmp_path / "table.toml"), points=300)
     speeds = [each["speed"] for each in document["operating_points"]]
     np.testing.assert_allclose(speeds, found.operating.speed[np.asarray(found.operating.exists)], rtol=1e-12)
     head, *rows = read(tmp_path / "curve.csv")
+    assert len(rows) == 300
     np.testing.assert_allclose(float(rows[9][head.index("torque (N m)")]), found.torque[9, 0], rtol=1e-7)
     power = [each["measures"]["power"] for each in document["operating_points"] if each["stable"]]
     shown = [float(line.split()[8]) for line in out.splitlines() if line.startswith("  shaft: ")]

@@ -35,3 +35,13 @@ def test_command_in_a_report_can_be_run_again(tmp_path):
         Output(True, None, tmp_path / "report.html").done({"a": 1.0}, lambda: "text", "simulate")
     page = (tmp_path / "report.html").read_text()
     assert "jaxvib simulate &#x27;my machine.toml&#x27; --until &#x27;0.5 min&#x27;" in page
+
+
+@pytest.mark.parametrize(("title", "heading"), [(None, "simulate"), ("Screen 7", "Screen 7")])
+def test_a_report_has_the_requested_title(tmp_path, title, heading):
+    with click.Context(click.Command("simulate")):
+        output = Output(True, None, tmp_path / "report.html", title=title, author=title and "A. Author")
+        output.done({"a": 1.0}, lambda: "text", "simulate")
+    page = (tmp_path / "report.html").read_text()
+    assert f"<h1>{heading}</h1>" in page and ("<p>A. Author</p>" in page) == (title is not None)
+    assert "<code>jaxvib simulate</code>" in page

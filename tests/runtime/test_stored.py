@@ -431,3 +431,16 @@ def test_jams_from_a_stored_program_are_the_same(folder):
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(traced), strict=True):
         assert jax.typeof(a) == jax.typeof(b)
         np.testing.assert_array_equal(a, b)
+
+
+def test_no_stored_program_is_used_while_debugging():
+    root = programs.cached(jnp.sqrt)
+    assert np.isnan(root(jnp.asarray(-1.0)))
+    with jax.debug_nans(True), pytest.raises(FloatingPointError, match="invalid value"):
+        root(jnp.asarray(-1.0))
+    called = []
+    sums = programs.cached(lambda x: called.append(type(x)) or x + 1.0)
+    sums(jnp.asarray(1.0))
+    with jax.disable_jit():
+        assert sums(jnp.asarray(2.0)) == 3.0
+    assert len(called) == 2 and not issubclass(called[1], jax.core.Tracer)
