@@ -209,13 +209,17 @@ def clipped_at(value: np.ndarray) -> tuple[float, float]:
 
 
 def _clipped_above(value: np.ndarray) -> float:
-    top, size = float(np.max(value)), float(np.ptp(value))
+    count = max(1, min(_MIN_CLIPPED, value.size // 4))  # fewer readings beyond all others are spikes
+    ends = np.partition(value, (count - 1, value.size - count))
+    top, size = float(np.max(value)), float(ends[value.size - count] - ends[count - 1])
     below = value[value < top]
     if size == 0.0 or below.size == 0:
         return np.inf
     level = np.inf
     for share in _BINS:
         width = max(share * size, 1.5 * (top - float(np.max(below))))  # a bin has at least one step of the converter
+        if 5.0 * width > size:  # without bins below the last one nothing is comparable: the largest reading is an outlier
+            continue
         is_top = value > top - width
         in_last_bin, in_next_bins = np.count_nonzero(is_top), np.count_nonzero((value > top - 5.0 * width) & ~is_top)
         in_triples = np.count_nonzero(is_top[2:] & is_top[1:-1] & is_top[:-2])

@@ -187,6 +187,14 @@ def test_converter_steps_and_single_peaks_are_no_clipping():
     assert _clipped_above(peak) == np.inf
 
 
+@pytest.mark.parametrize("count", [1, 8])
+def test_spikes_do_not_count_as_clipping(count):
+    """A spike far above all other readings leaves no reading in the bins below it."""
+    value = np.sin(0.1 * np.arange(4000.0))
+    value[17 :: 4000 // count][:count] = 500.0
+    assert clipped_at(value) == (-np.inf, np.inf)
+
+
 @pytest.mark.parametrize(
     ("places", "value", "says"),
     [
