@@ -35,6 +35,10 @@ Amplitudes and forces are zero to peak. The page shows the theory of light loads
 _ABOUT_UNBALANCES = """Amplitudes and forces are zero to peak. The page shows motions averaged over a turn. For exact results,
 save the machine and run `jaxvib simulate`; `jaxvib run-up` computes the motion from rest."""
 
+_ABOUT_COLLECTED = """Amplitudes and forces are zero to peak. The page shows motions averaged over a turn, in which all loads
+of an exciter are at one angle; their separation counts in the stability. For other motions use `jaxvib regimes`, for exact
+results save the machine and run `jaxvib simulate`."""
+
 _CAMPBELL_SPEEDS = 81
 """Number of rotor speeds of a Campbell diagram."""
 
@@ -131,12 +135,19 @@ def has_branches(scene: Scene) -> bool:
 
 def about(scene: Scene) -> str:
     """Return the text below the pictures, as Markdown."""
-    theory = _ABOUT_LOADS if scene.is_plain else _ABOUT_UNBALANCES
+    theory = _ABOUT_LOADS if scene.is_plain else _ABOUT_COLLECTED if scene.has_loads else _ABOUT_UNBALANCES
     return f"{heading(scene)}\n\n{_ABOUT_SLIDERS} {theory}"
 
 
 def heading(scene: Scene) -> str:
     """Return the description of `diagram` for this scene, with a reference to other results."""
+    if not scene.is_plain and scene.has_loads:
+        return (
+            "Synchronous regimes: all loads and unbalances turn at one speed, the loads of an exciter at one angle. The speed, "
+            "the amplitudes and the phases of the exciters (of one exciter the foundation force) of the first four regimes of "
+            "the list, over the speed of the drives, which all change by one factor. Dashed lines: unstable. A line ends where "
+            "its regime ends. The sketch shows the first regime of the list; ellipses are the paths of points of the body."
+        )
     if not scene.is_plain:
         return (
             "Working regime: the stable synchronous regime at the speed of the motors. The diagram shows its rotor speed, its "

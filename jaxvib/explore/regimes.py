@@ -1,4 +1,5 @@
-"""Synchronous regimes of exciters with unbalances: chart over the speed of the motors, and results as text."""
+"""Synchronous regimes of exciters with unbalances or with loads that stay together: chart over the speed of the drives, and
+results as text."""
 
 from __future__ import annotations
 
@@ -11,14 +12,16 @@ import numpy as np
 from jax import Array
 
 from jaxvib.display import quantity_text, speed_unit
-from jaxvib.draw.charts import log_limits, scaled_amplitudes
+from jaxvib.draw.charts import log_limits, scaled_amplitudes, stretches
 from jaxvib.draw.machine.svg import svg
 from jaxvib.draw.style import COLORS, GUIDE
 from jaxvib.equations.linear import natural_frequencies
+from jaxvib.equations.torque_balance import mass_owners
 from jaxvib.errors import InputError
 from jaxvib.explore.panel import APART, FIRST, LAST, ROTOR, TALL, WIDE, WORKING, Panel, legend
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.regimes.collected import collected_regimes, follow_regimes
 from jaxvib.steady.regimes.synchronous import SynchronousRegime, synchronous_regimes
 from jaxvib.steady.regimes.working import working_regime
 
@@ -28,7 +31,11 @@ _SPEEDS = {1: 61, 2: 61, 3: 25}
 _MAX_LISTED = 2
 """Number of exciters up to which all regimes are listed. The search takes too long for more."""
 
+_MAX_FOLLOWED = 4
+"""Number of regimes of loads in the chart."""
+
 _LINE = {"lw": 1.5}
+_UNSTABLE = {"lw": 1.2, "ls": "--"}
 _RESONANCE = {"color": GUIDE, "lw": 0.8, "ls": ":"}
 _LEGEND = {
     "regime": {**_LINE, "color": "black"},
@@ -40,16 +47,22 @@ _LEGEND = {
 
 
 class _Curves(NamedTuple):
-    """Working regime at several speeds of the motors: rotor speed (n,), phases (n, mass), amplitudes (n, nd), force (n,)."""
+    """Regimes at several speeds of the drives `drive_speed` (n,): rotor or load speed (n,), phases (n, mass), amplitudes
+    (n, nd), force (n,), stability (n,). Values between two curves are NaN."""
 
+    drive_speed: Array
     speed: Array
     phases: Array
     amplitude: Array
     force: Array
+    stable: Array
 
 
 def regime_chart(scene: Scene, max_speed: float) -> str:
     """Draw the working regime over the speed of the motors: rotor speed, amplitudes, and phases or foundation force.
+
+    For exciters with loads, draw the first regimes of `regimes_of` from the operating speed until each of them ends; unstable
+    parts are dashed.
 
     The speeds of all drives are multiplied by one factor. The horizontal axis shows the highest of these speeds, without load.
     A line has a gap if there is no stable regime. The third panel shows the phases of the exciters relative to the first one,
@@ -77,18 +90,19 @@ def regime_chart(scene: Scene, max_speed: float) -> str:
             )
             raise InputError(f"{scene.prefix_of(k)}drive", f"{problem}, such as InductionMotor")
     scale, at = speed_unit("rpm")[1], float(scene.top_speed)
-    motor_speed = max_speed * np.arange(1, _SPEEDS[count] + 1) / _SPEEDS[count]
-    curves = jax.device_get(_working_regimes(scene, jnp.asarray(motor_speed / at)))
+    curves = _curves(scene, max_speed)
     resonances = np.asarray(natural_frequencies(scene))
     high = scale * max_speed
     parts, texts = [], []
-    panels = _panels(scene, curves, motor_speed, resonances, high)
+    panels = _panels(scene, curves, resonances, high)
     for panel, drawn in panels:
         parts += [*panel.frame(), panel.line([scale * at] * 2, panel.y, WORKING)]
         texts += panel.texts()
         parts += [
-            panel.line(scale * motor_speed, values, {**_LINE, "color": color})
+            panel.line(scale * curves.drive_speed[along], values[along], {**(_LINE if solid else _UNSTABLE), "color": color})
             for values, color in zip(drawn.values(), COLORS, strict=False)
+            for along, solid in stretches(np.asarray(curves.stable))
+            if np.any(np.isfinite(values[along]))
         ]
     speeds = panels[0][0]
     parts += [speeds.line([0.0, high], [scale * w] * 2, _RESONANCE) for w in resonances.tolist() if w <= max_speed]
@@ -96,14 +110,35 @@ def regime_chart(scene: Scene, max_speed: float) -> str:
     names = {
         name: {**_LINE, "color": color} for _, drawn in panels[1:] for name, color in zip(drawn, COLORS, strict=False) if name
     }
-    keys, words = legend([_LEGEND, names])
+    unstable = {} if np.all(curves.stable) else {"unstable": {**_UNSTABLE, "color": "black"}}
+    keys, words = legend([{**_LEGEND, **unstable}, names])
     width = FIRST + 3.0 * WIDE + 2.0 * APART + LAST
     return svg((0.0, width, -0.95, TALL + 1.1), [[*parts, *keys]], [[*texts, *words]], "", 1.0, 0.0)
 
 
-def _panels(
-    scene: Scene, curves: _Curves, motor_speed: np.ndarray, resonances: np.ndarray, high: float
-) -> list[tuple[Panel, dict[str, np.ndarray]]]:
+def _curves(scene: Scene, max_speed: float) -> _Curves:
+    """Return the curves of the chart: the working regime of unbalances, or the first regimes of loads, which are followed."""
+    at = float(scene.top_speed)
+    if not scene.has_loads:
+        count = _SPEEDS[len(scene.exciters)]
+        motor_speed = max_speed * np.arange(1, count + 1) / count
+        return jax.device_get(_working_regimes(scene, jnp.asarray(motor_speed / at)))
+    regimes = regimes_of(scene)[:_MAX_FOLLOWED]
+    if not regimes:
+        masses, nd = mass_owners(scene).size, len(scene.machine.structure().coordinates)
+        empty = np.zeros(1)
+        return _Curves(empty, empty, np.zeros((1, masses)), np.zeros((1, nd)), empty, np.ones(1, bool))
+    # Missing regimes are copies of the first one, so that one program is sufficient.
+    chosen = [*regimes, *[regimes[0]] * (_MAX_FOLLOWED - len(regimes))]
+    start = (np.stack([np.asarray(getattr(each, name)) for each in chosen]) for name in ("speed", "phases"))
+    followed = jax.device_get(follow_regimes(scene, *start, np.asarray(1.0 / 64.0), np.asarray(max_speed / at)))
+    pieces = [_Curves(at * followed.factor, *(np.asarray(field)[k] for field in followed[1:])) for k in range(len(regimes))]
+    gap = _Curves(*(np.full_like(field[:1], True if field.dtype == bool else np.nan) for field in pieces[0]))
+    joined = [each for piece in pieces for each in (piece, gap)]
+    return _Curves(*(np.concatenate(fields) for fields in zip(*joined, strict=True)))
+
+
+def _panels(scene: Scene, curves: _Curves, resonances: np.ndarray, high: float) -> list[tuple[Panel, dict[str, np.ndarray]]]:
     """Return the three panels with their curves by name; `high` is the end of the horizontal axis, rpm."""
     structure = scene.machine.structure()
     rotor_speed, amplitude, foundation_force = map(np.asarray, (curves.speed, curves.amplitude, curves.force))
@@ -115,15 +150,17 @@ def _panels(
     titles = f"amplitude, {', '.join(dict.fromkeys(units))}, zero to peak", "foundation force, N, zero to peak"
 
     def logarithmic(k: int, title: str, drawn: dict[str, np.ndarray]) -> tuple[Panel, dict[str, np.ndarray]]:
-        limits = log_limits([*drawn.values()], motor_speed, rotor_speed, resonances)
+        limits = log_limits([*drawn.values()], curves.drive_speed, rotor_speed, resonances)
         return _panel(k, title, high, limits, log=True), drawn
 
     speed = speed_unit("rpm")[1] * rotor_speed
-    found = [(_panel(0, "rotor speed, rpm", high, (0.0, 1.06 * high)), {"": speed}), logarithmic(1, titles[0], moving)]
+    turning = "load speed, rpm" if scene.has_loads else "rotor speed, rpm"
+    found = [(_panel(0, turning, high, (0.0, 1.06 * high)), {"": speed}), logarithmic(1, titles[0], moving)]
     if len(scene.exciters) == 1:
         return [*found, logarithmic(2, titles[1], force)]
     angles = np.rad2deg(np.asarray(curves.phases))
-    phases = {f"exciter {k + 1}": _with_gaps(angles[:, k]) for k in range(1, len(scene.exciters))}
+    first = np.unique(mass_owners(scene), return_index=True)[1]
+    phases = {f"exciter {k + 1}": _with_gaps(angles[:, first[k]]) for k in range(1, len(scene.exciters))}
     return [*found, (_panel(2, "phase, deg, relative to exciter 1", high, (-185.0, 185.0)), phases)]
 
 
@@ -143,7 +180,8 @@ def _working_regimes(scene: Scene, factors: Array) -> _Curves:
         speeds = [factor * exciter.drive.speed for exciter in scene.exciters]
         changed = eqx.tree_at(lambda each: [exciter.drive.speed for exciter in each.exciters], scene, speeds)
         regime = working_regime(changed, throw=False)
-        return _Curves(regime.speed, regime.phases, regime.amplitude, regime.foundation_force)
+        drawn = regime.speed, regime.phases, regime.amplitude, regime.foundation_force
+        return _Curves(factor * scene.top_speed, *drawn, jnp.asarray(True))
 
     return jax.vmap(at)(factors)
 
@@ -154,11 +192,20 @@ _latest: list[tuple[Scene, list[SynchronousRegime]]] = []
 
 def regimes_of(scene: Scene) -> list[SynchronousRegime]:
     """Return the regimes that the page lists, the stable ones first: all for one or two exciters, otherwise the working
-    regime. The list is empty if there is no regime."""
+    regime. Loads of each exciter stay together. The list is empty if there is no regime.
+
+    **Raises** `InputError` for more than two exciters with loads among them.
+    """
     for latest, regimes in _latest:
         if latest is scene:
             return regimes
-    if len(scene.exciters) > _MAX_LISTED:
+    if scene.has_loads:
+        if len(scene.exciters) > _MAX_LISTED:
+            problem = f"are {len(scene.exciters)}; regimes of loads are listed for at most {_MAX_LISTED}, because the search"
+            raise InputError("exciters", f"{problem} takes too long for more; use jaxvib regimes")
+        found = jax.device_get(collected_regimes(scene))
+        regimes = [found.select(k) for k in range(found.speed.shape[0])]
+    elif len(scene.exciters) > _MAX_LISTED:
         regime = jax.device_get(working_regime(scene, throw=False))
         regimes = [regime] if np.isfinite(regime.speed) else []
     else:

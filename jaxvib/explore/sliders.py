@@ -7,7 +7,7 @@ import functools
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax
+import equinox as eqx
 import numpy as np
 
 from jaxvib.display import shown_unit
@@ -16,6 +16,7 @@ from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.numbers.named import NamedNumber, numbers_of, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.results.table import is_number
+from jaxvib.steady.regimes.collected import has_equal_loads
 from jaxvib.units.reading import to_float
 
 COUNT = "loads.count"
@@ -24,6 +25,9 @@ COUNT = "loads.count"
 _LOAD_NUMBERS = ("loads.mass", "loads.radius", "loads.drag")
 _MACHINE_NUMBERS = ("machine.mass", "machine.stiffness", "machine.link_stiffness", "machine.damping", "machine.link_damping")
 """Parameters of loads and of a machine that have sliders."""
+
+_EXCITER_NUMBERS = (("loads", "mass"), ("loads", "radius"), ("loads", "drag"), ("unbalance",), ("position",))
+"""Numbers of each of several exciters that have sliders, by their paths."""
 
 _MACHINE_FIELDS = ("stiffness", "link_stiffness", "angle", "mass", "inertia", "damping", "link_damping")
 """Fields of a machine, or of its supports and bodies, that have sliders if its exciters have unbalances."""
@@ -80,9 +84,6 @@ def sliders_of(scene: Scene) -> list[Slider]:
 
     A parameter that is 0 has no slider, because a factor does not change it.
 
-    **Raises** `InputError` for a scene with several exciters or a clockwise rotor if an exciter has loads, and for an exciter
-    with both loads and an unbalance.
-
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),
     ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("600 rpm"))
@@ -94,13 +95,11 @@ def sliders_of(scene: Scene) -> list[Slider]:
     named = numbers_of(scene)
     if scene.is_plain:
         sliders = [_slider(scene, named["drive.speed"], _SPEED_FACTORS)]
-        if _has_equal_loads(scene):
-            counts = tuple(range(1, min(256, max(8, 2 * scene.loads.count)) + 1))
-            sliders.append(Slider(COUNT, "number of loads", "", counts, scene.loads.count, None))
+        if has_equal_loads(scene, 0):
+            sliders.append(_count_slider(COUNT, "number of loads", scene.loads.count))
         numbers = [named[name] for name in _LOAD_NUMBERS if _is_adjustable(scene, name)]
         arrays = [named[name] for name in _MACHINE_NUMBERS if _is_adjustable(scene, name)]
     else:
-        _require_unbalances(scene)
         sliders, numbers = _exciter_sliders(scene, named), []
         in_machine = [each for each in named.values() if each.path[0] == "machine"]
         arrays = [each for field in _MACHINE_FIELDS for each in in_machine if field in each.path]
@@ -110,25 +109,18 @@ def sliders_of(scene: Scene) -> list[Slider]:
     return sliders + [_slider(scene, number, _VALUE_FACTORS) for number in numbers]
 
 
-def _require_unbalances(scene: Scene) -> None:
-    """**Raises** `InputError` for a scene whose exciters have loads but which is not plain."""
-    for k, exciter in enumerate(scene.exciters):
-        if exciter.loads is not None:
-            problem = (
-                "are given in a scene with several exciters, with an unbalance on the same rotor, or with a clockwise rotor"
-            )
-            advice = "the explorer shows one anticlockwise exciter with loads, or exciters with unbalances alone"
-            raise InputError(f"{scene.prefix_of(k)}loads", f"{problem}; {advice}; use jaxvib regimes or jaxvib simulate")
-
-
 def _exciter_sliders(scene: Scene, named: Mapping[str, NamedNumber]) -> list[Slider]:
-    """Return the sliders of exciters with unbalances: speeds of the drives, unbalances, positions, torques of the motors."""
+    """Return the sliders of several exciters: speeds of the drives, loads, unbalances, positions, torques of the motors."""
     reach = max([0.1, *(float(np.max(np.abs(e.position))) for e in scene.exciters if e.position is not None)])
     sliders = []
     for k in range(len(scene.exciters)):
         of_exciter = [each for each in named.values() if each.path[:2] == ("exciters", k)]
         speed = [each for each in of_exciter if each.path[2:] == ("drive", "speed")]
-        others = [each for each in of_exciter if each.path[2:] in (("unbalance",), ("position",))]
+        loads = scene.exciters[k].loads
+        if loads is not None and has_equal_loads(scene, k):
+            label = f"number of loads{f' of exciter {k + 1}' * (len(scene.exciters) > 1)}"
+            sliders.append(_count_slider(f"{scene.prefix_of(k)}{COUNT}", label, loads.count))
+        others = [each for each in of_exciter if each.path[2:] in _EXCITER_NUMBERS]
         torques = [each for each in of_exciter if each.path[2] == "drive" and each.spec.unit == "N m"]
         sliders += [_slider(scene, each, _SPEED_FACTORS) for each in speed]
         for entry in (entry for each in (*others, *torques) for entry in each.single(scene)):
@@ -150,7 +142,7 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
     (80000.0, 3)
     """
     sliders = {slider.name: slider for slider in sliders_of(scene)}
-    count = None
+    counts = {}
     for name, value in values.items():
         if name not in sliders:
             raise InputError(name, f"is not a slider of this scene; the sliders are: {', '.join(sliders)}")
@@ -158,14 +150,17 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
         if value == slider.start:
             continue
         if slider.number is None:
-            count = int(value)
+            counts[name] = int(value)
         else:
             old = slider.number.read(scene)
             new = old * (value / slider.start) if slider.shift is None else old + slider.shift * (value - slider.start)
             scene = put_numbers(scene, (slider.number,), new)
-    if count is None:
-        return scene
-    return scene.replace(loads=rebuild_part(dataclasses.replace(scene.loads, count=count), "loads"))
+    for k, exciter in enumerate(scene.exciters):
+        name = f"{scene.prefix_of(k)}{COUNT}"
+        if name in counts and exciter.loads is not None:
+            loads = rebuild_part(dataclasses.replace(exciter.loads, count=counts[name]), f"{scene.prefix_of(k)}loads")
+            scene = eqx.tree_at(lambda s, k=k: s.exciters[k].loads, scene, loads)
+    return scene
 
 
 def typed_value(scene: Scene, slider: Slider, text: str) -> float:
@@ -207,9 +202,9 @@ def _is_adjustable(scene: Scene, name: str) -> bool:
     return value is not None and bool(np.any(np.asarray(value))) and getattr(owner, f"{field}_terms", None) is None
 
 
-def _has_equal_loads(scene: Scene) -> bool:
-    """Return True if all loads have equal parameters and one station, so that the number of loads can be changed."""
-    return scene.mounting.at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
+def _count_slider(name: str, label: str, count: int) -> Slider:
+    """Return the slider of a number of loads."""
+    return Slider(name, label, "", tuple(range(1, min(256, max(8, 2 * count)) + 1)), count, None)
 
 
 def _is_shifted(number: NamedNumber) -> bool:
@@ -226,7 +221,7 @@ def _slider(scene: Scene, number: NamedNumber, factors: tuple[float, ...], reach
         return Slider(number.name, f"{field.replace('_', ' ')} of the {part}, common factor", "", steps, 1.0, number)
     label = number.words(scene)[0]
     if not _is_shifted(number):
-        unit, scale = shown_unit(number.spec.unit_of_tables, float(values[0]))
+        unit, scale = shown_unit(number.unit_of_tables, float(values[0]))
         start = float(f"{scale * values[0]:.6g}")
         return Slider(number.name, label, unit, _steps(start, factors), start, number)
     unit, scale = shown_unit(number.unit, 1e-3)

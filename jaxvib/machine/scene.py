@@ -296,6 +296,11 @@ class Scene(Part):
         return len(self.exciters) == 1 and self.exciters[0].is_plain
 
     @property
+    def has_loads(self) -> bool:
+        """True if an exciter has loads."""
+        return any(exciter.loads is not None for exciter in self.exciters)
+
+    @property
     def loads(self) -> Loads:
         """Loads of a scene with one exciter that turns anticlockwise and has no `unbalance`.
 

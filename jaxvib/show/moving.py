@@ -11,8 +11,9 @@ from jaxvib.draw.machine.deck import ellipses as draw_ellipses
 from jaxvib.draw.machine.parts import Part, circle
 from jaxvib.draw.machine.svg import svg
 from jaxvib.draw.style import COLORS, Look
+from jaxvib.equations.torque_balance import mass_owners
 from jaxvib.errors import ComputationError
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.show.sketch import drawable_scene
 from jaxvib.show.view import ARROWS_NOTE, View
 from jaxvib.show.views import view_of
@@ -54,22 +55,18 @@ def moving_svg(scene: Scene, jam: Jam) -> str:
     view = view_of(drawable_scene(scene))
     if not np.isfinite(jam.omega) or not np.isfinite(jam.displacement).all():
         raise ComputationError("absent", f"jam mode {int(jam.mode)} cannot be shown: {jam.message}")
-    first, *others = (np.asarray(u, float) for u in scene.loads.rest())
-    angles = _THETA[:, None] + np.zeros_like(first)
-    load_positions = places_of(scene.loads, (angles, *others))  # one call for all poses
-    rotors = [
-        (RotorPose((angle, *others), 0.0, [x[k] if x.ndim > 1 else x for x in load_positions]),)
-        for k, angle in enumerate(angles)
-    ]
+    rotors = [(pose,) for pose in _rotor_poses(scene.exciters[0], np.zeros(scene.loads.count))]
     words = f"jam mode {int(jam.mode)}, {jam.judgement}"
     return _moving(view, words, float(jam.omega), np.asarray(jam.displacement), rotors, float(jam.rotor_speed / jam.omega))
 
 
 def regime_svg(scene: Scene, regime: SynchronousRegime, points: Sequence[tuple[float, float]] = ()) -> str:
-    """Return the sketch of a scene that moves in a synchronous regime of its unbalances, with the forces on the foundation as
-    arrows, and with the ellipses on which points of the body move.
+    """Return the sketch of a scene that moves in a synchronous regime, with the forces on the foundation as arrows, and with
+    the ellipses on which points of the body move.
 
-    **Arguments**: `scene`, whose exciters have unbalances and no loads; a `regime` of it; `points` (x, y) of a body in a plane,
+    If no exciter has an unbalance, the rotors turn at the ratio of their speed to that of the loads in the first exciter.
+
+    **Arguments**: `scene`, whose exciters have an unbalance or loads; a `regime` of it; `points` (x, y) of a body in a plane,
     m.
 
     **Returns** the text of an SVG file, which repeats one period endlessly. **Raises** `InputError` for a machine that cannot
@@ -83,12 +80,30 @@ def regime_svg(scene: Scene, regime: SynchronousRegime, points: Sequence[tuple[f
     True
     """
     view = view_of(drawable_scene(scene))
-    turns = [exciter.direction * float(phase) for exciter, phase in zip(scene.exciters, regime.phases, strict=True)]
-    rotors = [tuple(RotorPose((), turn) for turn in turns)] * _FRAMES_PER_PERIOD
+    rotors = [*zip(*(_rotor_poses(scene.exciters[k], phases) for k, phases in _phases_of(scene, regime)), strict=True)]
+    first = scene.exciters[0]
+    has_unbalance = any(exciter.loads is None for exciter in scene.exciters)
+    turns = 1.0 if has_unbalance else float(first.drive.speed / regime.speed)
     words = f"{'stable' if bool(regime.stable) else 'unstable'} regime, {speed_text(regime.speed)}"
     decks = [regime.deck(points)] if points else []
     ellipses = [(np.asarray(deck.points), np.asarray(deck.amplitude)) for deck in decks]
-    return _moving(view, words, float(regime.speed), np.asarray(regime.displacement), rotors, 1.0, ellipses)
+    return _moving(view, words, float(regime.speed), np.asarray(regime.displacement), rotors, turns, ellipses)
+
+
+def _phases_of(scene: Scene, regime: SynchronousRegime) -> list[tuple[int, np.ndarray]]:
+    """Return the number of each exciter with the phases of its masses, rad."""
+    owners, phases = mass_owners(scene), np.asarray(regime.phases)
+    return [(k, phases[owners == k]) for k in range(len(scene.exciters))]
+
+
+def _rotor_poses(exciter: Exciter, phases: np.ndarray) -> list[RotorPose]:
+    """Return the rotor of an exciter in each frame, with its loads or its unbalance at the `phases` (mass,), rad."""
+    if exciter.loads is None:
+        return [RotorPose((), exciter.direction * float(phases[0]))] * _FRAMES_PER_PERIOD
+    _, *others = (np.asarray(u, float) for u in exciter.loads.rest())
+    angles = exciter.direction * (_THETA[:, None] + phases)
+    positions = places_of(exciter.loads, (angles, *others))  # one call for all poses
+    return [RotorPose((angle, *others), 0.0, [x[k] if x.ndim > 1 else x for x in positions]) for k, angle in enumerate(angles)]
 
 
 def _moving(

@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import Axes, Drawn, quantity_text
+from jaxvib.display import GRAVITIES, Axes, Drawn, quantity_text
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Machine, Place, on_body, read_place
 from jaxvib.numerics.linalg import magnitude
@@ -61,7 +61,7 @@ class Ellipse(Readable):
     semi_major: Array = eqx.field(metadata=in_unit("m"))
     semi_minor: Array = eqx.field(metadata=in_unit("m"))
     direction: Array = eqx.field(metadata=in_unit("rad"))
-    acceleration: Array = eqx.field(metadata=in_unit(""))
+    acceleration: Array = eqx.field(metadata=in_unit(GRAVITIES))
     throw_number: Array = eqx.field(metadata=in_unit(""))
     remainder: Array = eqx.field(metadata=in_unit(""))
 
@@ -80,8 +80,10 @@ class Ellipse(Readable):
         """Return the ellipse as a line of text."""
         turn = {1: ", anticlockwise", -1: ", clockwise", 0: ""}[int(self.sense)]
         axes = f"semi-axes {quantity_text([self.semi_major, abs(self.semi_minor)], 'm', 4, ' and ')}{turn}"
-        along = "a circle" if bool(self.is_circle) else f"long axis at {np.rad2deg(float(self.direction)):.4g} deg"
-        numbers = f"{float(self.acceleration):.4g} g, throw number {float(self.throw_number):.4g}"
+        # Rounding errors of 0 are not shown.
+        angle, throw = round(np.rad2deg(float(self.direction)), 9) + 0.0, round(float(self.throw_number), 9)
+        along = "a circle" if bool(self.is_circle) else f"long axis at {angle:.4g} deg"
+        numbers = f"{float(self.acceleration):.4g} g, throw number {throw:.4g}"
         rest = f", remainder {float(self.remainder):.2g}" if float(self.remainder) > 0.0 else ""
         return f"{axes}, {along}, {numbers}{rest}"
 

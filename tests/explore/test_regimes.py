@@ -153,14 +153,51 @@ def test_many_exciters_show_the_working_regime_alone(linear, count):
         assert "<b>No figure:</b> exciters are 4; the chart over the motor speed is drawn for at most 3" in shown
 
 
-def test_scenes_that_the_explorer_lacks_name_a_command(linear):
-    balls, drive = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("600 rpm")
-    loaded = jv.Scene(linear.machine, exciters=[linear.exciters[0], jv.Exciter(balls, drive, at=(0.0, 0.3))])
-    with pytest.raises(jv.InputError, match=r"exciters\[1\]\.loads are given in a scene with several .* use jaxvib regimes"):
-        sliders_of(loaded)
-    clockwise = jv.Scene(linear.machine, exciters=[jv.Exciter(balls, drive, at=(0.0, 0.3), direction=-1)])
-    with pytest.raises(jv.InputError, match=r"^loads are given .* clockwise rotor"):
-        sliders_of(clockwise)
+@pytest.fixture(scope="module")
+def loaded():
+    """A screen with two balls in each of two exciters of opposite directions."""
+    springs = [jv.support(at=(x, -0.2), stiffness=(2e5, 3e5), damping=(300.0, 300.0)) for x in (-0.6, 0.6)]
+    body = jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
+    balls, drive = jv.balls(count=2, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed("900 rpm")
+    exciters = [jv.Exciter(balls, drive, at=(x, 0.3), direction=way) for x, way in ((-0.3, 1), (0.3, -1))]
+    return jv.Scene(body, exciters=exciters)
+
+
+def test_the_page_of_loads_shows_regimes_and_their_course(loaded):
+    first = regimes_of(loaded)[0]
+    assert bool(first.stable) and max(np.ptp(first.phases[:2]), np.ptp(first.phases[2:])) < 1e-9
+    text = pictures.readings(loaded)
+    assert text.startswith(first.summary()) and "spread over the deck" in text and "e-1" not in text
+    drawn = ElementTree.fromstring(pictures.diagram(loaded, 126.0))
+    spans = svg_charts.texts(drawn)
+    starts = [x for x, _, text, _ in spans if re.match(r"load speed, rpm|amplitude, mm|phase, deg", text or "")]
+    assert len(starts) == 3 and "unstable" in [text for _, _, text, _ in spans]
+    in_first = [span for span in spans if span[0] + 1.0 < starts[1]]
+    across, up = svg_charts.axes(in_first, False)
+    lines = [line for line, _ in svg_charts.lines(drawn, COLORS[0]) if len(line) > 2 and line[0, 0] < starts[1]]
+    points = np.concatenate([np.stack([np.polyval(across, line[:, 0]), np.polyval(up, line[:, 1])], 1) for line in lines])
+    at = RPM * float(loaded.top_speed)
+    for regime in regimes_of(loaded)[:4]:  # each line passes through the speed of its regime
+        nearest = points[np.abs(points[:, 0] - at) < 40.0, 1]
+        assert np.min(np.abs(nearest - RPM * float(regime.speed))) < 15.0
+    film = pictures.machine(loaded, None)
+    assert f"stable regime, {RPM * float(first.speed):.5g} rpm" in film and "animate" in film
+
+
+def test_sliders_of_loads_change_one_exciter(loaded):
+    names = {each.name: each for each in sliders_of(loaded)}
+    assert len({each.title for each in names.values()}) == len(names)
+    moved = scene_at(loaded, {"exciters[1].loads.count": 3, "exciters[0].loads.mass": 400.0})
+    assert [exciter.loads.count for exciter in moved.exciters] == [2, 3]
+    assert [float(exciter.loads.mass) for exciter in moved.exciters] == [0.4, 0.8]
+    clockwise = jv.Scene(loaded.machine, exciters=[loaded.exciters[1]])
+    assert scene_at(clockwise, {"loads.count": 1}).exciters[0].loads.count == 1
+
+
+def test_scenes_that_the_explorer_lacks_name_a_command(linear, loaded):
+    three = jv.Scene(loaded.machine, exciters=[*loaded.exciters, linear.exciters[0]])
+    with pytest.raises(jv.InputError, match=r"exciters are 3; regimes of loads are listed for at most 2.* use jaxvib regimes"):
+        pictures.readings(three)
     table = jv.TorqueTable(speeds=(0.0, 90.0, 100.0), torques=(50.0, 60.0, 0.0), inertia=0.6)
     tabled = jv.Scene(linear.machine, exciters=[jv.Exciter(drive=table, unbalance=2.0, at=(0.0, 0.8))])
     shown = pictures.image(lambda: pictures.diagram(tabled, 100.0), SceneOrProblem(tabled, ""))

@@ -358,12 +358,28 @@ def synchronous_regimes(
         speed, phases = number(near[0], "rad/s", "near[0]", low=0.0, open_low=True), numbers(near[1], "rad", "near[1]", count)
         return outcome(_regime_near(scene, speed, phases, group), scene)
     balance = assemble_for_search(scene, group)
-    omega, phases = all_regimes(balance)
+    search = RegimeSearchStatus.sampled if count > MAX_COMPLETE and not balance.is_prescribed.all() else RegimeSearchStatus.done
+    return regimes_from(scene, *all_regimes(balance), group, search=search)
+
+
+def regimes_from(
+    scene: Scene,
+    omega: np.ndarray,
+    phases: np.ndarray,
+    group: tuple[int, ...] | None = None,
+    *,
+    search: RegimeSearchStatus,
+) -> SynchronousRegimes:
+    """Return the regimes that Newton's method finds from starts, the stable ones first.
+
+    **Arguments**: `omega` (n,), rad/s, and `phases` (n, mass), rad, of the starts; `group`: numbers of the masses, None for
+    all; `search`: status of the search.
+    """
     fields = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: _regimes_near(scene, w, a, group), omega, phases)
     order = np.flatnonzero(status_names(fields["status"]) != "not_converged")
     order = order[np.lexsort((-fields["speed"][order], ~fields["stable"][order]))]
-    search = RegimeSearchStatus.done if order.size else RegimeSearchStatus.none
-    search = RegimeSearchStatus.sampled if count > MAX_COMPLETE and not balance.is_prescribed.all() else search
+    is_empty = order.size == 0 and status_name(search) == "done"
+    search = RegimeSearchStatus.none if is_empty else search
     return SynchronousRegimes(**on_device(jax.tree.map(lambda leaf: leaf[order], fields)), scene=scene, search=search)
 
 
@@ -379,15 +395,15 @@ def _read_group(masses: Sequence[int] | None, count: int) -> tuple[int, ...] | N
 
 @cached
 def _regimes_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ...] | None) -> dict[str, Any]:
-    return jax.vmap(lambda w, a: _fields_near(scene, w, a, group))(omega, phases)
+    return jax.vmap(lambda w, a: fields_near(scene, w, a, group))(omega, phases)
 
 
 @cached
 def _regime_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ...] | None) -> SynchronousRegime:
-    return SynchronousRegime(**_fields_near(scene, omega, phases, group), scene=scene)
+    return SynchronousRegime(**fields_near(scene, omega, phases, group), scene=scene)
 
 
-def _fields_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ...] | None) -> dict[str, Any]:
+def fields_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ...] | None) -> dict[str, Any]:
     """Return the fields, except `scene`, of the regime that is found from a start, for a group of masses (None: all)."""
     balance = assemble_torque_balance(scene)
     if group is not None:
