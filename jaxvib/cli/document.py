@@ -46,7 +46,7 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
             value = float(number(value, "rad", "--slope"))
             if abs(value) >= math.pi / 2.0:
-                problem = f"is {value:.4g} rad ({math.degrees(value):.4g} degrees), no slope of a deck"
+                problem = f"is {value:.4g} rad ({math.degrees(value):.4g} degrees), which is not a slope of a deck"
                 raise InputError("--slope", f"{problem}; write degrees as '{value:g} deg'")
         if value:
             context.meta.setdefault(_DECK_KEY, {})[parameter.name] = value

@@ -1,5 +1,5 @@
-"""Checks of the values (types, shapes, the mass matrix) that parts return whose classes are defined outside this package:
-machines, loads, drives and effects.
+"""Checks of the values (types, shapes, the mass matrix) that machines, loads, drives and effects return if their classes are
+defined outside this package.
 
 Parts of the package are not checked here, because the tests of the package check them.
 """

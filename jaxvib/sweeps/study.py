@@ -141,7 +141,7 @@ def _traced(study: Study) -> Study:
     except (InputError, ComputationError):
         raise
     except Exception as error:  # any error of a user's function
-        problem = f"cannot be computed ({type(error).__name__}: {error}); it must take a Scene and return a number of JAX"
+        problem = f"cannot be computed ({type(error).__name__}: {error}); it must take a Scene and return a JAX scalar"
         raise InputError("measure", problem) from error
     for name, m, form in zip(study.names, study.measures, forms, strict=True):
         axes_count = 1 if isinstance(m, RunMeasure) and m.axis else 0

@@ -358,7 +358,7 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     assert "rotation: exciter 1 anticlockwise, exciter 2 clockwise" in out and "margin: factor" in out
     assert "resonances: 42.706, 42.706, 51.247 rpm" in out and "stable, above all resonances:" in out
     code, _, err = typed("regimes", "screen.toml", "--slope", "10")
-    assert code == 2 and "--slope is 10 rad (573 degrees), no slope of a deck; write degrees as '10 deg'" in err
+    assert code == 2 and "--slope is 10 rad (573 degrees), which is not a slope of a deck; write degrees as '10 deg'" in err
     assert (
         "--deck is '0.4'; give X,Y from the centre of mass, m, such as" in typed("regimes", "screen.toml", "--deck", "0.4")[2]
     )

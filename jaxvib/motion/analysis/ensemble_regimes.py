@@ -128,7 +128,7 @@ class EnsembleRegimes(Result):
 
     - `status`: an `EnsembleRegimesStatus`
     - `regime_of_run` (B,): number of the regime of each run, from 1; 0 for a run that did not stay finite
-    - `runs` (n,): number of runs; `share` (n,) of all runs; `standard_error` (n,) of the share, sqrt(p (1 - p)/B); `low` and
+    - `runs` (n,): number of runs; `share` p (n,) of all runs; `standard_error` (n,) of the share, sqrt(p (1 - p)/B); `low` and
       `high` (n,): Wilson's confidence interval of 95 %
     - `group` (n, mass): number of the group of masses that turn at one speed, from 0; -1 for a mass that makes less than one
       turn in the last quarter of the run

@@ -40,7 +40,7 @@ def means_of_exciters(scene: Scene, values: Array) -> Array:
 
 
 def unbalance_of(exciter: Exciter) -> Array:
-    """Return the static moment of an exciter's rotor, or of its loads at one angle, kg m."""
+    """Return the unbalance of an exciter's rotor, or of its loads at one angle, kg m."""
     if exciter.loads is None:
         assert exciter.unbalance is not None
         return exciter.unbalance
