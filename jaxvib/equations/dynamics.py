@@ -295,8 +295,8 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
 def _groups_of_directions(exciters: Sequence[RotorDynamics], directions: Sequence[int]) -> tuple[Group[RotorDynamics], ...]:
     """Return the exciters in groups.
 
-    A group with both directions of rotation contains the directions as an array. In another group, the program has no
-    operations for the direction.
+    A group with both directions of rotation contains the directions as an array. In another group, the direction
+    is not an array, and the program has no products with it.
     """
 
     def directed(part: RotorDynamics, direction: int) -> RotorDynamics:
