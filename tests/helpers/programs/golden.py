@@ -11,6 +11,7 @@ the results. It is the same in every process for one version of JAX. Names, sour
 from __future__ import annotations
 
 import argparse
+import gc
 import hashlib
 import json
 import pathlib
@@ -247,6 +248,7 @@ def main() -> int:
     if given.show:
         print("\n".join(program((scenes() | scenes_of_exciters())[given.show[0]], QUESTIONS[given.show[1]])))
         return 0
+    gc.set_threshold(100_000, 50, 100)  # as in conftest.py
     after = {name: digest(lines) for name, lines in programs()}
     found = changes(recorded()["programs"], after)
     print("\n".join(found) or "no program changed")
