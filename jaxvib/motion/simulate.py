@@ -29,7 +29,7 @@ from jaxvib.results.status import status_name
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.parallel import in_background, in_threads
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.jam import jams_of
+from jaxvib.steady.jams.jam import jams_of, require_mode_number
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number
 
@@ -134,7 +134,8 @@ def simulate(
         progress_meter=progress_meter,
         throw=throw,
     )
-    if isinstance(start, str) and start == "jam" and not jams_of.is_ready(scene):
+    if isinstance(start, str) and start == "jam" and mode is not None and not jams_of.is_ready(scene):
+        require_mode_number(mode, 2 * scene.machine.structure().mass.shape[0] + 1)  # before the run is compiled
         prepare_run(plan_from(start="rest", mode=None, separation=None))
     plan = plan_from(start=start, mode=mode, separation=separation)
     run = run_planned(plan, throw=throw)

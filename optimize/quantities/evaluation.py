@@ -13,13 +13,13 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model, natural_frequencies
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate
 from jaxvib.runtime.devices import known, numpy_of
 from jaxvib.steady.jams.follow import follow_fold, follow_jam
-from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes
+from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes, require_mode_number
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.synchronous import SynchronousOrbit, synchronous_orbit
@@ -115,9 +115,7 @@ class Evaluation:
 
     def jam(self, mode: int) -> Jam:
         """Return the jam of the mode with this number, with NaN values if it does not exist."""
-        mode_count = 2 * self.scene.machine.structure().mass.shape[0] + 1
-        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= mode_count:
-            raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {mode_count}")
+        require_mode_number(mode, 2 * self.scene.machine.structure().mass.shape[0] + 1)
         key: Key = (self.path, ("jam", mode))
         if key not in self._jams:
             jam = (

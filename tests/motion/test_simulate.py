@@ -18,6 +18,7 @@ from jaxvib.motion.integrate import StepControl, effects_rate, frequency_bounds,
 from jaxvib.motion.plan import _enough_samples, _sample_size, _step_control, enough_steps
 from jaxvib.motion.simulate import _error_share
 from jaxvib.ode.dopri8_loop import LoopDopri8
+from jaxvib.steady.jams.jam import jams_of
 
 
 @pytest.mark.parametrize(
@@ -50,6 +51,14 @@ def test_wrong_arguments_raise_clear_errors(arguments, sentence):
     with pytest.raises(jv.InputError) as error:
         jv.simulate(published().scene(), **{"until": 10.0, **arguments})
     assert str(error.value).startswith(sentence)
+
+
+@pytest.mark.parametrize(("mode", "says"), [(None, "mode is missing"), (9, "modes are numbered 1 to 5")])
+def test_wrong_modes_are_refused_before_a_run_is_compiled(mode, says, monkeypatch):
+    monkeypatch.setattr("jaxvib.motion.simulate.prepare_run", lambda plan: pytest.fail("a run is compiled"))
+    monkeypatch.setattr(jams_of, "is_ready", lambda scene: False)
+    with pytest.raises(jv.InputError, match=says):
+        jv.simulate(published().scene(), 10.0, start="jam", mode=mode)
 
 
 def test_steps_resolve_what_effects_add_to_the_fastest_load():

@@ -171,9 +171,7 @@ class JamModes(AbstractJam):
 
         **Raises** `InputError` for a number outside 1 .. 2 nd + 1; with `throw` also the errors of `select`.
         """
-        count = self.mode.shape[0]
-        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= count:
-            raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {count}")
+        require_mode_number(mode, self.mode.shape[0])
         if throw:
             when_known(lambda *_: self._require_mode(int(mode)), self.omega, self.status)
         return int(mode) - 1
@@ -211,6 +209,12 @@ class JamModes(AbstractJam):
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot the load speed of each mode in `unit`, with the resonances, and the amplitudes; `ax`: two axes to plot onto."""
         return _modes_chart(self, self.resonances, unit, ax)
+
+
+def require_mode_number(mode: object, count: int) -> None:
+    """Raise `InputError` unless `mode` is a whole number from 1 to `count`."""
+    if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= count:
+        raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {count}")
 
 
 def modes_table(jams: JamModes, growth: Mapping[int, float]) -> list[list[str]]:
