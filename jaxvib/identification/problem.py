@@ -28,7 +28,7 @@ from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbe
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import require_double
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.stiffness import equal_step_length, fastest_decay
+from jaxvib.motion.stiffness import equal_step_length, machine_decay
 from jaxvib.numerics.linalg import poles_of
 from jaxvib.numerics.noise import Noise, bounded, limited
 from jaxvib.runtime.programs import cached
@@ -490,7 +490,7 @@ def _stretches(scene: Scene, count: int, step: float) -> tuple[int, int, int]:
     """
     fastest, slowest = (float(each) for each in frequency_bounds(scene))
     fastest = max(fastest, _stop_frequency(scene))
-    longest, is_stiff = equal_step_length(fastest, float(fastest_decay(scene)), _STEPS_PER_RADIAN)
+    longest, is_stiff = equal_step_length(fastest, float(machine_decay(scene)), _STEPS_PER_RADIAN)
     if is_stiff:
         raise InputError(
             "scene",

@@ -20,6 +20,7 @@ from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.state import ExciterState, Spin, State
 from jaxvib.errors import InputError
+from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import LoadInteraction, RotorImbalance
 from jaxvib.machine.scene import Scene
@@ -27,6 +28,7 @@ from jaxvib.motion.analysis.measure import measure, trajectory, unmeasured
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.system import PackedSystem
+from jaxvib.numerics.linalg import eigenvalues_in_turn
 from jaxvib.ode.control import PIController
 from jaxvib.ode.replay import solve
 from jaxvib.runtime.programs import cached
@@ -37,6 +39,9 @@ WINDOW_SAMPLES = 4096
 MIN_SAMPLES_PER_TURN = 16
 """Smallest number of samples in a turn of the rotor; a vibration with the period of a turn is then interpolated with
 a relative error of 4e-9, see `jaxvib.numerics.extrema.locate_extrema`."""
+
+_MOTOR_SPEEDS = 33
+"""Number of speeds from 0 to the largest one at which the rates of a motor are computed."""
 
 _UNBOUNDED_FACTOR = 1e8
 """Displacement or velocity, in units of its initial value or of its natural unit, beyond which a motion counts as unbounded."""
@@ -107,17 +112,38 @@ def effects_rate(scene: Scene) -> Array:
     return functools.reduce(jnp.maximum, all_rates, zero)
 
 
+def motor_poles(drive: Drive) -> Array:
+    """Return the poles of a motor whose rotor is free, complex, 1/s, at several speeds.
+
+    They are the eigenvalues of the equations of the speed and of the states of the motor, linearized about these speeds.
+    """
+    drive, zero = drive.at_working_speed(), jnp.zeros_like(drive.speed)
+    states = tuple(zero for _ in drive.state_units())
+
+    def rates(x: Array) -> Array:
+        motor = drive.torque_and_inertia(zero, x[0], tuple(x[1:]))
+        assert motor is not None
+        return jnp.stack([motor[0] / motor[1], *drive.state_rates(zero, x[0], tuple(x[1:]))])
+
+    speeds = jnp.append(drive.largest_speed * jnp.linspace(0.0, 1.0, _MOTOR_SPEEDS, dtype=zero.dtype), drive.speed)
+    slopes = jax.vmap(lambda speed: jax.jacfwd(rates)(jnp.stack([speed, *states])))(speeds)
+    return jnp.ravel(jax.vmap(eigenvalues_in_turn)(slopes) if states else slopes + 0j)
+
+
 @cached
 def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
     """Return the largest and the smallest of rotor speed and natural frequencies, rad/s.
 
     A natural frequency of 0 (a free carrier) is ignored. The largest value includes the natural frequency of the loads, if they
-    have one, and the rates of effects.
+    have one, the rates of effects, the largest speed of a drive during a run, and the frequencies of motors, see `motor_poles`.
     """
     scene = jax.lax.stop_gradient(scene)
     frequencies, speed = estimated_frequencies(scene), scene.top_speed
-    fastest = jnp.maximum(speed, jnp.max(frequencies))
+    largest = functools.reduce(jnp.maximum, (exciter.drive.largest_speed for exciter in scene.exciters))
+    fastest = jnp.maximum(largest, jnp.max(frequencies))
     for exciter in scene.exciters:
+        if exciter.drive.state_units():
+            fastest = jnp.maximum(fastest, jnp.max(jnp.abs(motor_poles(exciter.drive).imag)))
         natural_frequency = None if exciter.loads is None else exciter.loads.natural_frequency(exciter.drive.speed)
         fastest = fastest if natural_frequency is None else jnp.maximum(fastest, jnp.max(natural_frequency))
     fastest = jnp.maximum(fastest, effects_rate(scene))

@@ -433,8 +433,10 @@ def _build_scenes(make: Callable[..., Scene | tuple[Scene, State]], values: PyTr
 
 
 def _start_speed(states: State) -> np.ndarray:
-    """Return the largest speed (runs,), rad/s, at which a load starts; a user may choose one above that of the rotor."""
+    """Return the largest speed (runs,), rad/s, at which a load or the rotor of a motor starts; a user may choose one above
+    that of the drive."""
     speeds = [np.abs(exciter.rate[0]) for exciter in states.exciters if exciter.rate]
+    speeds += [np.abs(exciter.rotor[1])[:, None] for exciter in states.exciters if exciter.rotor is not None]
     return np.max([np.max(np.where(np.isfinite(x), x, 0.0), axis=-1) for x in speeds] or [0.0], axis=0)
 
 

@@ -12,11 +12,12 @@ from jax import Array
 from jaxvib.equations.linear import linear_model
 from jaxvib.equations.sliding import kinematics
 from jaxvib.equations.state import State
+from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import SupportForce
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.integrate import frequency_bounds
+from jaxvib.motion.integrate import frequency_bounds, motor_poles
 from jaxvib.numerics.linalg import hermitian_modes, relative_to
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.runtime.programs import cached
@@ -37,6 +38,18 @@ _MAX_IMPLICIT_SIZE = 64
 
 @cached
 def fastest_decay(scene: Scene) -> Array:
+    """Return the fastest decay rate, 1/s, due to the machine with its loads, `machine_decay`, or to a motor, `motor_poles`."""
+    drives = [exciter.drive for exciter in jax.lax.stop_gradient(scene).exciters if not exciter.drive.ideal]
+    return functools.reduce(jnp.maximum, [machine_decay(scene), *map(_motor_decay, drives)])
+
+
+def _motor_decay(drive: Drive) -> Array:
+    """Return the fastest decay rate of the speed and the states of a motor, 1/s."""
+    return jnp.max(-motor_poles(drive).real)
+
+
+@cached
+def machine_decay(scene: Scene) -> Array:
     """Return the fastest decay rate, 1/s, due to the drag of the loads or the damping of the carrier: the larger of
 
         max_j(-Q'_j / H_j) / (1 - mu sum_j m_j / kappa_j)   and   the largest eigenvalue of M^-1 C
@@ -120,8 +133,9 @@ def advice(scene: Scene) -> str:
     decay, motion = float(fastest_decay(scene)), float(frequency_bounds(scene)[0])
     if not decay > 10.0 * motion:
         return ""
-    carrier = float(np.max(np.asarray(_carrier_decay(scene))))
+    carrier, machine = float(np.max(np.asarray(_carrier_decay(scene)))), float(machine_decay(scene))
     name = "machine.damping makes vibrations" if carrier >= decay else "loads.drag makes speeds of loads"
+    name = name if machine >= decay else "a motor makes its speed or its currents"
     return (
         f"; {name} decay at {decay:.2g} 1/s, {decay / motion:.1g} times as fast as the motion: use a "
         "smaller value, or the default solver"

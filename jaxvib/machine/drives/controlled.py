@@ -144,6 +144,11 @@ class SpeedProfile(IdealDrive):
         """Working speed: the last one, or the largest if the rotor comes to rest, rad/s."""
         return jnp.where(self.speeds[-1] > 0.0, self.speeds[-1], jnp.max(self.speeds))
 
+    @property
+    def largest_speed(self) -> Array:
+        """Largest speed of the points, rad/s."""
+        return jnp.max(self.speeds)
+
     def _elapsed(self, t: Array) -> tuple[Array, Array]:
         """Return the time spent in each segment until `t`, and the acceleration in it."""
         lengths = jnp.diff(self.times)
@@ -221,6 +226,11 @@ class Converter(MotorWrapper):
         """Working speed of the reference."""
         return self.reference.speed
 
+    @property
+    def largest_speed(self) -> Array:
+        """Largest speed of the reference, rad/s."""
+        return self.reference.largest_speed
+
     def torque(self, speed: Array) -> Array:
         """Return the torque at the rotor's `speed` while the reference is at its working speed."""
         return self.motor.torque(speed + self.motor.speed - self.speed)
@@ -291,6 +301,11 @@ class SpeedControl(Motor):
         """Working speed of the reference."""
         return self.reference.speed
 
+    @property
+    def largest_speed(self) -> Array:
+        """Largest speed of the reference, rad/s."""
+        return self.reference.largest_speed
+
     def _torques(self, t: Array, speed: Array, integral: Array) -> tuple[Array, Array, Array]:
         """Return the error of the speed, the torque without a limit, and the torque."""
         error = self.reference.speed_at(t) - speed
@@ -323,8 +338,12 @@ class SpeedControl(Motor):
         return self.reference.jump_ts()
 
     def settled(self) -> Drive:
-        """Return the drive with the working speed as its reference."""
+        """Return the drive with the working speed as its reference. **Raises** `InputError` if the reference comes to rest."""
         return eqx.tree_at(lambda drive: drive.reference, self, self.reference.settled())
+
+    def at_working_speed(self) -> Drive:
+        """Return the drive with the working speed as its reference."""
+        return eqx.tree_at(lambda drive: drive.reference, self, self.reference.at_working_speed())
 
 
 def _require_ideal(reference: object) -> None:

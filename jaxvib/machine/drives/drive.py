@@ -44,6 +44,11 @@ class Drive(Part):
     constant: ClassVar[bool] = False
     """True if the rotor turns at `speed` from the start."""
 
+    @property
+    def largest_speed(self) -> Array:
+        """Largest speed of the rotor during a run, rad/s, without vibrations of the speed; `speed` by default."""
+        return self.speed
+
     @abc.abstractmethod
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
         """Return the rotor speed, rad/s.
@@ -116,6 +121,11 @@ class Directed(Drive):
     def _undirected(self, rotor: Rotor) -> Rotor:
         """Return the states of the rotor with the signs of `drive`."""
         return None if rotor is None else (self._directed(rotor[0]), self._directed(rotor[1]), *rotor[2:])
+
+    @property
+    def largest_speed(self) -> Array:
+        """Largest speed of the drive."""
+        return self.drive.largest_speed
 
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
         """Return the speed of the drive in the direction."""
@@ -475,14 +485,9 @@ class InductionMotor(Motor):
     kind: str = eqx.field(static=True)
 
     def __init__(self, speed: Number, breakdown_torque: Number, breakdown_slip: Number, inertia: Number):
-        self.speed, self.breakdown_torque, self.breakdown_slip, self.inertia = read_numbers(
-            InductionMotor,
-            "drive",
-            speed=speed,
-            breakdown_torque=breakdown_torque,
-            breakdown_slip=breakdown_slip,
-            inertia=inertia,
-        ).values()
+        given = {"speed": speed, "breakdown_torque": breakdown_torque, "breakdown_slip": breakdown_slip, "inertia": inertia}
+        found = read_numbers(InductionMotor, "drive", **given)
+        self.speed, self.breakdown_torque, self.breakdown_slip, self.inertia = found.values()
         self.kind = "induction_motor"
 
     def torque(self, speed: Array) -> Array:
@@ -504,6 +509,11 @@ class MotorWrapper(Motor):
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         """No-load speed of the motor."""
         return self.motor.speed
+
+    @property
+    def largest_speed(self) -> Array:
+        """Largest speed of the motor."""
+        return self.motor.largest_speed
 
     @property
     def inertia(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]

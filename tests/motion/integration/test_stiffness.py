@@ -9,6 +9,7 @@ from hard_cases.reference_model import reference_model
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
+from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.stiffness import equal_step_length, fastest_decay, is_unresolved
 from jaxvib.ode.dopri8 import UnrolledDopri8
 
@@ -54,6 +55,38 @@ def test_steps_resolve_decay_or_are_implicit():
         True,
     )
     assert bool(is_unresolved(7000.0, 1e-3)) and not bool(is_unresolved(5000.0, 1e-3))
+
+
+KLOSS = {"speed": 50.0, "breakdown_torque": 120.0, "breakdown_slip": 0.05, "inertia": 0.02}
+PROFILE = jv.SpeedProfile([0.0, 1.0, 3.0, 4.0], [0.0, 150.0, 150.0, 5.0])
+
+
+def unbalanced(drive):
+    """Machine with a resonance at 4 rad/s."""
+    return jv.Scene(jv.one_mass(mass=200.0, stiffness=3200.0, damping=50.0), exciters=[jv.Exciter(drive=drive, unbalance=0.2)])
+
+
+def test_fastest_rates_include_those_of_drives():
+    control = jv.SpeedControl(PROFILE, gain=5.0, integral_gain=50.0, torque_limit=40.0, inertia=0.02)
+    electrical = jv.DCMotorElectrical(48.0, 0.6, torque_constant=0.8, inertia=0.02, inductance=1e-3)
+    for drive, decay, motion in (
+        (jv.InductionMotor(**KLOSS), 2.0 * 120.0 / (0.05 * 50.0 * 0.02), 50.0),
+        (PROFILE, 0.25, 150.0),
+        (control, 125.0 + np.sqrt(125.0**2 - 50.0 / 0.02), 150.0),  # J s^2 + gain s + integral gain
+        (jv.Converter(jv.DCMotor(60.0, 30.0, 0.01), PROFILE), 30.0 / 60.0 / 0.01, 150.0),
+        (electrical, 300.0 + np.sqrt(300.0**2 - 0.64 / 2e-5), 60.0),  # L J s^2 + R J s + K^2
+        (eqx.tree_at(lambda motor: motor.inertia, electrical, 0.002), 300.0, np.sqrt(0.64 / 2e-6 - 300.0**2)),
+    ):
+        np.testing.assert_allclose(fastest_decay(unbalanced(drive)), decay, rtol=1e-9)
+        np.testing.assert_allclose(frequency_bounds(unbalanced(drive))[0], motion, rtol=1e-9)
+
+
+@pytest.mark.parametrize("drive", [jv.InductionMotor(**KLOSS), PROFILE], ids=["motor", "profile"])
+def test_equal_steps_resolve_drives(drive):
+    """Steps of the last speed alone are unstable for the motor, and the rotor of the profile turns by 7 rad in each of them."""
+    many = jv.ensemble(lambda _: unbalanced(drive), jnp.zeros(1), 5.0)
+    run = jv.simulate(unbalanced(drive), 5.0, stepsize_controller=jv.Tolerance(1e-10), save="window", estimate=False)
+    np.testing.assert_allclose(many.state.displacement[0], run.window.state.displacement[-1], atol=2e-6)
 
 
 def test_runs_of_any_drag_agree_with_radau_of_scipy():
