@@ -124,6 +124,8 @@ class Averaged(eqx.Module):
     - `groups` of the exciters' drives, see `Group`
     - of each exciter: `counts`, the number of its loads, 0 for an unbalance; `directions` of rotation
     - `owners`: the exciter of each row of `port`
+    - `other_rotors`: speeds, anticlockwise, rad/s, of the rotors whose masses are not part of the equations; the gyroscopic
+      matrix of the machine belongs to them too
     """
 
     stiffness: Array
@@ -140,6 +142,7 @@ class Averaged(eqx.Module):
     counts: tuple[int, ...] = eqx.field(static=True)
     directions: tuple[int, ...] = eqx.field(static=True)
     owners: tuple[int, ...] = eqx.field(static=True)
+    other_rotors: tuple[Array, ...] = ()
 
     @property
     def drives(self) -> tuple[Drive, ...]:
@@ -291,8 +294,9 @@ class Averaged(eqx.Module):
         return ungroup(self.groups, values)
 
     def gyroscopic_speed(self, speeds: Sequence[Array]) -> Array:
-        """Return the mean of the `rotor_speeds`, anticlockwise, by which the gyroscopic matrix is multiplied, rad/s."""
+        """Return the factor of the gyroscopic matrix: the mean of `rotor_speeds` and `other_rotors`, anticlockwise, rad/s."""
         turned = [n if way == 1 else -n for way, n in zip(self.directions, self.by_exciter(speeds), strict=True)]
+        turned += self.other_rotors
         return turned[0] if len(turned) == 1 else sum(turned[1:], turned[0]) / len(turned)
 
     def driving_torque(self, t: Array, speeds: Sequence[Array], rate: Array) -> Array:

@@ -96,9 +96,9 @@ class TorqueBalance(eqx.Module):
         """Return the rotor speeds of each group from the speeds `rate` (count,) of the masses, see `Averaged.rotor_speeds`."""
         return self.averaged.rotor_speeds(jnp.full_like(rate[0], LATE), rate)
 
-    def dynamic_stiffness(self, omega: Array) -> Array:
-        """Return D(omega) (nd, nd) complex, N/m."""
-        speeds = self.rotor_speeds(jnp.full_like(self.unbalance, omega))
+    def dynamic_stiffness(self, omega: Array, rate: Array | None = None) -> Array:
+        """Return D(omega) (nd, nd) complex, N/m, with masses that turn at the speeds `rate` (count,), default: `omega`."""
+        speeds = self.rotor_speeds(jnp.full_like(self.unbalance, omega) if rate is None else rate)
         return self.model.dynamic_stiffness(omega, self.averaged.gyroscopic_speed(speeds))
 
     def decomposed(self) -> TorqueBalance:
@@ -360,12 +360,16 @@ def assemble_for_search(scene: Scene, masses: tuple[int, ...] | None = None) -> 
 
 
 def balance_of_group(balance: TorqueBalance, masses: tuple[int, ...]) -> TorqueBalance:
-    """Return the balance of some rotating masses, by number. The others move with the machine, but exert no force."""
+    """Return the balance of some rotating masses, by number. The others move with the machine, but exert no force.
+
+    The rotors of the other exciters turn at the working speeds of their drives.
+    """
     field, indices = balance.averaged, np.asarray(masses)
     owner = owners_of(field.counts)[indices]
     exciters = sorted(set(owner.tolist()))
     rows = indices if field.levers is None else np.flatnonzero(np.isin(field.owners, exciters))
     drives = field.drives
+    others = tuple(field.directions[k] * drive.speed for k, drive in enumerate(drives) if k not in exciters)
     counts = tuple(int(np.sum(owner == k)) if field.counts[k] else 0 for k in exciters)
     averaged = dataclasses.replace(
         field,
@@ -379,6 +383,7 @@ def balance_of_group(balance: TorqueBalance, masses: tuple[int, ...]) -> TorqueB
         counts=counts,
         directions=tuple(field.directions[k] for k in exciters),
         owners=tuple(exciters.index(field.owners[row]) for row in rows),
+        other_rotors=others,
     )
     return TorqueBalance(balance.model, averaged, balance.direction[indices], balance.motor_torque[indices])
 
@@ -407,16 +412,19 @@ def _motor_torque(averaged: Averaged) -> Array:
     return jax.lax.stop_gradient(each[0] if len(each) == 1 else jnp.concatenate(each))
 
 
-def influence_of(balance: TorqueBalance, omega: Array) -> Array:
-    """Return the influence coefficients H_jk (count, count), complex, m/N: response at mass j per force of mass k."""
+def influence_of(balance: TorqueBalance, omega: Array, rate: Array | None = None) -> Array:
+    """Return the influence coefficients H_jk (count, count), complex, m/N: response at mass j per force of mass k.
+
+    `rate` (count,), rad/s: speeds of the masses, on which gyroscopic forces depend; default: all turn at `omega`.
+    """
     if balance.model.modal is not None:
         return balance.model.modal.receptance(omega)
-    return balance.direction.conj() @ response_of(balance, omega)
+    return balance.direction.conj() @ response_of(balance, omega, rate)
 
 
-def response_of(balance: TorqueBalance, omega: Array) -> Array:
+def response_of(balance: TorqueBalance, omega: Array, rate: Array | None = None) -> Array:
     """Return the response of the carrier per force of each mass, D^-1 B_k^T e_k (nd, count), complex, m/N."""
-    dynamic = balance.dynamic_stiffness(omega)
+    dynamic = balance.dynamic_stiffness(omega, rate)
     return small_solve(dynamic, balance.direction.T.astype(dynamic.dtype))
 
 

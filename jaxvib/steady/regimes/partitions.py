@@ -252,7 +252,7 @@ def _interactions(speed: Array, group: Array, scene: Scene) -> Array:
     unbalance, inertia = balance.unbalance, balance.averaged.inertia
 
     def one(speed: Array, group: Array) -> Array:
-        influence = jax.vmap(lambda w: magnitude(influence_of(balance, w)))(speed)
+        influence = jax.vmap(lambda w: magnitude(influence_of(balance, w, speed)))(speed)
         from_each = jnp.diagonal(influence, axis1=0, axis2=2)  # (i, k): at the speed of mass k
         torque = 0.5 * unbalance[:, None] * unbalance[None] * speed[None] ** 4 * from_each
         slope = jnp.diagonal(jax.jacfwd(balance.driving_torques)(speed))

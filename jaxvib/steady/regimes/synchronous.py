@@ -322,7 +322,8 @@ def synchronous_regimes(
     - `scene`, with gravity as its only effect or without effects; exciters have an unbalance, or loads and an ideal drive;
       typical: 2 to 32 rotating masses
     - `masses`: numbers, from 0, of the rotating masses that turn at the common speed; the result contains only these and their
-      exciters. The others turn at different speeds; only their mass affects the result. Default: all
+      exciters. The others turn at different speeds; only their mass affects the result and, in a machine with a gyroscopic
+      matrix, the working speeds of their drives, as parts of n. Default: all
     - `near`: (speed, phases), rad/s and (mass,) rad, from which Newton's method finds one regime. The function can then be used
       under `jit`, `vmap` and `grad`. Derivatives are those of the implicit function theorem; `growth`, `quasi_static`
       and `stable` have none

@@ -43,6 +43,21 @@ def speeds_alone(unbalance, speed, torque):
     return [(brentq(balance, grid[k], grid[k + 1], xtol=1e-12), values[k] > 0.0) for k in at]
 
 
+def test_gyroscopic_matrix_includes_rotors_of_other_groups():
+    machine = jv.from_matrices(
+        20.0 * np.eye(2), 100.0 * np.eye(2), 1e5 * np.eye(2), gyroscopic=[[0.0, 4.0], [-4.0, 0.0]], places=[[0, 1]]
+    )
+    slow = jv.Exciter(drive=motor(60.0, 1.0, 0.01), unbalance=0.02)
+    for way in (1, -1):
+        fast = jv.Exciter(drive=jv.ConstantSpeed(300.0), unbalance=1e-4, direction=way)
+        scene = jv.Scene(machine, exciters=[slow, fast])
+        regimes = jv.synchronous_regimes(scene, masses=[0])
+        run = jv.settle(scene)
+        np.testing.assert_allclose(regimes.speed, run.load_speed[:1], rtol=1e-5)
+        np.testing.assert_allclose(regimes.amplitude[0], run.amplitude, rtol=1e-2)  # the fast rotor adds 0.4 %
+        assert jv.regime_partitions(scene).interaction[0] < 1e-3
+
+
 @pytest.mark.slow
 def test_partitions_of_two_are_all_pairs_of_single_speeds():
     numbers = [(0.4, 100.0, 0.6), (0.3, 60.0, 0.4)]
