@@ -158,9 +158,15 @@ def linear_model(scene: Scene) -> LinearModel:
     return LinearModel(scene, model.carrier, model.mounts, model.supports, mass)
 
 
-def mean_speed(scene: Scene) -> Array:
-    """Return the mean speed of all rotors, rad/s, anticlockwise."""
-    speeds = [exciter.direction * exciter.drive.speed for exciter in scene.exciters]
+def mean_speed(scene: Scene, unbalances: Array | None = None) -> Array:
+    """Return the mean speed of all rotors, rad/s, anticlockwise.
+
+    Rotors without loads turn at the speed `unbalances`, rad/s, others at the working speeds of their drives (default: all).
+    """
+    speeds = [
+        exciter.direction * (exciter.drive.speed if unbalances is None or exciter.loads is not None else unbalances)
+        for exciter in scene.exciters
+    ]
     return sum(speeds[1:], speeds[0]) / len(speeds)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import Dynamics, dynamics_of
-from jaxvib.equations.linear import linear_model
+from jaxvib.equations.linear import linear_model, mean_speed
 from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.state import ExciterState, State
 from jaxvib.machine.drives.drive import Motor
@@ -230,7 +230,8 @@ def linear_start(scene: PeriodicScene, grid: Grid, omega: Array) -> Array:
         phase = body_phases[0] if body_phases else 0.0
         direction = jnp.stack([(1.0 + 0.0j, -1.0j * exciter.direction)[axis] for axis in mount.axes])
         force.append(unbalance_of(exciter) * jnp.exp(1j * phase) * (mount.rows[0].T @ direction))
-    response = small_solve(model.dynamic_stiffness(omega, model.scene.top_speed), omega**2 * sum(force[1:], force[0]))
+    dynamic = model.dynamic_stiffness(omega, mean_speed(model.scene, omega))
+    response = small_solve(dynamic, omega**2 * sum(force[1:], force[0]))
     q = (response[:, None] * np.exp(1j * grid.theta)[None]).real / scene.length
     no_deviation = jnp.zeros((scene.phases.size, grid.theta.size), omega.dtype)
     return jax.lax.stop_gradient(jnp.concatenate([q.astype(omega.dtype), no_deviation]))

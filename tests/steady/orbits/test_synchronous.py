@@ -11,9 +11,11 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 import jaxvib as jv
+from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.status import status_names
 from jaxvib.steady.orbits.limit import _fold, _Point
 from jaxvib.steady.orbits.synchronous import plan_synchronous
+from jaxvib.steady.orbits.whole import linear_start, periodic_scene
 from jaxvib.units import Bounds
 
 G = 9.81
@@ -141,6 +143,22 @@ def test_opposite_ideal_exciters_throw_along_a_straight_line():
     np.testing.assert_allclose(orbit.amplitude, [amplitude, 0.0, 0.0], rtol=1e-12, atol=1e-14)
     assert float(orbit.speed) == 100.0 and np.isnan(orbit.trivial) and bool(orbit.stable)
     assert float(jnp.sum(orbit.power)) == pytest.approx(0.5 * 4e3 * (amplitude * 100.0) ** 2, rel=1e-10)
+
+
+@pytest.mark.parametrize("way", [1, -1])
+@pytest.mark.parametrize("jammed", [False, True])
+def test_start_includes_gyroscopic_forces_of_either_direction(way, jammed):
+    machine = jv.from_matrices(
+        20.0 * np.eye(2), 100.0 * np.eye(2), 1e5 * np.eye(2), gyroscopic=[[0.0, 4.0], [-4.0, 0.0]], places=[[0, 1]]
+    )
+    w, speed = 60.0, 90.0 if jammed else 60.0
+    body = {"loads": jv.balls(count=1, mass=1e-5, radius=0.1, drag=1.0)} if jammed else {"unbalance": 1e-6}
+    exciter = jv.Exciter(drive=jv.ConstantSpeed(speed), direction=way, **body)
+    whole, grid = periodic_scene(jv.Scene(machine, exciters=[exciter]), jnp.zeros(1)), grid_of(17, False)
+    start = linear_start(whole, grid, jnp.asarray(w))[:2] * whole.length
+    expected = 1e-6 * w**2 / (1e5 - 20.0 * w**2 + 4.0 * w * speed + 100.0j * w)
+    size = np.sqrt(2.0 * np.mean(np.asarray(start) ** 2, axis=1))
+    np.testing.assert_allclose(size, abs(expected), rtol=1e-5)
 
 
 def test_phase_of_opposite_motors_is_minus_the_sum_of_angles():
