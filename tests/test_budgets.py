@@ -49,8 +49,9 @@ BUDGETS = {
     "vector field": (field, 134),
     "jam_modes": (modes, 1400),
     "jam_modes, gradient": (jax.grad(modes), 2050),
-    "jam_orbit": (orbit, 3360),  # with the check of traced numbers, power without cancellation, and the number of steps
-    "jam_orbit, gradient": (jax.grad(orbit), 3970),  # 150 of them fill places of steps that are not taken
+    # With the check of traced numbers, power without cancellation, the number of steps, and the error of multipliers.
+    "jam_orbit": (orbit, 3390),
+    "jam_orbit, gradient": (jax.grad(orbit), 4010),  # 150 of them fill places of steps that are not taken
     "simulate": (run, 2420),
     "simulate, forward derivatives": (jax.jacfwd(forward_run), 4600),
     "simulate, reverse derivatives": (jax.grad(run), 4190),

@@ -16,8 +16,12 @@ from jaxvib.numerics.loops import repeat
 _STAGES = 6
 """Number of collocation points in a step; the method then has the order 11."""
 
-_PHASE = 1.0
+PHASE = 1.0
 """Phase of the fastest oscillation in a step, rad. The relative error of a step of order 11 is then 5e-12."""
+
+_DECAY_ERROR = 1e-11
+"""Twice the relative decay of an undamped oscillation in a step of the phase 1 rad; it is proportional to the 12th power of the
+phase."""
 
 
 def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
@@ -56,7 +60,12 @@ _FORMS = _forms()
 
 def steps_for(radians: Array) -> Array:
     """Return the number of steps for the total phase of the fastest oscillation, rad; decay of any rate needs no more steps."""
-    return jnp.ceil(radians / _PHASE).astype(int)
+    return jnp.ceil(radians / PHASE).astype(int)
+
+
+def decay_error(phase: Array, steps: int | Array) -> Array:
+    """Return a bound of the relative decay of an undamped oscillation in `steps` steps, from its `phase` in a step, rad."""
+    return _DECAY_ERROR * phase**12 * steps
 
 
 def transition(slopes: Array, h: float | Array) -> Array:

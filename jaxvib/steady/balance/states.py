@@ -397,6 +397,11 @@ def balanced_growth(scene: Scene, speeds: Numbers, angles: ArrayLike | None = No
     return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(values.shape)
 
 
+def decay_over_turn(speeds: np.ndarray, growth: np.ndarray) -> np.ndarray:
+    """Return True for growth rates, 1/s, of deviations that decay during a turn by more than errors of the computation."""
+    return growth * 2.0 * np.pi / speeds < -_rounding()
+
+
 def balanced_intervals(
     scene: Scene, low: Number, high: Number, angles: ArrayLike | None = None, *, points: int = 200, steps: int | None = None
 ) -> SpeedIntervals:
@@ -420,7 +425,7 @@ def balanced_intervals(
     if not 0.0 < low < high:
         raise InputError("low", f"is {low:g} and high {high:g}; 0 < low < high is needed, both finite")
     grid = np.linspace(low, high, count(points, "points", low=2, each=1e4))
-    stable = balanced_growth(scene, grid, angles, steps=steps) < 0.0
+    stable = decay_over_turn(grid, balanced_growth(scene, grid, angles, steps=steps))
     changes = stability_changes(scene, grid, stable, angles, steps=steps).tolist()
     ends = [*([low] if stable[0] else []), *changes, *([high] if stable[-1] else [])]
     return SpeedIntervals([float(a), float(b)] for a, b in zip(ends[0::2], ends[1::2], strict=True))
@@ -444,7 +449,7 @@ def stability_changes(
     left, right = speeds[change], speeds[change + 1]
     while left.size and np.max((right - left) / right) > rtol:
         middle = (left + right) / 2.0
-        same = (balanced_growth(scene, middle, angles, steps=steps) < 0.0) == stable[change]
+        same = decay_over_turn(middle, balanced_growth(scene, middle, angles, steps=steps)) == stable[change]
         left, right = np.where(same, middle, left), np.where(same, right, middle)
     return (left + right) / 2.0
 

@@ -19,7 +19,7 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.orbits.solve import Harmonics, Parameter, PeriodicSolution, branch_tangent, harmonics_of, periodic_motion
-from jaxvib.steady.orbits.stability import Floquet, floquet
+from jaxvib.steady.orbits.stability import Floquet, decay_error, floquet, multiplier_error
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.units import count, known_number
 
@@ -60,8 +60,9 @@ class Orbit(Result):
     - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, (max - min)/2 over the period. For two
       directions of the force: root of the summed squares of their peaks (sqrt 2 times the force of a circular whirl)
     - `power`, W: mean power that the loads take from the rotor, by drag and dry friction
-    - `stable`: True if small deviations of the loads from this motion decay (`multiplier` < 1) and the loads do not separate
-    - `multiplier`: largest modulus of the non-trivial Floquet multipliers
+    - `stable`: True if small deviations of the loads from this motion decay (`multiplier` < 1 - `multiplier_error`) and the
+      loads do not separate
+    - `multiplier`: largest modulus of the non-trivial Floquet multipliers; `multiplier_error`: its estimated numerical error
     - `multipliers`: all Floquet multipliers, complex; those of loads that separate from each other are the last ones
     - `trivial`: computed value of the multiplier of a shift in time, which is exactly 1
     - `deviation_harmonics` (G, J), rad, `displacement_harmonics` (nd, K), m (rad for tilts), `force_harmonics` (nb, K), N: the
@@ -77,6 +78,7 @@ class Orbit(Result):
     slope: Array = eqx.field(metadata=in_unit(""))
     stable: Array = eqx.field(metadata=in_unit(""))
     multiplier: Array = eqx.field(metadata=in_unit(""))
+    multiplier_error: Array = eqx.field(metadata=in_unit(""))
     multipliers: Array = eqx.field(metadata=in_unit("", "floquet"))
     trivial: Array = eqx.field(metadata=in_unit(""))
     amplitude: Array = eqx.field(metadata=in_unit("m or rad", "coordinate"))
@@ -128,7 +130,7 @@ class Orbit(Result):
     @property
     def judgement(self) -> str:
         """Stability as text: "stable", "unstable", or that the stability is unknown."""
-        return judgement_of(self.multiplier, self.stable, self.trivial)
+        return judgement_of(self.multiplier, self.multiplier_error, self.stable)
 
     def force_peaks(self) -> Array:
         """Return the greatest foundation force in each of 16 equal parts of the period, N, (16,); the largest is
@@ -164,13 +166,12 @@ class Orbit(Result):
         return plot_period(self.orders, self.displacement_harmonics, named, deviation, self.force_harmonics, ax)
 
 
-def judgement_of(multiplier: Array, stable: Array, trivial: Array) -> str:
+def judgement_of(multiplier: Array, error: Array, stable: Array) -> str:
     """Return "stable" or "unstable", or that the stability is unknown, for the largest `multiplier` of a motion.
 
-    It is unknown without a multiplier, and if the multiplier differs from 1 by less than the `trivial` one, which is 1 except
-    for the error of the integration.
+    It is unknown without a multiplier, and if the multiplier differs from 1 by less than its `error`.
     """
-    if np.isnan(multiplier) or abs(multiplier - 1.0) <= abs(trivial - 1.0):
+    if np.isnan(multiplier) or abs(multiplier - 1.0) <= error:
         return "stability unknown"
     return "stable" if stable else "unstable"
 
@@ -274,6 +275,8 @@ def orbits(
     limited = jnp.where(resolved, steps if max_steps is None else jnp.minimum(steps, max_steps), 1)
     growth = floquet(model, grid, motion, harmonics, limited, implicit=implicit, max_steps=max_steps)
     multipliers, trivial, largest = _multipliers_of(growth, grid)
+    turn, turns = (np.pi, 2.0) if grid.symmetric else (2.0 * np.pi, 1.0)
+    largest_error = multiplier_error(trivial, turns * decay_error(steps, limited, turn, implicit=implicit))
     slope, residual, speed_error, deviation_error, amplitude, force, power, contact_torque = measured
     tiny = jnp.finfo(slope.dtype).eps
     relative = jnp.abs(slope) * motion.omega / motion.rotor_speed
@@ -291,8 +294,9 @@ def orbits(
         omega=or_nan(motion.omega),
         rotor_speed=or_nan(motion.rotor_speed),
         slope=or_nan(slope),
-        stable=met & resolved & (largest < 1.0) & ~separates,
+        stable=met & resolved & (largest < 1.0 - largest_error) & ~separates,
         multiplier=or_nan(jnp.where(resolved, largest, jnp.nan)),
+        multiplier_error=or_nan(jnp.where(resolved, largest_error, jnp.nan)),
         multipliers=or_nan(jnp.where(resolved, multipliers, jnp.nan)),
         trivial=or_nan(jnp.where(resolved, trivial, jnp.nan)),
         amplitude=or_nan(amplitude),

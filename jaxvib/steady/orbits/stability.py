@@ -25,6 +25,13 @@ _PHASE_PER_STEP = 0.7
 """Phase of the carrier's fastest motion in an explicit step, rad. With order 8 the error of the multipliers is then 1e-12 for
 loads as fast as the carrier, and 1e-10 for loads three times as fast as the carrier."""
 
+_GROWTH_ERROR = 5e-8
+"""Twice the relative growth of an undamped oscillation in an explicit step of the phase 1 rad; it is proportional to the 10th
+power of the phase."""
+
+_ROUNDING_ERRORS = 1e3
+"""Smallest error of multipliers, in units of rounding."""
+
 _STIFF_DECAY_RATIO = 3.0
 """Ratio of decay rate and fastest oscillation above which the implicit method is used. Explicit steps would have to resolve
 the decay, and diverge above a ratio of about 7."""
@@ -52,6 +59,26 @@ class Floquet(NamedTuple):
     roots: Array
     inner: Array | None
     trivial: Array
+
+
+def decay_error(needed: int | Array, steps: int | Array, turn: float, *, implicit: bool) -> Array:
+    """Return a bound of the relative growth or decay of an undamped oscillation of the carrier in a turn of the grid.
+
+    **Arguments**: the `needed` number of integration steps, see `steps_for`, from which the phase of the fastest oscillation
+    follows; the number of `steps` that are taken; the angle `turn`, rad.
+    """
+    phase = ((radau.PHASE if implicit else _PHASE_PER_STEP) * needed - 2.0 * turn) / jnp.asarray(steps)
+    return radau.decay_error(phase, steps) if implicit else _GROWTH_ERROR * phase**10 * steps
+
+
+def multiplier_error(trivial: Array, decay_error: Array) -> Array:
+    """Return the error of the moduli of multipliers near 1: the largest of three known errors.
+
+    They are the error of the `trivial` multiplier, which is exactly 1, that of an undamped oscillation of the carrier by the
+    integration, and rounding.
+    """
+    rounding = _ROUNDING_ERRORS * float(jnp.finfo(trivial.dtype).eps)
+    return jnp.maximum(jnp.abs(trivial - 1.0), jnp.maximum(decay_error, rounding))
 
 
 def _oscillation(model: JammedBodies, speed: Array) -> Array:

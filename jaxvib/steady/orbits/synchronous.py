@@ -54,10 +54,6 @@ _MAX_UNKNOWN_STEPS = 128
 _ONE_ANGLE = 1e-3
 """Largest difference between the phases of loads at one angle, rad."""
 
-_STABLE_MARGIN = 1e3
-"""Distance of the largest multiplier from 1, in units of rounding, below which a disturbance counts as neither growing nor
-decaying."""
-
 
 _SYNCHRONOUS_POINTS = (17, 33, 65, 129)
 """Collocation points on a period, tried one after the other until the accuracy is reached."""
@@ -107,8 +103,8 @@ class SynchronousOrbit(PathsOfPoints, Result):
     - `torque` (N,), N m: mean torque of each drive in the direction of its rotation; `power` (N,), W: its mean power
     - `amplitude` (nd,), m (rad for rotations), and `foundation_force`, N: zero to peak, (max - min)/2 over the period; for two
       directions of the force the root of their summed squares
-    - `stable`: True if small disturbances decay, that is `multiplier` < 1
-    - `multiplier`: largest modulus of the non-trivial Floquet multipliers
+    - `stable`: True if small disturbances decay, that is `multiplier` < 1 - `multiplier_error`
+    - `multiplier`: largest modulus of the non-trivial Floquet multipliers; `multiplier_error`: its estimated numerical error
     - `multipliers`: all Floquet multipliers, complex; `trivial`: computed value of the multiplier of a shift in time, which is
       exactly 1; NaN if an ideal drive turns an unbalance, because a shifted motion is then not a solution
     - `residual` of the equations of motion, relative; `error`: estimated relative error of speed and displacements, and error
@@ -125,6 +121,7 @@ class SynchronousOrbit(PathsOfPoints, Result):
     power: Array = eqx.field(metadata=in_unit("W", "exciter"))
     stable: Array = eqx.field(metadata=in_unit(""))
     multiplier: Array = eqx.field(metadata=in_unit(""))
+    multiplier_error: Array = eqx.field(metadata=in_unit(""))
     multipliers: Array = eqx.field(metadata=in_unit("", "floquet"))
     trivial: Array = eqx.field(metadata=in_unit(""))
     amplitude: Array = eqx.field(metadata=in_unit("m or rad", "coordinate"))
@@ -139,7 +136,7 @@ class SynchronousOrbit(PathsOfPoints, Result):
     @property
     def judgement(self) -> str:
         """Stability as text: "stable", "unstable", or that the stability is unknown."""
-        return judgement_of(self.multiplier, self.stable, self.trivial)
+        return judgement_of(self.multiplier, self.multiplier_error, self.stable)
 
     @validated
     def at(self, theta: Number) -> State:
@@ -390,7 +387,7 @@ def _solve_program(
     forced = bool(forcing)
     motion = solve_whole(whole, grid, speed, forced=forced)
     residual, error = collocation_error(whole, grid, motion, forced=forced)
-    multipliers, trivial = multipliers_of(whole, grid, motion, max_steps, forced=forced)
+    multipliers, trivial, multiplier_error = multipliers_of(whole, grid, motion, max_steps, forced=forced)
     eps = float(jnp.finfo(speed.dtype).eps)
     largest = jnp.max(jnp.abs(multipliers))
     is_met = residual < 4096.0 * eps
@@ -404,11 +401,11 @@ def _solve_program(
     status = SynchronousStatus.where(equal, status, SynchronousStatus.different_speeds)
     is_solution = is_met & equal
     numbers = {
-        **_quantities(whole, grid, motion), "multiplier": largest, "multipliers": multipliers, "trivial": trivial,
-        "error": error,
+        **_quantities(whole, grid, motion), "multiplier": largest, "multiplier_error": multiplier_error,
+        "multipliers": multipliers, "trivial": trivial, "error": error,
     }  # fmt: skip
     numbers = {name: jnp.where(is_solution, x, jnp.nan) for name, x in numbers.items()}
-    stable = is_solution & (largest < 1.0 - _STABLE_MARGIN * eps)
+    stable = is_solution & (largest < 1.0 - multiplier_error)
     return SynchronousOrbit(status=status, stable=stable, residual=residual, scene=scene, **numbers)
 
 

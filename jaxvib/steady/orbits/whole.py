@@ -23,7 +23,7 @@ from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of, resampling
 from jaxvib.numerics.linalg import eigenvalues, small_solve, solve_in_turn
 from jaxvib.steady.orbits.solve import Linearized, newton
-from jaxvib.steady.orbits.stability import deflate
+from jaxvib.steady.orbits.stability import deflate, multiplier_error
 
 
 def body_counts(scene: Scene) -> tuple[int, ...]:
@@ -301,8 +301,8 @@ def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, 
 
 def multipliers_of(
     scene: PeriodicScene, grid: Grid, motion: WholeMotion, max_steps: int | None, *, forced: bool
-) -> tuple[Array, Array]:
-    """Return the Floquet multipliers of the full state about a periodic motion, and the trivial one.
+) -> tuple[Array, Array, Array]:
+    """Return the Floquet multipliers of the full state about a periodic motion, the trivial one, and the error of their moduli.
 
     Without forcing the trivial multiplier of a shift in time is not among the others; with forcing it is NaN. The
     number of steps of `radau.flow` in a period is the number that the carrier's fastest vibration needs, at most `max_steps`.
@@ -317,22 +317,24 @@ def multipliers_of(
         at = theta, (harmonics @ wave).real, (harmonics @ (1j * orders * wave)).real, omega
         return scene.slopes(*at)[0][:, : 2 * n]
 
-    steps = _steps_for(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(omega))
+    radians = _radians(*jax.lax.stop_gradient((scene, omega)))
+    steps = radau.steps_for(radians)
     steps = steps if max_steps is None else jnp.clip(steps, 1, max_steps)
     whole = radau.flow(slopes, n, 2.0 * np.pi, steps, x.dtype, max_steps)
+    decay_error = radau.decay_error(radians / steps, steps)
     if forced:
-        return eigenvalues(whole), jnp.full_like(omega, jnp.nan)
+        return eigenvalues(whole), jnp.full_like(omega, jnp.nan), multiplier_error(jnp.ones_like(omega), decay_error)
     rate, second = _rates(grid, x)
     along = jnp.concatenate([rate[:, 0].at[scene.coordinates :].add(1.0), second[:, 0]])
     trivial, rest = deflate(whole, along)
-    return eigenvalues(rest), trivial
+    return eigenvalues(rest), trivial, multiplier_error(trivial, decay_error)
 
 
-def _steps_for(scene: PeriodicScene, omega: Array) -> Array:
-    """Return the number of steps in a period that resolve the carrier's fastest vibration."""
+def _radians(scene: PeriodicScene, omega: Array) -> Array:
+    """Return the phase of the fastest oscillation, that of the carrier as seen by the bodies, in a period, rad."""
     carrier, gyroscopic = scene.model.carrier, scene.model.mounts[0].gyroscopic
     half = jnp.linalg.inv(jnp.linalg.cholesky(carrier.mass))
     fastest = jnp.sqrt(jnp.max(jnp.abs(jnp.linalg.eigvalsh(half @ carrier.stiffness @ half.T))))
     if gyroscopic is not None:
         fastest = fastest + scene.model.scene.top_speed * jnp.linalg.norm(half @ gyroscopic @ half.T)
-    return radau.steps_for(2.0 * np.pi * (fastest / omega + 2.0))
+    return 2.0 * np.pi * (fastest / omega + 2.0)

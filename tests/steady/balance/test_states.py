@@ -105,3 +105,13 @@ def test_speeds_of_growth_rates_are_numbers(speeds):
     )
     with pytest.raises(jv.InputError, match=r"^speeds"):
         jv.balanced_states(scene).growth(speeds)
+
+
+@pytest.mark.parametrize("stiffness", [5e4, 2e7])
+def test_undamped_vibration_has_no_stable_interval(stiffness):
+    machine = jv.two_mass(
+        mass=(120.0, 95.0), stiffness=(stiffness, 5e4), damping=(0.0, 400.0), link_stiffness=0.0, link_damping=0.0
+    )
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=5.0), jv.ConstantSpeed(60.0))
+    assert jv.balanced_states(scene).stability().status_name == "undecided"
+    assert jv.balanced_states(scene).intervals(50.0, 90.0, points=20) == []

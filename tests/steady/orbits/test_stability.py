@@ -270,3 +270,22 @@ def test_a_multiplier_within_its_error_of_one_gives_no_verdict():
     found = jv.jam_orbit(scene, near=0.01)
     assert abs(found.multiplier - 1.0) <= abs(found.trivial - 1.0) < 1e-9
     assert found.judgement == "stability unknown" and "stability unknown" in found.summary()
+
+
+def undamped(stiffness, **parts):
+    """Scene on the second of two platforms without link; the first one has no damping: two multipliers of modulus 1."""
+    machine = jv.two_mass(
+        mass=(120.0, 95.0), stiffness=(stiffness, 5e4), damping=(0.0, 400.0), link_stiffness=0.0, link_damping=0.0
+    )
+    return jv.Scene(machine, **parts)
+
+
+@pytest.mark.parametrize("stiffness", [5e4, 3e5, 2e7])
+@pytest.mark.parametrize("drag", [1.0, 1e4])  # explicit and implicit steps
+def test_undamped_vibration_is_neither_stable_nor_unstable(stiffness, drag):
+    loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=drag)
+    jam = jv.jam_orbit(undamped(stiffness, loads=loads, drive=jv.ConstantSpeed(40.0)), omega=20.0)
+    exciter = jv.Exciter(drive=jv.ConstantSpeed(30.0), unbalance=0.1)
+    for orbit in (jam, jv.synchronous_orbit(undamped(stiffness, exciters=[exciter]))):
+        assert abs(orbit.multiplier - 1.0) < orbit.multiplier_error < 2e-7
+        assert not orbit.stable and orbit.judgement == "stability unknown"
