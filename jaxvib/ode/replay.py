@@ -166,10 +166,15 @@ def _refuse_reverse(*_: object, field: str, problem: str) -> NoReturn:
     raise InputError(field, problem)
 
 
+_NO_SECOND_REVERSE = (
+    "has no reverse derivatives of reverse derivatives; for second derivatives of a run use forward over reverse, "
+    "jax.hessian(f) or jax.jacfwd(jax.jacrev(f)), in place of jax.jacrev(jax.jacrev(f))"
+)
+
 _forward_tangents = primitive(
     "forward_tangents",
     impl=lambda *tangents, **_: list(tangents),
-    batching_rule=lambda tangents, axes, **_: (list(tangents), list(axes)),
+    batching_rule=lambda tangents, axes, **named: (_forward_tangents(*tangents, **named), list(axes)),
     transpose=_refuse_reverse,
     lowering=lambda *tangents, **_: list(tangents),
     abstract_eval=lambda *types, **_: types,
@@ -246,7 +251,8 @@ def _backward(
         y0=y0,
         every=_spacing(y0, rest[1]),
     )
-    return _by_inputs(differentiable, cotangents, saveat, controller, backward.saved, backward.slopes(jnp.zeros_like(end)))
+    slopes = forward_only(backward.slopes(jnp.zeros_like(end)), "adjoint", _NO_SECOND_REVERSE)
+    return _by_inputs(differentiable, cotangents, saveat, controller, backward.saved, slopes)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxvib.errors import InputError
 from jaxvib.ode.control import PIController
 from jaxvib.ode.dopri8 import UnrolledDopri8
 from jaxvib.ode.dopri8_loop import LoopDopri8
@@ -176,3 +177,26 @@ def test_slopes_by_the_end_and_by_constant_steps(controller):
         np.testing.assert_allclose(by_step, forward[1], atol=1e-9)
     else:
         assert jnp.all(by_step == 0.0)
+
+
+def test_second_derivatives_are_forward_over_reverse():
+    """End state of y' = -k y: exp(-k)."""
+
+    def state(k):
+        return solve(
+            diffrax.ODETerm(lambda t, y, k: -k * y),
+            diffrax.Dopri8(),
+            end=jnp.asarray(1.0),
+            first_step=jnp.asarray(0.1),
+            y0=jnp.asarray(1.0),
+            args=k,
+            saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True)]),
+            controller=diffrax.PIDController(rtol=1e-10, atol=1e-12),
+            adjoint=None,
+            max_steps=256,
+        ).ys[0][-1]
+
+    np.testing.assert_allclose(jax.hessian(state)(2.0), np.exp(-2.0), rtol=1e-8)
+    for reverse in (jax.jacrev, jax.grad):
+        with pytest.raises(InputError, match="use forward over reverse"):
+            reverse(reverse(state))(2.0)
