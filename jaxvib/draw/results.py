@@ -119,12 +119,14 @@ def phase_circles(
     *,
     resultant: bool = True,
     numbers: np.ndarray | None = None,
+    plural: str = "loads",
     ax: Onto = None,
 ) -> Drawn:
     """Draw angles of loads (count,) rad as points on a circle, one circle for each (title, angles).
 
     A black arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel.
-    `resultant`: False for masses that turn in different directions, whose mean has no meaning. `numbers`: see `draw_circle`.
+    `resultant`: False for masses that turn in different directions, whose mean has no meaning. `numbers` and `plural`: see
+    `draw_circle`.
     `ax` must contain one axes object for each circle.
 
     >>> import numpy as np
@@ -137,7 +139,7 @@ def phase_circles(
     for k, axis in enumerate(axes):
         axis.set_axis_off()
         if k < len(sets):
-            draw_circle(axis, *sets[k], resultant=resultant, numbers=numbers)
+            draw_circle(axis, *sets[k], resultant=resultant, numbers=numbers, plural=plural)
     return figure if ax is None else ax
 
 
@@ -150,11 +152,13 @@ def draw_circle(
     imbalance: complex = 0.0,
     resultant: bool = True,
     numbers: np.ndarray | None = None,
+    plural: str = "loads",
 ) -> None:
     """Draw angles (count,) rad as points on a circle, with arrows, see `phase_circles`.
 
     `weights` (count,), whose sum is 1, are those of the mean; default: equal ones. An orange arrow shows the `imbalance` of the
     rotor, relative to the unbalance of all loads at one angle. `numbers` (count,) of the loads, from 0; default: 0, 1, ...
+    `plural`: name of the points, for the label of many at one angle.
     """
     axis.set(aspect="equal", xlim=(-1.6, 1.6), ylim=(-1.35, 1.35))
     axis.set_axis_off()
@@ -169,7 +173,7 @@ def draw_circle(
             side = {0: "right", 180: "left"}.get(degrees, "center")
             look: Look = {"ha": side, "va": "center", "fontsize": "x-small", "color": "#555555"}
             axis.text(0.88 * float(e[0]), 0.88 * float(e[1]), f"{degrees}°", **look)
-    _loads_on_circle(axis, angles, np.arange(angles.size) if numbers is None else numbers)
+    _loads_on_circle(axis, angles, np.arange(angles.size) if numbers is None else numbers, plural)
     mean = np.average(np.exp(1j * angles), weights=weights) if angles.size else 0.0
     for value, color in ((mean, "black"), (imbalance, COLORS[1])) if resultant else ():
         if abs(value) > 0.02:
@@ -190,7 +194,7 @@ _SIDES, _ENDS = ("right", "left"), ("top", "bottom")
 """Alignments of a text on the left and on the right of a circle, and below and above it."""
 
 
-def _loads_on_circle(axis: Axes, angles: np.ndarray, numbers: np.ndarray) -> None:
+def _loads_on_circle(axis: Axes, angles: np.ndarray, numbers: np.ndarray, plural: str) -> None:
     """Draw loads as points with their numbers; loads at the same angle share a label."""
     order = np.argsort(np.mod(angles + 1e-6, 2.0 * np.pi))
     groups: list[list[int]] = []
@@ -202,7 +206,7 @@ def _loads_on_circle(axis: Axes, angles: np.ndarray, numbers: np.ndarray) -> Non
             look = {"mfc": COLORS[numbers[j] % len(COLORS)], "mec": "black", "ms": 9.0, "zorder": 3 + 0.01 * j}
             axis.plot([np.cos(angles[j])], [np.sin(angles[j])], MARKERS[numbers[j] % len(MARKERS)], **look)
         e = np.mean(np.exp(1j * angles[group]))
-        names = ", ".join(str(j + 1) for j in sorted(numbers[group])) if len(group) < 5 else f"{len(group)} loads"
+        names = ", ".join(str(j + 1) for j in sorted(numbers[group])) if len(group) < 5 else f"{len(group)} {plural}"
         x, y = 1.15 * np.real(e / abs(e)), 1.15 * np.imag(e / abs(e))
         # The text begins at the point and extends away from the circle.
         across, up = (("center" if abs(v) < 0.5 else names_of[int(v > 0.0)]) for v, names_of in ((x, _SIDES), (y, _ENDS)))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import weakref
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any
 
 import jax
@@ -239,10 +239,11 @@ def first_moment(exciter: Exciter) -> Array | None:
     return jnp.hypot(own + sum(x for x, _ in vectors), sum(y for _, y in vectors))
 
 
-def start_notes(scene: Scene) -> list[str]:
-    """Return a sentence for each motor that cannot turn its hanging unbalance over the top.
+def start_notes(scene: Scene, exciters: Iterable[int] | None = None) -> list[str]:
+    """Return a sentence for the motors that cannot turn their hanging unbalances over the top, one for all with equal torques.
 
-    Motors whose torque at rest changes over time, such as those of converters, are not judged.
+    Motors whose torque at rest changes over time, such as those of converters, are not judged. `exciters`: numbers, from 0, of
+    the exciters to judge; default: all.
 
     >>> import jaxvib as jv
     >>> motor = jv.DCMotor(100.0, stall_torque=2.5, inertia=0.5)
@@ -250,17 +251,22 @@ def start_notes(scene: Scene) -> list[str]:
     ...                      exciters=[jv.Exciter(drive=motor, unbalance=0.4)], effects=jv.Gravity()))
     ['the motor cannot start: the weight of its unbalance needs 2.84 N m, its starting torque is 2.5 N m']
     """
-    notes = []
+    chosen = set(range(len(scene.exciters)) if exciters is None else exciters)
+    equal: dict[str, list[str]] = {}
     for k, (exciter, torques) in enumerate(zip(scene.exciters, lifting_torques(scene), strict=True)):
-        if torques is None or exciter.drive.jump_ts() or float(torques[1]) > float(torques[0]):
+        if k not in chosen or torques is None or exciter.drive.jump_ts() or float(torques[1]) > float(torques[0]):
             continue
-        which = f" of exciter {k + 1}" if len(scene.exciters) > 1 else ""
         weight, start = (f"{float(each):.3g} N m" for each in torques)
         by_plate = getattr(exciter.drive, "starting_ratio", 0.0) is None
         hint = " by Kloss's formula; give that of the catalogue as starting_ratio" if by_plate else ""
-        notes.append(
-            f"the motor{which} cannot start: the weight of its unbalance needs {weight}, its starting torque is {start}{hint}"
-        )
+        reason = f"cannot start: the weight of its unbalance needs {weight}, its starting torque is {start}{hint}"
+        equal.setdefault(reason, []).append(str(k + 1))
+    notes = []
+    for reason, numbers in equal.items():
+        if len(numbers) > 1:
+            notes.append(f"each motor of the exciters {', '.join(numbers[:-1])} and {numbers[-1]} {reason}")
+        else:
+            notes.append(f"the motor{f' of exciter {numbers[0]}' if len(scene.exciters) > 1 else ''} {reason}")
     return notes
 
 

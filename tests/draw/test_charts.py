@@ -224,6 +224,12 @@ def test_points_on_a_circle_are_numbered_from_1():
     assert {"1", "2"} <= set(texts) and "0" not in texts
 
 
+@pytest.mark.parametrize("named", [{}, {"plural": "masses"}])
+def test_many_points_at_one_angle_share_a_label(named):
+    texts = [text.get_text() for text in phase_circles([("", np.zeros(6))], **named).axes[0].texts]
+    assert f"6 {named.get('plural', 'loads')}" in texts
+
+
 def test_a_branch_crosses_a_speed_between_its_points():
     rotor_speed = np.array([0.0, np.nan, 1.0, 2.0, 4.0, 2.0, 2.0])
     stable, modes = np.arange(7) < 4, np.array([0, 0, 1, 1, 1, 2, 2])

@@ -216,3 +216,15 @@ def test_implausible_bodies_in_a_plane_are_noted():
 def test_units_of_screens_that_were_confused_are_noted(old, new, says):
     (note,) = implausible_numbers(jv.scene_from_toml(SCREENS["linear_screen"].replace(old, new)))
     assert re.match(says, note)
+
+
+def test_equal_motors_that_cannot_start_have_one_note():
+    weak, strong = (jv.DCMotor(100.0, stall_torque=torque, inertia=0.5) for torque in (2.5, 25.0))
+    exciters = [jv.Exciter(drive=motor, unbalance=s) for motor, s in ((weak, 0.4), (strong, 0.4), (weak, 0.4), (weak, 0.5))]
+    scene = jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), exciters=exciters, effects=jv.Gravity())
+    text = "cannot start: the weight of its unbalance needs {} N m, its starting torque is 2.5 N m"
+    fourth = f"the motor of exciter 4 {text.format(3.55)}"
+    assert start_notes(scene) == [f"each motor of the exciters 1 and 3 {text.format(2.84)}", fourth]
+    assert start_notes(scene, [1, 3]) == [fourth]
+    group = jv.synchronous_regimes(scene, masses=[1, 3]).summary()
+    assert group.count("cannot start") == 1 and fourth in group

@@ -80,7 +80,7 @@ def regimes_chart(
         if regime.phases.size <= _MAX_TITLE_MASSES:
             lines.append(f"phases {', '.join(f'{a + 0.0:g}' for a in np.round(np.rad2deg(regime.phases), 1))} deg")
             lines.append(f"torques {', '.join(f'{t:.3g}' for t in regime.torque)} N m")
-        draw_circle(axis, "\n".join(lines), regime.phases, resultant=resultant, numbers=regime.masses)
+        draw_circle(axis, "\n".join(lines), regime.phases, resultant=resultant, numbers=regime.masses, plural="masses")
     return figure if ax is None else ax
 
 

@@ -180,7 +180,8 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
         from jaxvib.draw.results import phase_circles  # slow import
 
         one = [(speed_text(self.speed, 6), np.asarray(self.phases))]
-        return phase_circles(one, resultant=_has_resultant(self), numbers=np.asarray(self.masses), ax=ax)
+        numbers = np.asarray(self.masses)
+        return phase_circles(one, resultant=_has_resultant(self), numbers=numbers, plural="masses", ax=ax)
 
 
 @cached
@@ -223,10 +224,12 @@ class SynchronousRegimes(AbstractSynchronousRegime):
         return SynchronousRegime(**jax.tree.map(lambda leaf: leaf[index], fields), scene=self.scene)
 
     def summary(self) -> str:
-        """Return a line of text for each regime, and for each motor that cannot start from rest."""
+        """Return a line of text for each regime, and for the motors of its masses that cannot start from rest."""
         lines = [self.select(k).summary() for k in range(self.speed.shape[0])]
         complete = lines and status_name(self.search) == "done"
-        return "\n".join([*lines, *([] if complete else [RegimeSearchStatus[self.search]]), *start_notes(self.scene)])
+        owners = np.unique(mass_owners(self.scene)[np.ravel(self.masses)]).tolist()
+        notes = start_notes(self.scene, owners or None)
+        return "\n".join([*lines, *([] if complete else [RegimeSearchStatus[self.search]]), *notes])
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
