@@ -55,12 +55,12 @@ _UNITS = {
 def value_text(value: float, unit: str) -> str:
     """Return an SI value as text with the unit that drawings use.
 
-    >>> value_text(5e4, "N/m"), value_text(0.12, "m"), value_text(0.05, "kg")
-    ('50 N/mm', '120 mm', '50 g')
+    >>> value_text(5e4, "N/m"), value_text(0.12, "m"), value_text(0.05, "kg"), value_text(1.6e4, "kg m²")
+    ('50 N/mm', '120 mm', '50 g', '16000 kg m²')
     """
     choices = _UNITS[unit]
     name, factor = next((choice for choice in choices if abs(value) * choice[1] >= 1.0), choices[-1])
-    return f"{value * factor:.4g} {name}"
+    return f"{float(f'{value * factor:.4g}'):g} {name}"  # four digits, without an exponent below a million
 
 
 def _span(values: np.ndarray, unit: str) -> str:
