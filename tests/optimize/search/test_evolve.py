@@ -148,3 +148,16 @@ def test_evolution_counts_and_reports_its_designs():
     nowhere = problem_of(DesignSpace(SCENE, FREE), plain("no", lambda x, y: x * jnp.nan), [])
     none = evolve(nowhere, 20, 0, lambda share, least: None)
     assert none.point is None and none.existing == 0 and none.drawn >= 20
+
+
+def test_cma_draws_designs_within_their_ranges(monkeypatch):
+    drawn = []
+
+    def outside(_, z):
+        drawn.append(z)
+        return np.sum((z - 1.2) ** 2, axis=1)[:, None]
+
+    monkeypatch.setattr(PopulationValues, "of", outside)
+    evolve(problem_of(DesignSpace(SCENE, FREE), NEAREST, []), 300, 0, lambda *_: None)
+    z = np.concatenate(drawn)
+    assert np.all((z >= 0.0) & (z <= 1.0)) and np.mean(z == 1.0) < 0.01
