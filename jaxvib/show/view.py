@@ -112,7 +112,7 @@ class View(abc.ABC):
         ]
 
 
-ARROWS_NOTE = "arrows: forces of the supports on the foundation (black: total force on the foundation)"
+ARROWS_NOTE = "arrows: forces of the supports on the foundation (black: total force)"
 """Meaning of the arrows, written below animations."""
 
 
