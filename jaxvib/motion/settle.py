@@ -23,12 +23,12 @@ from jaxvib.motion.integrate import WINDOW_SAMPLES, frequency_bounds, whole_turn
 from jaxvib.motion.plan import EqualSteps, RunPlan, StepChoice, Tolerance, plan_stretch, require, with_settled_drives
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.simulate import last_state, prepare_run, run_planned
-from jaxvib.motion.start import START_SEPARATION, Start, initial_state, start_state
+from jaxvib.motion.start import START_SEPARATION, Start, initial_state, must_compile_jams, start_state
 from jaxvib.numerics.linalg import poles_of
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.jam import jam_modes, jams_of
+from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_known
 
@@ -174,7 +174,7 @@ def _plan_settle(
     is_jam = isinstance(start, str) and start == "jam"
     separation = START_SEPARATION if separation is None and is_jam else separation
     steps = Tolerance(1e-9 if double else 1e-5) if steps is None else steps
-    if is_jam and scene.is_plain and not jams_of.is_ready(scene):
+    if must_compile_jams(scene, start, mode):
         rest = initial_state(scene)
         prepare_run(plan_stretch(scene, length, rest, steps, throw=throw))
         prepare_separation(scene, rest, WINDOW_SAMPLES)

@@ -23,13 +23,12 @@ from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, na
 from jaxvib.motion.integrate import IntegrationPlan, StepControl, angle_wrapping, integrate, whole_turns
 from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, StepChoice, plan_run
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
-from jaxvib.motion.start import Start
+from jaxvib.motion.start import Start, must_compile_jams
 from jaxvib.motion.stiffness import advice
 from jaxvib.results.status import status_name
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.parallel import in_background, in_threads
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.jam import jams_of, require_mode_number
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number
 
@@ -134,8 +133,7 @@ def simulate(
         progress_meter=progress_meter,
         throw=throw,
     )
-    if isinstance(start, str) and start == "jam" and mode is not None and not jams_of.is_ready(scene):
-        require_mode_number(mode, 2 * scene.machine.structure().mass.shape[0] + 1)  # before the run is compiled
+    if must_compile_jams(scene, start, mode):
         prepare_run(plan_from(start="rest", mode=None, separation=None))
     plan = plan_from(start=start, mode=mode, separation=separation)
     run = run_planned(plan, throw=throw)

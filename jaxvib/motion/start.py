@@ -25,7 +25,7 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.jams.jam import jam_modes, jams_of, require_mode_number
 from jaxvib.units import Number, Numbers, known_number, numbers
 from jaxvib.units.known import require_if_known, when_known
 
@@ -126,6 +126,17 @@ def initial_state(
     row, angle = np.asarray(modes.row(mode, throw=throw), np.uint32), phases(scene.exciter, scene.loads, 0.0)
     require_start(scene, State(zero, zero, (angle,)))
     return with_spin(scene, _in_jam(modes.omega, modes.displacement, row, angle))
+
+
+def must_compile_jams(scene: Scene, start: object, mode: int | None) -> bool:
+    """Return True if a run that starts in a jam mode must first compile the jam modes of its scene.
+
+    **Raises** `InputError` if the number of the mode is wrong.
+    """
+    if not (isinstance(start, str) and start == "jam" and mode is not None and scene.is_plain):
+        return False
+    require_mode_number(mode, 2 * scene.machine.structure().mass.shape[0] + 1)
+    return not jams_of.is_ready(scene)
 
 
 def _places(exciter: Exciter, loads: Loads, start: Start, separation: Number | None, *, one_each: bool) -> Array | np.ndarray:

@@ -55,10 +55,12 @@ def test_wrong_arguments_raise_clear_errors(arguments, sentence):
 
 @pytest.mark.parametrize(("mode", "says"), [(None, "mode is missing"), (9, "modes are numbered 1 to 5")])
 def test_wrong_modes_are_refused_before_a_run_is_compiled(mode, says, monkeypatch):
-    monkeypatch.setattr("jaxvib.motion.simulate.prepare_run", lambda plan: pytest.fail("a run is compiled"))
+    for name in ("simulate.prepare_run", "settle.prepare_run", "envelope.envelope.in_background"):
+        monkeypatch.setattr(f"jaxvib.motion.{name}", lambda *tasks: pytest.fail("a run is compiled"))
     monkeypatch.setattr(jams_of, "is_ready", lambda scene: False)
-    with pytest.raises(jv.InputError, match=says):
-        jv.simulate(published().scene(), 10.0, start="jam", mode=mode)
+    for ask in (jv.simulate, jv.settle, jv.envelope):
+        with pytest.raises(jv.InputError, match=says):
+            ask(published().scene(), *[] if ask is jv.settle else [10.0], start="jam", mode=mode)
 
 
 def test_steps_resolve_what_effects_add_to_the_fastest_load():

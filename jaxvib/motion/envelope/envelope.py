@@ -42,7 +42,7 @@ from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite, with_jump_times
 from jaxvib.motion.plan import Tolerance, require, require_error_estimate
 from jaxvib.motion.run import SETTLED_DRIFT
-from jaxvib.motion.start import Start, initial_state, start_state, with_spin_up_drive
+from jaxvib.motion.start import Start, initial_state, must_compile_jams, start_state, with_spin_up_drive
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.ode.control import Decision, WrappedController, step_success
 from jaxvib.ode.replay import solve
@@ -54,7 +54,6 @@ from jaxvib.runtime.compat import jaxpr_as_fun
 from jaxvib.runtime.parallel import in_background
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.balance.monodromy import at_constant_speed
-from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, count, number, validate_tolerance
 from jaxvib.units.known import when_known
@@ -211,7 +210,7 @@ def envelope(
         chosen = np.asarray(validate_tolerance(chosen.tolerance, "tolerance", end.dtype, 10.0), end.dtype)
     given_scene, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
     choices = solver, chosen, adjoint, samples if save == "all" else 0, window_periods, count(max_steps, "max_steps")
-    if isinstance(start, str) and start == "jam" and scene.is_plain and not jams_of.is_ready(scene):
+    if must_compile_jams(scene, start, mode):
         rest = initial_state(scene)
         in_background(partial(_run.prepare, scene, end, rest, *choices), partial(_prepare_growth, scene, rest))
     # The state of rest exists for every scene; therefore it is computed in the compiled run, which takes less time.
