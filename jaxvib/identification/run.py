@@ -15,7 +15,7 @@ from jaxvib.identification.records.agreement import ROTOR_KINDS, check_agreement
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.records.pulses import number_pulses, rising_edges
 from jaxvib.identification.records.recorded import described_channels, recorded_from_sep005
-from jaxvib.identification.records.sampling import clipped_at, continued_angle, even_samples, require_ascending
+from jaxvib.identification.records.sampling import clipped_at, continued_angle, even_samples, require_ascending, without_spikes
 from jaxvib.results.readable import Readable
 from jaxvib.results.table import is_number
 from jaxvib.units import Number, number
@@ -248,7 +248,8 @@ def _read_channel(
         return _Samples(edges, number, np.zeros(edges.size, bool), notes)
     value, turn_notes = continued_angle(value, where) if channel.kind == "angle" else (value, [])
     time, value, notes = even_samples(time, value, where)
-    notes = turn_notes + notes
+    value, spike_notes = (value, []) if channel.kind in ROTOR_KINDS else without_spikes(time, value, where)
+    notes = turn_notes + notes + spike_notes
     low, high = (-np.inf, np.inf) if channel.kind in ("speed", "angle") else clipped_at(value)
     if channel.range is not None:
         low, high = max(low, -_FULL * channel.range), min(high, _FULL * channel.range)

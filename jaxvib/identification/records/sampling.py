@@ -30,6 +30,9 @@ _BINS, _SPIKE, _MIN_CLIPPED = (0.001, 0.003, 0.01), 3.0, 10
 the number of readings in this bin to the number in the next four bins; smallest number of readings in this bin. For a smooth
 signal the ratio is below 2."""
 
+_FAR = 3.0
+"""Distance of a spike from all other readings, relative to their range."""
+
 
 def require_ascending(time: np.ndarray, where: str) -> None:
     """**Raises** `InputError` for fewer than 16 times, and for times that are not finite or do not ascend."""
@@ -194,6 +197,31 @@ def dropouts(value: np.ndarray) -> np.ndarray:
         is_inside = (value[starts] > np.nanmin(value)) & (value[starts] < np.nanmax(value))
     is_long = (lengths >= max(_MIN_DROPOUT, _MIN_RATIO * usual_length)) & is_inside
     return np.repeat(is_long, lengths)
+
+
+def without_spikes(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, list[str]]:
+    """Return the readings with NaN in place of spikes, and a note about them.
+
+    Spikes are less than 10 readings beyond all others by more than three times the range of the others. A fit by least squares
+    begins with all readings, and one such spike is enough to hide the motion.
+
+    >>> value = np.sin(0.1 * np.arange(400.0))
+    >>> value[7] = 500.0
+    >>> found, notes = without_spikes(0.01 * np.arange(400.0), value, "run: channel 'a'")
+    >>> bool(np.isnan(found[7])), int(np.isnan(found).sum()), notes
+    (True, 1, ["run: channel 'a' has 1 spike, at 0.07 s, far beyond all other readings; left out"])
+    """
+    known = value[np.isfinite(value)]
+    if known.size < 10 * _MIN_CLIPPED:
+        return value, []
+    ends = np.partition(known, (_MIN_CLIPPED - 1, known.size - _MIN_CLIPPED))
+    low, high = ends[_MIN_CLIPPED - 1], ends[known.size - _MIN_CLIPPED]
+    is_spike = (value > high + _FAR * (high - low)) | (value < low - _FAR * (high - low))
+    count = int(np.count_nonzero(is_spike))
+    if count == 0 or high == low:
+        return value, []
+    what = f"1 spike, at {time[is_spike][0]:g} s" if count == 1 else f"{count} spikes, the first at {time[is_spike][0]:g} s"
+    return np.where(is_spike, np.nan, value), [f"{where} has {what}, far beyond all other readings; left out"]
 
 
 def clipped_at(value: np.ndarray) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from jaxvib.identification.records.sampling import (
     dropouts,
     even_samples,
     require_ascending,
+    without_spikes,
 )
 
 N = 400
@@ -208,3 +209,14 @@ def test_the_first_wrong_time_is_named(places, value, says):
     time[places] = value
     with pytest.raises(jv.InputError, match=says):
         require_ascending(time, "a")
+
+
+def test_spikes_are_left_out_and_high_peaks_are_not():
+    time = 0.01 * np.arange(1000.0)
+    decay = np.exp(-time) * np.sin(7.0 * time)
+    assert without_spikes(time, decay, "run")[1] == []
+    value = decay.copy()
+    value[[300, 5]] = 40.0, -40.0
+    found, (note,) = without_spikes(time, value, "run")
+    assert np.flatnonzero(np.isnan(found)).tolist() == [5, 300]
+    assert note == "run has 2 spikes, the first at 0.05 s, far beyond all other readings; left out"
