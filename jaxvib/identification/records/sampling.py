@@ -246,7 +246,7 @@ def _clipped_above(value: np.ndarray) -> float:
     level = np.inf
     for share in _BINS:
         width = max(share * size, 1.5 * (top - float(np.max(below))))  # a bin has at least one step of the converter
-        if 5.0 * width > size:  # without bins below the last one nothing is comparable: the largest reading is an outlier
+        if 5.0 * width > size and np.count_nonzero(value == top) < _MIN_CLIPPED:  # a few spikes above all other readings
             continue
         is_top = value > top - width
         in_last_bin, in_next_bins = np.count_nonzero(is_top), np.count_nonzero((value > top - 5.0 * width) & ~is_top)
