@@ -30,7 +30,7 @@ _BINS, _SPIKE, _MIN_CLIPPED = (0.001, 0.003, 0.01), 3.0, 10
 the number of readings in this bin to the number in the next four bins; smallest number of readings in this bin. For a smooth
 signal the ratio is below 2."""
 
-_FAR = 3.0
+_SPIKE_DISTANCE = 3.0
 """Distance of a spike from all other readings, relative to their range."""
 
 
@@ -216,7 +216,7 @@ def without_spikes(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.
         return value, []
     ends = np.partition(known, (_MIN_CLIPPED - 1, known.size - _MIN_CLIPPED))
     low, high = ends[_MIN_CLIPPED - 1], ends[known.size - _MIN_CLIPPED]
-    is_spike = (value > high + _FAR * (high - low)) | (value < low - _FAR * (high - low))
+    is_spike = (value > high + _SPIKE_DISTANCE * (high - low)) | (value < low - _SPIKE_DISTANCE * (high - low))
     count = int(np.count_nonzero(is_spike))
     if count == 0 or high == low:
         return value, []
