@@ -34,8 +34,8 @@ from parts.common import busy, machine_line, published, thrown  # noqa: E402
 from parts.loads import apart  # noqa: E402
 from parts.loads import scene as balls  # noqa: E402
 
-from jaxvib.motion import system  # noqa: E402
-from jaxvib.motion.system import PackedSystem  # noqa: E402
+from jaxvib.motion.integration import system  # noqa: E402
+from jaxvib.motion.integration.system import PackedSystem  # noqa: E402
 from jaxvib.ode import dopri8, dopri8_loop, replay, scalarize  # noqa: E402
 from jaxvib.ode.dopri8_loop import LoopDopri8  # noqa: E402
 

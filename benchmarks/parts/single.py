@@ -22,7 +22,7 @@ from parts import native
 from parts.common import TOLERANCES, as_first_written, best, best_in_turn, first, flat, published, reach, say, thrown, told
 
 import jaxvib as jv
-from jaxvib.motion.system import PackedSystem
+from jaxvib.motion.integration.system import PackedSystem
 from jaxvib.ode.control import PIController
 from jaxvib.runtime.cpu import cores
 

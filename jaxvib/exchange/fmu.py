@@ -30,8 +30,8 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units
 from jaxvib.motion.integrate import frequency_bounds
+from jaxvib.motion.integration.stiffness import fastest_decay
 from jaxvib.motion.start import Start, start_state
-from jaxvib.motion.stiffness import fastest_decay
 from jaxvib.ode.scalarize import NotScalarizable, scalar_program
 from jaxvib.runtime.compat import HAS_JAXPRS
 

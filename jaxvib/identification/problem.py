@@ -28,7 +28,7 @@ from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbe
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import require_double
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.stiffness import equal_step_length, machine_decay
+from jaxvib.motion.integration.stiffness import equal_step_length, machine_decay
 from jaxvib.numerics.linalg import poles_of
 from jaxvib.numerics.noise import Noise, bounded, limited
 from jaxvib.runtime.programs import cached

@@ -18,7 +18,8 @@ from jaxvib.motion.analysis.measure import Measured, Peaks, Trajectory, locate_p
 from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.integrate import angle_wrapping, is_finite
-from jaxvib.motion.system import PackedSystem
+from jaxvib.motion.integration.contacts import Contacts, ContactSolver
+from jaxvib.motion.integration.system import PackedSystem
 from jaxvib.numerics.extrema import NODES
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.types import Y as IntegratorState
@@ -48,9 +49,10 @@ def advance(
     motion: PackedSystem, packed: IntegratorState, begin: Array, length: Array, step: Array, *, implicit: bool = False
 ) -> tuple[IntegratorState, Array]:
     """Return the state of the integrator at the time `begin` + `length`, by steps of size `step`, and the number of steps."""
+    solver = Rodas4() if implicit else motion.method()
     solution = diffrax.diffeqsolve(
         motion.term,
-        Rodas4() if implicit else motion.method(),
+        ContactSolver(solver, motion) if motion.has_contacts else solver,
         t0=begin,
         t1=begin + length,
         dt0=step,
@@ -86,13 +88,13 @@ def divide_run(
     return packed, begins.at[0].set(step), lengths.at[0].add(-step)
 
 
-def pack_batch(
-    field: Callable[[Array, State], State], state: State, wrapped: bool, has_common_turns: bool, *, implicit: bool
-) -> PackedSystem:
+def pack_batch(scene: Scene, field: Callable[[Array, State], State], state: State, *, implicit: bool) -> PackedSystem:
     """Return the equations of a batch of runs; for an implicit method the state of each run is one vector."""
+    contacts = Contacts.of(scene)
     if implicit:
-        return PackedSystem(field, state, solver=Rodas4())
-    return PackedSystem(field, state, wrapped=wrapped, has_common_turns=has_common_turns, batch=True)
+        return PackedSystem(field, state, contacts=contacts, solver=Rodas4())
+    wrapped, has_common_turns = angle_wrapping(scene, state.displacement.dtype)
+    return PackedSystem(field, state, wrapped=wrapped, has_common_turns=has_common_turns, batch=True, contacts=contacts)
 
 
 def batch_size() -> int:
@@ -153,10 +155,9 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     Under `vmap` all runs take the same steps. No run waits for another, and no result depends on the other runs.
     """
     dtype = state.displacement.dtype
-    wrapped, has_common_turns = angle_wrapping(scene, dtype)
     model = assemble(scene)
     field = dynamics_of(model)
-    motion = pack_batch(field, state, wrapped, has_common_turns, implicit=plan.implicit)
+    motion = pack_batch(scene, field, state, implicit=plan.implicit)
     begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS_OF_RUN
     spacing = plan.window / (plan.samples - 1)
 

@@ -31,9 +31,9 @@ from jaxvib.motion.analysis.ensemble_regimes import (
 from jaxvib.motion.analysis.measure import turning_angles, turning_directions
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
 from jaxvib.motion.batch import advance, batch_size, divide_run, pack_batch
-from jaxvib.motion.integrate import angle_wrapping, is_finite
+from jaxvib.motion.integrate import is_finite
+from jaxvib.motion.integration.stiffness import is_unresolved
 from jaxvib.motion.plan import ENSEMBLE_PARTS, EqualSteps, plan_ensemble
-from jaxvib.motion.stiffness import is_unresolved
 from jaxvib.ode.replay import forward_only
 from jaxvib.ode.types import Y
 from jaxvib.results.estimate import Share, estimate_share
@@ -338,7 +338,6 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     state from that with the last count, True if the motion stayed finite, True for loads that lost contact with their track,
     and the number of steps.
     """
-    wrapped, has_common_turns = angle_wrapping(scene, state.displacement.dtype)
     has_one_sided_loads = any(exciter.loads is not None and exciter.loads.one_sided for exciter in scene.exciters)
     field, start = field_of(equations, scene), state
     if has_one_sided_loads:
@@ -346,7 +345,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
             jnp.zeros_like(exciter_state.angle[0]) if exciter_state.angle else jnp.zeros(1) for exciter_state in state.exciters
         ]
         field, start = _FieldWithDetachment(field, scene), _StateWithDetachment(state, _concatenate(missing_forces))
-    motion = pack_batch(field, start, wrapped, has_common_turns, implicit=implicit)
+    motion = pack_batch(scene, field, start, implicit=implicit)
     length = end / ENSEMBLE_PARTS
 
     def part(packed: Y, at: tuple[Array, Array], step: Array) -> tuple[Y, tuple[Y, Array]]:

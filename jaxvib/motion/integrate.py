@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.dynamics import dynamics_of
+from jaxvib.equations.dynamics import Dynamics, dynamics_of
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.state import ExciterState, Spin, State
@@ -26,8 +26,9 @@ from jaxvib.machine.effects.terms import LoadInteraction, RotorImbalance
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory, unmeasured
 from jaxvib.motion.analysis.scaled_error import natural_units
+from jaxvib.motion.integration.contacts import Contacts, ContactSolver
+from jaxvib.motion.integration.system import PackedSystem
 from jaxvib.motion.run import Run, RunStatus
-from jaxvib.motion.system import PackedSystem
 from jaxvib.numerics.linalg import eigenvalues_in_turn
 from jaxvib.ode.control import PIController
 from jaxvib.ode.replay import solve
@@ -193,13 +194,9 @@ def integrate(
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
     unit = natural_units(scene)
     saves = _saves(scene, end, plan)
-    wrapped, has_common_turns = angle_wrapping(scene, state.displacement.dtype)
     model = assemble(scene)
     field = dynamics_of(model)
-    motion = PackedSystem(
-        field, state, wrapped=wrapped and plan.solver is None, has_common_turns=has_common_turns, solver=plan.solver
-    )
-    solver = motion.method(plan.adjoint) if plan.solver is None else plan.solver
+    motion, solver = _system_and_method(scene, field, state, plan)
     first_step, controller = _steps(motion, state, unit, plan, end)
     solution = solve(
         motion.term,
@@ -245,6 +242,22 @@ def integrate(
         coincident=_stay_coincident(model, state, states),
         engine="scalar" if motion.is_scalarized else "array",
     )
+
+
+def _system_and_method(
+    scene: Scene, field: Dynamics, state: State, plan: IntegrationPlan
+) -> tuple[PackedSystem, diffrax.AbstractSolver]:
+    wrapped, has_common_turns = angle_wrapping(scene, state.displacement.dtype)
+    motion = PackedSystem(
+        field,
+        state,
+        wrapped=wrapped and plan.solver is None,
+        has_common_turns=has_common_turns,
+        contacts=Contacts.of(scene),
+        solver=plan.solver,
+    )
+    solver = motion.method(plan.adjoint) if plan.solver is None else plan.solver
+    return motion, ContactSolver(solver, motion) if motion.has_contacts else solver
 
 
 def _saves(scene: Scene, end: Array, plan: IntegrationPlan) -> list[diffrax.SubSaveAt]:

@@ -25,8 +25,8 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns, validate_scene
 from jaxvib.motion.integrate import MIN_SAMPLES_PER_TURN, IntegrationPlan, StepControl, frequency_bounds
+from jaxvib.motion.integration.stiffness import equal_step_length, fastest_decay, fastest_motion, stiff_solver
 from jaxvib.motion.start import Start, initial_state, require_start, start_state, with_spin, with_spin_up_drive
-from jaxvib.motion.stiffness import equal_step_length, fastest_decay, fastest_motion, stiff_solver
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.runtime.devices import known as numpy_of_known
 from jaxvib.runtime.programs import cached

@@ -21,10 +21,10 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, with_nearest_turns
 from jaxvib.motion.integrate import IntegrationPlan, StepControl, angle_wrapping, integrate, whole_turns
+from jaxvib.motion.integration.stiffness import advice
 from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, StepChoice, plan_run
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.start import Start, must_compile_jams
-from jaxvib.motion.stiffness import advice
 from jaxvib.results.status import status_name
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.parallel import in_background, in_threads
@@ -99,8 +99,8 @@ def simulate(
 
     **Returns** `Run`, with its estimated `error` and its cost.
 
-    - Forward and reverse derivatives, `jit` and `vmap` are supported. Derivatives are wrong after a contact with a `Stop` or a
-      `LoadContact` that has damping, because they do not contain the shift of the time of contact, at which the force jumps
+    - Forward and reverse derivatives, `jit` and `vmap` are supported. First derivatives contain the shift of the time at which
+      a contact with a `Stop` or a `LoadContact` that has damping begins, and its force jumps; second derivatives do not
     - In single precision, the default methods of order 8 keep angles within one turn during the integration, and angles of the
       window are relative to the number of turns at its beginning. Runs of one exciter of more than 20,000 turns at constant
       speed that keep only a window are divided into stretches. Long runs therefore keep their phase

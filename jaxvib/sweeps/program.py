@@ -15,8 +15,8 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.batch import PARTS_OF_RUN, BatchPlan, run_in_batch
 from jaxvib.motion.integrate import frequency_bounds
+from jaxvib.motion.integration.stiffness import equal_step_length, fastest_decay, fastest_motion
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state
-from jaxvib.motion.stiffness import equal_step_length, fastest_decay, fastest_motion
 from jaxvib.runtime.operations import program_digest
 from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Axis, Target, extreme_cases, put, put_start

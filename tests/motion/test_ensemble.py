@@ -13,8 +13,8 @@ from scenes import published, some_state
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error
 from jaxvib.motion.ensemble import Ensemble
+from jaxvib.motion.integration.stiffness import fastest_motion
 from jaxvib.motion.plan import _build_scenes
-from jaxvib.motion.stiffness import fastest_motion
 from jaxvib.runtime import cache
 
 

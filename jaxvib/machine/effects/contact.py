@@ -48,8 +48,8 @@ class LoadContact(Effect):
     - `stiffness` k, N/m, positive; typical: 4e4 to 1e6, softer than steel so that a contact lasts 1 to 10 ms. Choose
       k = mu (pi/t)^2 for a contact that lasts t, such as a tenth of a turn of the rotor: 8e4 for balls of 44 g at 3000 rpm.
       Loads that collide with the speed v overlap by v sqrt(mu/k). Ten times the stiffness needs about three times the steps
-    - `damping` c, N s/m, at least 0 (the default); typical: 2 to 200. With damping or a restitution, derivatives of runs are
-      wrong after a collision, see `simulate`
+    - `damping` c, N s/m, at least 0 (the default); typical: 2 to 200. With damping or a restitution, second derivatives of runs
+      are wrong after a collision, see `simulate`
     - `restitution` e in place of the damping, above 0, up to 1; typical: 0.3 to 0.9
 
     **Raises** `InputError` for values that are not allowed, and for both damping and restitution. A scene raises it for loads
@@ -81,7 +81,7 @@ class LoadContact(Effect):
 
     def terms(self) -> tuple[Term, ...]:
         """Return the forces between the loads."""
-        return (LoadInteraction(self.energy, self.resistance, self.validate_start),)
+        return (LoadInteraction(self.energy, self.resistance, self.penetrations, self.validate_start),)
 
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for `loads` without a size, and for loads of unequal mass with a restitution."""
@@ -148,6 +148,10 @@ class LoadContact(Effect):
         if parts[-1].shape != (loads.count,):  # with an even count there are only half as many pairs of opposite loads
             parts[-1] = jnp.concatenate([parts[-1], jnp.zeros_like(parts[-1])])
         return sum(parts[1:], parts[0])
+
+    def penetrations(self, loads: Loads, u: Coordinates) -> Array:
+        """Return the penetrations of the pairs of `loads` at the coordinates `u`, m, negative without contact."""
+        return -jnp.concatenate(_clearances(loads, u, self.tracks))
 
     def resistance(self, loads: Loads, u: Coordinates, rate: Coordinates) -> Coordinates:
         """Return the generalized forces of the damping forces -c s' between `loads` that overlap, (count,) each.

@@ -112,8 +112,8 @@ class Stop(_Support):
     - `stiffness` k, N/m, at least 0; typical: 1e5 to 1e7, that is 10 to 100 times that of the support. A stiffer stop needs
       shorter steps
     - `gap`, m, at least 0; typical: 0.001 to 0.02
-    - `damping` c, N s/m, at least 0 (the default); typical: 0 to 5000. With damping, derivatives of runs are wrong after a
-      contact, see `simulate`
+    - `damping` c, N s/m, at least 0 (the default); typical: 0 to 5000. With damping, second derivatives of runs are wrong after
+      a contact, see `simulate`
     - `side`: "above", "below" or "both" (the default); platforms only
     - `platform` or `position`: as for `CubicSupport`; typical: platform 1
 
@@ -164,7 +164,7 @@ class Stop(_Support):
 
     def terms(self) -> tuple[Term, ...]:
         """Return the force of spring and damper."""
-        return (SupportForce(self.rows, self.energy, self.resistance, stiffness=self.stiffness),)
+        return (SupportForce(self.rows, self.energy, self.resistance, stiffness=self.stiffness, penetration=self.penetration),)
 
     def rows(self, machine: Machine) -> Array:
         """Return the matrix (1, nd) or (2, nd) that gives the displacement of the place on a `machine` with nd coordinates.

@@ -90,12 +90,15 @@ class LoadInteraction:
 
     - `energy` of the pairs, J, (count,)
     - `resistance`: generalized forces that dissipate energy of the relative motion, or None
+    - `penetration`: function of the loads and `u` that returns the penetrations of the pairs, m, negative without contact, if
+      the forces jump when a contact begins; otherwise None
     - `validate_start`: function of the loads, of `u` (..., count), and of the stations (count,) of the loads, m (None for a
       single track). It raises `InputError` if the loads cannot start there. None: every start is allowed
     """
 
     energy: Energy
     resistance: Resistance | None = None
+    penetration: Callable[[Loads, Coordinates], Array] | None = None
     validate_start: Callable[[Loads, Coordinates, np.ndarray | None], None] | None = None
     is_smooth: ClassVar[bool] = False
 
@@ -235,6 +238,8 @@ class SupportForce:
     - `resistance`: function of x and its rate, the dissipative force on the foundation, (k,) N; or None
     - `is_smooth`: True if the force has all derivatives
     - `stiffness`: largest stiffness of the support, N/m, whose vibration equal steps must resolve; None if it has no limit
+    - `penetration`: function of x that returns the penetration, m, negative without contact, and its direction (k,), if the
+      force jumps when a contact begins; otherwise None
     """
 
     rows: Callable[[Machine], Array]
@@ -242,6 +247,7 @@ class SupportForce:
     resistance: Callable[[Array, Array], Array] | None = None
     is_smooth: bool = False
     stiffness: Array | None = None
+    penetration: Callable[[Array], tuple[Array, Array]] | None = None
 
     def force(self, displacement: Array, velocity: Array) -> Array:
         """Return the force on the foundation, (k,) N. The force on the carrier has the opposite sign."""

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import jaxvib as jv
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.stiffness import equal_step_length, fastest_decay, is_unresolved
+from jaxvib.motion.integration.stiffness import equal_step_length, fastest_decay, is_unresolved
 from jaxvib.ode.dopri8 import UnrolledDopri8
 
 DRAGS = (300.0, 1e3, 1e5, 1e9)

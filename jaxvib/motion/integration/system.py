@@ -57,6 +57,7 @@ class PackedSystem(eqx.Module):
     - `has_common_turns`: True if the same number of turns is subtracted from a coordinate of all loads of an exciter, which
       keeps their differences
     - `batch`: True if many runs advance as one batch
+    - `contacts` of the scene, a second part of `args`, see `jaxvib.motion.integration.contacts`; default: none
     - `solver`; default: `method`
 
     **Attributes**
@@ -79,6 +80,7 @@ class PackedSystem(eqx.Module):
     wrapped: bool = eqx.field(static=True)
     has_common_turns: bool = eqx.field(static=True)
     batch: bool = eqx.field(static=True)
+    has_contacts: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -88,9 +90,15 @@ class PackedSystem(eqx.Module):
         wrapped: bool = False,
         has_common_turns: bool = False,
         batch: bool = False,
+        contacts: PyTree | None = None,
         solver: diffrax.AbstractSolver | None = None,
     ):
-        self.wrapped, self.has_common_turns, self.batch = wrapped, has_common_turns, batch
+        self.wrapped, self.has_common_turns, self.batch, self.has_contacts = (
+            wrapped,
+            has_common_turns,
+            batch,
+            contacts is not None,
+        )
         leaves, self.treedef = jax.tree.flatten(state)
         self.shapes = tuple(leaf.shape for leaf in leaves)
         self.size = sum(leaf.size for leaf in leaves)
@@ -105,6 +113,7 @@ class PackedSystem(eqx.Module):
         if program is not None:
             # Arrays are split into entries here; the time loop then contains no arrays.
             self.args = scalars_of(field)
+        self.args = (self.args, contacts) if self.has_contacts else self.args
         self.is_on_scalars = self.is_scalarized and batch
         self.has_fences = self.is_scalarized and solver is None and (batch or self.size <= _MAX_UNROLLED_SIZE)
 
@@ -130,9 +139,9 @@ class PackedSystem(eqx.Module):
         """Return states along a leading axis from states of the integrator. The whole turns of the first state are subtracted
         from wrapped angles."""
         if not self.wrapped:
-            return self._state(packed)
+            return self.state(packed)
         y, turns = packed
-        return self._state(_add_turns(y, jax.tree.map(lambda n: n - n[:1], turns), 1.0))
+        return self.state(_add_turns(y, jax.tree.map(lambda n: n - n[:1], turns), 1.0))
 
     def _wrap(self, packed: IntegratorState) -> IntegratorState:
         """Move whole turns from the angles to their counts."""
@@ -163,7 +172,7 @@ class PackedSystem(eqx.Module):
                 is_angle[exciter.rotor[0]] = True
         return is_angle, leader
 
-    def _state(self, y: IntegratorState) -> State:
+    def state(self, y: IntegratorState) -> State:
         """Return states along a leading axis from entries of the integrator's state."""
         rows = jnp.stack(y, axis=-1) if self.is_on_scalars else y
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
@@ -173,7 +182,15 @@ class PackedSystem(eqx.Module):
         ]
         return jax.tree.unflatten(self.treedef, parts)
 
+    def unwrapped(self, packed: IntegratorState, like: IntegratorState) -> IntegratorState:
+        """Return a state of the integrator whose angles are counted from the whole turns of the state `like`."""
+        if not self.wrapped:
+            return packed
+        (y, turns), (_, first) = packed, like
+        return _add_turns(y, jax.tree.map(jnp.subtract, turns, first), 1.0), first
+
     def _rates(self, t: RealScalarLike, y: IntegratorState, args: Args) -> IntegratorState:
+        args = args[0] if self.has_contacts else args
         if self.wrapped:
             y, turns = y
             return self._plain_rates(t, y, args), jax.tree.map(jnp.zeros_like, turns)
@@ -181,10 +198,10 @@ class PackedSystem(eqx.Module):
 
     def _plain_rates(self, t: RealScalarLike, y: IntegratorState, args: Args) -> IntegratorState:
         if self.program is None:
-            return ravel(args(t, self._state(y)))
+            return ravel(args(t, self.state(y)))
         run = jaxpr_as_fun(self.program)
         if not self.is_scalarized:
-            return ravel(run(jnp.asarray(t, y.dtype), *jax.tree.leaves(self._state(y)), *jax.tree.leaves(args)))
+            return ravel(run(jnp.asarray(t, y.dtype), *jax.tree.leaves(self.state(y)), *jax.tree.leaves(args)))
         numbers = y if self.is_on_scalars else entries(y, hidden_one(y[0])) if self.has_fences else jnp.unstack(y)
         arguments = [jnp.asarray(t, numbers[0].dtype), *numbers, *args]
         rates = fenced(self.program, arguments) if self.has_fences else run(*arguments)

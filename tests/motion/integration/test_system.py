@@ -11,7 +11,7 @@ from scenes import loads, machines, scene, some_state
 
 import jaxvib as jv
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.system import PackedSystem
+from jaxvib.motion.integration.system import PackedSystem
 from jaxvib.ode.dopri8 import UnrolledDopri8
 from jaxvib.ode.dopri8_loop import LoopDopri8
 
@@ -84,7 +84,7 @@ def test_wrapping_counts_every_turn(machine, batch):
         method = motion.method()
         assert isinstance(method, (LoopDopri8, UnrolledDopri8)) and method.wrap is not None
         held = method.wrap(motion.pack(state))
-        inside = np.asarray(motion._state(jax.tree.map(lambda x: x[None], held[0])).angle[0][0])
+        inside = np.asarray(motion.state(jax.tree.map(lambda x: x[None], held[0])).angle[0][0])
         if has_common_turns:
             # All by the turns of the first.
             np.testing.assert_allclose(np.diff(inside), np.diff(state.angle[0]), rtol=1e-14)
@@ -106,7 +106,7 @@ def test_turns_of_the_azimuth_leave_the_other_angle():
     motion = PackedSystem(jv.vector_field(s), state, wrapped=True, has_common_turns=True)
     wrap = motion.method().wrap
     assert wrap is not None
-    held = motion._state(wrap(motion.pack(state))[0])
+    held = motion.state(wrap(motion.pack(state))[0])
     np.testing.assert_allclose(np.diff(held.angle[0]), 1.0, rtol=1e-12)
     np.testing.assert_array_equal(held.angle[1], angle[1])
 

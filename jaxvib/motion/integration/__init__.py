@@ -1,0 +1,1 @@
+"""Equations, methods and steps of time integration."""
