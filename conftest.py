@@ -67,27 +67,6 @@ def pytest_configure(config):
     gc.set_threshold(100_000, 50, 100)
 
 
-COMPILED_WITHOUT_OPTIMIZATIONS = (
-    "tests/equations",
-    "tests/machine/effects/test_contact.py",
-    "tests/machine/structures/test_matrices.py",
-    "tests/motion/analysis",
-    "tests/motion/envelope",
-)
-"""Tests whose programs are compiled in half the time, without LLVM's optimizations, which change the last digits of results
-only. Processes that a test starts compile as those of users do."""
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _compiler(request):
-    """Compile without optimizations where nearly all of the time is compilation; long tests would take longer."""
-    name = request.node.path.relative_to(request.config.rootpath).as_posix()
-    quick = name.startswith(COMPILED_WITHOUT_OPTIMIZATIONS) and request.config.option.markexpr == "not slow"
-    jax.config.update("jax_disable_most_optimizations", quick)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @pytest.fixture(autouse=True, scope="module")
 def _stored():
     """A worker keeps what a module compiled no longer than the module: hundreds of programs fill gigabytes, and what a test
