@@ -50,12 +50,12 @@ class _Curves(NamedTuple):
     """Regimes at several speeds of the drives `drive_speed` (n,): rotor or load speed (n,), phases (n, mass), amplitudes
     (n, nd), force (n,), stability (n,). Values between two curves are NaN."""
 
-    drive_speed: Array
-    speed: Array
-    phases: Array
-    amplitude: Array
-    force: Array
-    stable: Array
+    drive_speed: Array | np.ndarray
+    speed: Array | np.ndarray
+    phases: Array | np.ndarray
+    amplitude: Array | np.ndarray
+    force: Array | np.ndarray
+    stable: Array | np.ndarray
 
 
 def regime_chart(scene: Scene, max_speed: float) -> str:
@@ -130,8 +130,8 @@ def _curves(scene: Scene, max_speed: float) -> _Curves:
         return _Curves(empty, empty, np.zeros((1, masses)), np.zeros((1, nd)), empty, np.ones(1, bool))
     # Missing regimes are copies of the first one, so that one program is sufficient.
     chosen = [*regimes, *[regimes[0]] * (_MAX_FOLLOWED - len(regimes))]
-    start = (np.stack([np.asarray(getattr(each, name)) for each in chosen]) for name in ("speed", "phases"))
-    followed = jax.device_get(follow_regimes(scene, *start, np.asarray(1.0 / 64.0), np.asarray(max_speed / at)))
+    speed, phases = (np.stack([np.asarray(getattr(each, name)) for each in chosen]) for name in ("speed", "phases"))
+    followed = jax.device_get(follow_regimes(scene, speed, phases, np.asarray(1.0 / 64.0), np.asarray(max_speed / at)))
     pieces = [_Curves(at * followed.factor, *(np.asarray(field)[k] for field in followed[1:])) for k in range(len(regimes))]
     gap = _Curves(*(np.full_like(field[:1], True if field.dtype == bool else np.nan) for field in pieces[0]))
     joined = [each for piece in pieces for each in (piece, gap)]
@@ -150,7 +150,7 @@ def _panels(scene: Scene, curves: _Curves, resonances: np.ndarray, high: float) 
     titles = f"amplitude, {', '.join(dict.fromkeys(units))}, zero to peak", "foundation force, N, zero to peak"
 
     def logarithmic(k: int, title: str, drawn: dict[str, np.ndarray]) -> tuple[Panel, dict[str, np.ndarray]]:
-        limits = log_limits([*drawn.values()], curves.drive_speed, rotor_speed, resonances)
+        limits = log_limits([*drawn.values()], np.asarray(curves.drive_speed), rotor_speed, resonances)
         return _panel(k, title, high, limits, log=True), drawn
 
     speed = speed_unit("rpm")[1] * rotor_speed

@@ -143,7 +143,7 @@ class _KnotsFit(NamedTuple):
     residuals: np.ndarray
 
     @property
-    def count(self) -> int:
+    def parameter_count(self) -> int:
         """Number of coefficients and offsets."""
         return len(self.coefficients) + len(self.data.gram)
 
@@ -151,12 +151,14 @@ class _KnotsFit(NamedTuple):
     def criterion(self) -> float:
         """Bayesian information criterion."""
         n, accuracy = self.residuals.size, _ROUNDING * float(np.max(np.abs(self.data.value)))
-        return n * math.log(max(float(self.residuals @ self.residuals) / n, accuracy**2, 1e-300)) + self.count * math.log(n)
+        return n * math.log(
+            max(float(self.residuals @ self.residuals) / n, accuracy**2, 1e-300)
+        ) + self.parameter_count * math.log(n)
 
     @property
     def variance(self) -> float:
         """Variance of the weighted values."""
-        return float(self.residuals @ self.residuals) / max(self.residuals.size - self.count, 1)
+        return float(self.residuals @ self.residuals) / max(self.residuals.size - self.parameter_count, 1)
 
     def covariance(self) -> np.ndarray:
         """Return the covariance (k, k) of the coefficients."""

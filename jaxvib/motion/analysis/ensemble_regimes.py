@@ -42,7 +42,7 @@ _WORKING_SHARE = 0.95
 """Largest natural frequency, relative to the working speed of a drive, that counts as a resonance below this speed."""
 
 
-def catching_resonance(speed: ArrayLike, working_speed: ArrayLike, resonances: Array) -> Array:
+def catching_resonance(speed: ArrayLike, working_speed: ArrayLike, resonances: Array | np.ndarray) -> Array:
     """Return the number, from 1, of the lowest of the `resonances` (nd,), ascending, that a mass at `speed` has not passed.
 
     Only resonances below 0.95 of the `working_speed` of the drive count; the number is 0 if all of them are passed.
@@ -77,7 +77,7 @@ def rotating_masses(scenes: Scene, states: State, mean_speed: Array, end: Array,
     **Arguments**: `scenes` and final `states` with a leading axis over the runs; `mean_speed` (runs, mass), rad/s, over the
     last part of the runs, its `length`, s, and the `end`, s, of the runs.
     """
-    directions, owners = turning_directions(scenes), _owners(scenes)
+    directions, owners = jnp.asarray(turning_directions(scenes)), _owners(scenes)
     counts = [0 if exciter.loads is None else exciter.loads.count for exciter in scenes.exciters]
     names = [name for k, n in enumerate(counts, 1) for name in ([f"{k}.{j + 1}" for j in range(n)] or [f"{k}"])]
 
@@ -177,7 +177,7 @@ class EnsembleRegimes(Result):
             if caught := sorted({int(k) for k in self.resonance[index, members]} - {0}):
                 text += f", caught by resonance {' and '.join(map(str, caught))}"
             if len(members) > 1:
-                text += f", phases {', '.join(self._phase_text(index, k) for k in members)} deg"
+                text += f", phases {', '.join(self._phase_text(index, k) for k in members.tolist())} deg"
             parts.append(text)
         return "; ".join(parts)
 

@@ -82,7 +82,9 @@ class FollowedRegimes(NamedTuple):
 
 
 @cached
-def follow_regimes(scene: Scene, speed: Array, phases: Array, low: Array, high: Array) -> FollowedRegimes:
+def follow_regimes(
+    scene: Scene, speed: Array | np.ndarray, phases: Array | np.ndarray, low: Array | np.ndarray, high: Array | np.ndarray
+) -> FollowedRegimes:
     """Follow regimes while all drives change their speed by a common factor, from `low` below 1 to `high` above 1.
 
     At each factor Newton's method starts from the regime at the previous factor. A regime ends where it does not converge.
@@ -96,16 +98,16 @@ def follow_regimes(scene: Scene, speed: Array, phases: Array, low: Array, high: 
         names = ("speed", "phases", "amplitude", "foundation_force", "stable")
         fields = fields_near(changed, *start, None)
         is_lost = fields["status"] == RegimeStatus.not_converged
-        following = tuple(jnp.where(is_lost, jnp.nan, fields[name]) for name in names[:2])
-        return following, FollowedRegimes(factor, *(fields[name] for name in names))
+        w, a = (jnp.where(is_lost, jnp.nan, fields[name]) for name in names[:2])
+        return (w, a), FollowedRegimes(factor, *(fields[name] for name in names))
 
     def along(end: Array, w: Array, a: Array) -> FollowedRegimes:
         factors = 1.0 + (end - 1.0) * jnp.linspace(0.0, 1.0, POINTS)
         return jax.lax.scan(lambda carry, factor: at(factor, carry), (w, a), factors)[1]
 
     def follow(w: Array, a: Array) -> FollowedRegimes:
-        both = jax.vmap(along, in_axes=(0, None, None))(jnp.stack([low, high]), w, a)
+        both = jax.vmap(along, in_axes=(0, None, None))(jnp.asarray([low, high]), w, a)
         return jax.tree.map(lambda leaf: jnp.concatenate([leaf[0, :0:-1], leaf[1]]), both)
 
-    found = jax.vmap(follow)(speed, phases)
+    found = jax.vmap(follow)(jnp.asarray(speed), jnp.asarray(phases))
     return found._replace(factor=found.factor[0])
