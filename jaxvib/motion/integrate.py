@@ -124,7 +124,7 @@ def motor_poles(drive: Drive) -> Array:
     def rates(x: Array) -> Array:
         motor = drive.torque_and_inertia(zero, x[0], tuple(x[1:]))
         assert motor is not None
-        return jnp.stack([motor[0] / motor[1], *drive.state_rates(zero, x[0], tuple(x[1:]))])
+        return jnp.stack([motor[0] / motor[1], *(drive.state_rates(zero, x[0], tuple(x[1:])) if states else ())])
 
     speeds = jnp.append(drive.largest_speed * jnp.linspace(0.0, 1.0, _MOTOR_SPEEDS, dtype=zero.dtype), drive.speed)
     slopes = jax.vmap(lambda speed: jax.jacfwd(rates)(jnp.stack([speed, *states])))(speeds)

@@ -397,9 +397,13 @@ def balanced_growth(scene: Scene, speeds: Numbers, angles: ArrayLike | None = No
     return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(values.shape)
 
 
+_DECAY_ERROR = 5e-11
+"""Smallest decay over a turn that counts: errors of the integration let an undamped vibration decay by up to 2e-11."""
+
+
 def decay_over_turn(speeds: np.ndarray, growth: np.ndarray) -> np.ndarray:
     """Return True for growth rates, 1/s, of deviations that decay during a turn by more than errors of the computation."""
-    return growth * 2.0 * np.pi / speeds < -_rounding()
+    return growth * 2.0 * np.pi / speeds < -max(_DECAY_ERROR, 32.0 * float(np.finfo(float_dtype()).eps))
 
 
 def balanced_intervals(
