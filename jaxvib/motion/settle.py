@@ -174,7 +174,7 @@ def _plan_settle(
     is_jam = isinstance(start, str) and start == "jam"
     separation = START_SEPARATION if separation is None and is_jam else separation
     steps = Tolerance(1e-9 if double else 1e-5) if steps is None else steps
-    if must_compile_jams(scene, start, mode):
+    if is_jam and must_compile_jams(scene, mode):
         rest = initial_state(scene)
         prepare_run(plan_stretch(scene, length, rest, steps, throw=throw))
         prepare_separation(scene, rest, WINDOW_SAMPLES)

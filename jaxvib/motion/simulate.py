@@ -133,7 +133,7 @@ def simulate(
         progress_meter=progress_meter,
         throw=throw,
     )
-    if must_compile_jams(scene, start, mode):
+    if isinstance(start, str) and start == "jam" and must_compile_jams(scene, mode):
         prepare_run(plan_from(start="rest", mode=None, separation=None))
     plan = plan_from(start=start, mode=mode, separation=separation)
     run = run_planned(plan, throw=throw)

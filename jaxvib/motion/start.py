@@ -128,12 +128,12 @@ def initial_state(
     return with_spin(scene, _in_jam(modes.omega, modes.displacement, row, angle))
 
 
-def must_compile_jams(scene: Scene, start: object, mode: int | None) -> bool:
-    """Return True if a run that starts in a jam mode must first compile the jam modes of its scene.
+def must_compile_jams(scene: Scene, mode: int | None) -> bool:
+    """Return True if a run that starts in a jam `mode` must first compile the jam modes of its scene.
 
     **Raises** `InputError` if the number of the mode is wrong.
     """
-    if not (isinstance(start, str) and start == "jam" and mode is not None and scene.is_plain):
+    if mode is None or not scene.is_plain:
         return False
     require_mode_number(mode, 2 * scene.machine.structure().mass.shape[0] + 1)
     return not jams_of.is_ready(scene)

@@ -210,7 +210,7 @@ def envelope(
         chosen = np.asarray(validate_tolerance(chosen.tolerance, "tolerance", end.dtype, 10.0), end.dtype)
     given_scene, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
     choices = solver, chosen, adjoint, samples if save == "all" else 0, window_periods, count(max_steps, "max_steps")
-    if must_compile_jams(scene, start, mode):
+    if isinstance(start, str) and start == "jam" and must_compile_jams(scene, mode):
         rest = initial_state(scene)
         in_background(partial(_run.prepare, scene, end, rest, *choices), partial(_prepare_growth, scene, rest))
     # The state of rest exists for every scene; therefore it is computed in the compiled run, which takes less time.
