@@ -30,9 +30,12 @@ _MIN_VALUES = 2
 _MAX_JUMPS = 8
 """Largest number of jumps of the acceleration."""
 
-_SEARCH_VALUES, _SEARCH_PLACES, _SEARCH_INTERVALS = 4096, 400, (1, 8, 64)
-"""Largest number of values, and number of places, in the search of a jump, and numbers of intervals of the splines to which a
-jump is added: a jump between wavy parts is visible with many intervals only, and a weak one with few."""
+_SEARCH_VALUES, _SEARCH_INTERVALS = 4096, (1, 8, 64)
+"""Largest number of values in the search of a jump, and numbers of intervals of the splines to which a jump is added: a jump
+between wavy parts is visible with many intervals only, and a weak one with few."""
+
+_MIN_PLACES, _MAX_PLACES = 100, 400
+"""Smallest and largest number of places at which a jump is tried; between them two for each interval."""
 
 _VALUES_BETWEEN_JUMPS = 12
 """Smallest number of values between two jumps, and between a jump and an end of the record."""
@@ -241,8 +244,8 @@ def _with_jumps(data: _Data, smooth: _KnotsFit, order: int) -> _KnotsFit:
     while len(best.jumps) < _MAX_JUMPS:
         trials = []
         for intervals in {min(each, best.intervals) for each in (*_SEARCH_INTERVALS, best.intervals)}:
-            fit = _fit_knots(part, intervals, best.jumps)
-            place = _place_of_jump(fit, order, (part.time[0], part.time[-1]), _SEARCH_PLACES)
+            places = min(max(_MIN_PLACES, 2 * intervals), _MAX_PLACES)
+            place = _place_of_jump(_fit_knots(part, intervals, best.jumps), order, (part.time[0], part.time[-1]), places)
             if place is not None:
                 trials.append(_best_fit(part, (*best.jumps, place), best.intervals))
         trial = min(trials, key=lambda each: each.criterion, default=best)
@@ -251,7 +254,7 @@ def _with_jumps(data: _Data, smooth: _KnotsFit, order: int) -> _KnotsFit:
         best = trial
     if not best.jumps:
         return smooth
-    jumps, spacing = list(best.jumps), (data.time[-1] - data.time[0]) / _SEARCH_PLACES
+    jumps, spacing = list(best.jumps), (data.time[-1] - data.time[0]) / _MAX_PLACES
     for k in 2 * list(range(len(jumps))):  # a place depends on those of the other jumps
         fit = _fit_knots(data, best.intervals, [each for i, each in enumerate(jumps) if i != k])
         jumps[k] = _place_of_jump(fit, order, (jumps[k] - spacing, jumps[k] + spacing), _FINER_PLACES) or jumps[k]
