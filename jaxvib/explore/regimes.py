@@ -61,7 +61,7 @@ class _Curves(NamedTuple):
 def regime_chart(scene: Scene, max_speed: float) -> str:
     """Draw the working regime over the speed of the motors: rotor speed, amplitudes, and phases or foundation force.
 
-    For exciters with loads, draw the first regimes of `regimes_of` from the operating speed until each of them ends; unstable
+    For exciters with loads, draw the first regimes of `regimes_of` from the working speed until each of them ends; unstable
     parts are dashed.
 
     The speeds of all drives are multiplied by one factor. The horizontal axis shows the highest of these speeds, without load.

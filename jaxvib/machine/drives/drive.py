@@ -96,7 +96,7 @@ class Drive(Part):
         return self
 
     def at_working_speed(self) -> "Drive":
-        """Return the drive with its prescribed speed, if it has one, at the working speed, also if the rotor comes to rest."""
+        """Return the drive with its prescribed speed, if it has one, at the working speed, even if the rotor comes to rest."""
         return self
 
 

@@ -93,12 +93,8 @@ class PackedSystem(eqx.Module):
         contacts: PyTree | None = None,
         solver: diffrax.AbstractSolver | None = None,
     ):
-        self.wrapped, self.has_common_turns, self.batch, self.has_contacts = (
-            wrapped,
-            has_common_turns,
-            batch,
-            contacts is not None,
-        )
+        self.wrapped, self.has_common_turns, self.batch = wrapped, has_common_turns, batch
+        self.has_contacts = contacts is not None
         leaves, self.treedef = jax.tree.flatten(state)
         self.shapes = tuple(leaf.shape for leaf in leaves)
         self.size = sum(leaf.size for leaf in leaves)

@@ -32,8 +32,7 @@ CASES = {
     "two jammed balls and an unbalance, without an impact": {"balls": True, "impact": 0.0},
 }
 """Options of `record` by the name of a case; `motor`: run-up of a motor in place of the prescribed speed; `ending`: its
-acceleration jumps to 0; `balls`: records of
-`repeated_records.jammed`."""
+acceleration jumps to 0; `balls`: records of `repeated_records.jammed`."""
 
 JAMMED_CASES = {
     "two jammed balls, coloured noise, correlation 0.9": {"balls": True, "color": 0.9},
