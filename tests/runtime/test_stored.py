@@ -433,7 +433,7 @@ def test_jams_from_a_stored_program_are_the_same(folder):
         np.testing.assert_array_equal(a, b)
 
 
-def test_no_stored_program_is_used_while_debugging():
+def test_no_stored_program_is_used_while_debugging(folder):
     root = programs.cached(jnp.sqrt)
     assert np.isnan(root(jnp.asarray(-1.0)))
     with jax.debug_nans(True), pytest.raises(FloatingPointError, match="invalid value"):
