@@ -172,6 +172,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     motor, reference = later(lambda: jv.DCMotor(120.0, 2.0, 0.1)), later(lambda: jv.RunUp(120.0, 20.0))
     yield call("Converter", motor=motor, reference=reference)
     yield call("SpeedControl", reference=reference, gain=0.5, integral_gain=2.0, torque_limit=8.0, inertia=0.2)
+    yield call("BeltDrive", motor=motor, ratio=1.6, shaft_inertia=0.2)
     yield call("Gravity", g=9.81, along="up")
     yield call("DryFriction", coefficient=0.1, diameter=0.01, reaction="exact", width=0.01)
     yield call("RollingFriction", coefficient=1e-4, direction="along", width=0.01)

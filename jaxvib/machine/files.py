@@ -17,6 +17,7 @@ from jaxvib.boundary import validated
 from jaxvib.errors import CONTROL, InputError, quoted, read_text, within, written
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drag import drag_of
+from jaxvib.machine.drives.belt import BeltDrive
 from jaxvib.machine.drives.controlled import Converter, SpeedControl, SpeedProfile, TorqueTable
 from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor, Drive, InductionMotor, RunUp, SpinUp, SwitchedOff
 from jaxvib.machine.drives.electrical import DCMotorElectrical, InductionMotorCircuit, InductionMotorElectrical, NamePlateMotor
@@ -60,6 +61,7 @@ DRIVES: dict[str, Callable[..., Drive]] = {
     "speed_profile": SpeedProfile,
     "converter": Converter,
     "speed_control": SpeedControl,
+    "belt_drive": BeltDrive,
 }
 SECTIONS: Mapping[str, Mapping[str, Callable[..., Any]]] = {"machine": MACHINES, "loads": LOADS, "drive": DRIVES}
 """Parts by section and `kind`; each constructor takes the fields of the part's table in a scene file.

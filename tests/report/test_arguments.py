@@ -58,6 +58,7 @@ UNITS = {
         "torque_table": {"speeds": "rad/s", "torques": "N m", "inertia": "kg m^2"},
         "speed_profile": {"times": "s", "speeds": "rad/s"},
         "converter": {},
+        "belt_drive": {"shaft_inertia": "kg m^2"},
         "speed_control": {"gain": "N m s", "integral_gain": "N m", "torque_limit": "N m", "inertia": "kg m^2"},
     },
     "effects": {

@@ -59,6 +59,14 @@ PARTS = {
             "bearing": ("N m s", NOT_NEGATIVE, "friction of the bearings", "", None),
         },
     ),
+    "belt_drive": (
+        jv.BeltDrive,
+        {"motor": MOTOR, "ratio": 1.6, "shaft_inertia": 0.1},
+        {
+            "ratio": ("", POSITIVE, "speed of the motor divided by that of the shaft", "", None),
+            "shaft_inertia": INERTIA,
+        },
+    ),
     "torque_table": (
         jv.TorqueTable,
         {"speeds": [0.0, 100.0], "torques": [10.0, -2.0], "inertia": 0.1},
@@ -213,6 +221,9 @@ REFUSED = {
     "controlled by a motor": (lambda: jv.SpeedControl(MOTOR, 1.0, 1.0, 1.0, 0.1), "drive.reference is induction_motor("),
     "switched off twice": (lambda: jv.SwitchedOff(jv.SwitchedOff(MOTOR)), "drive.motor is switched_off("),
     "ideal drive off": (lambda: jv.SwitchedOff(jv.ConstantSpeed(5.0)), "drive.motor is constant_speed("),
+    "belt of a switched motor": (lambda: jv.BeltDrive(jv.SwitchedOff(MOTOR), 2.0, 0.1), "drive.motor is switched_off("),
+    "belt of a belt": (lambda: jv.BeltDrive(jv.BeltDrive(MOTOR, 2.0, 0.1), 2.0, 0.1), "drive.motor is belt_drive("),
+    "belt of an ideal drive": (lambda: jv.BeltDrive(jv.ConstantSpeed(5.0), 2.0, 0.1), "drive.motor is constant_speed("),
     "half a pole pair": (lambda: jv.InductionMotorCircuit(**{**CIRCUIT, "pole_pairs": 1.5}), "drive.pole_pairs is 1.5"),
     "control without states": (
         lambda: jv.SpeedControl(jv.ConstantSpeed(9.0), 1.0, 1.0, 1.0, 0.1).torque_at(0.0, 5.0),
@@ -387,9 +398,48 @@ def test_steady_torque_is_that_of_the_equivalent_circuit(speed):
     np.testing.assert_allclose(motor.torque(speed), 3.0 * 0.07 * np.imag(rotor.conj() * stator), rtol=1e-12)
 
 
-def test_a_belt_divides_speeds_and_multiplies_torques():
-    """The data of a motor as seen from a shaft that turns 1.5 times as slowly, as documented."""
-    motor = jv.NamePlateMotor("7.5 kW", "1440 rpm", breakdown_ratio=2.6, inertia=0.045)
-    shaft = jv.NamePlateMotor("7.5 kW", "960 rpm", breakdown_ratio=2.6, inertia=0.1, frequency=2.0 * np.pi * 50.0 / 1.5)
-    speeds = np.linspace(0.0, 105.0, 9)
-    np.testing.assert_allclose(shaft.torque(speeds), 1.5 * motor.torque(1.5 * speeds), rtol=1e-9)
+def test_belt_divides_speeds_and_multiplies_torques():
+    """Kloss's formula at the shaft of a motor of 7.5 kW and 1450 rpm, whose belt turns the shaft at 900 rpm."""
+    motor = jv.NamePlateMotor("7.5 kW", "1450 rpm", breakdown_ratio=2.6, inertia=0.045)
+    drive = jv.BeltDrive(motor, ratio=1450.0 / 900.0, shaft_inertia="1 kg m^2")
+    rpm = np.pi / 30.0
+    assert float(drive.speed) == pytest.approx(1500.0 * 900.0 / 1450.0 * rpm, rel=1e-14) == float(drive.largest_speed)
+    assert float(drive.torque(900.0 * rpm)) == pytest.approx(7500.0 / (900.0 * rpm), rel=1e-12)
+    breakdown = 50.0 / 1500.0 * (2.6 + np.sqrt(2.6**2 - 1.0))
+    at_breakdown = (1.0 - breakdown) * 1500.0 * 900.0 / 1450.0 * rpm
+    assert float(drive.torque(at_breakdown)) == pytest.approx(2.6 * 7500.0 / (900.0 * rpm), rel=1e-12)
+    torque, inertia = drive.torque_and_inertia(0.0, 900.0 * rpm)
+    assert float(inertia) == pytest.approx(1.0 + 0.045 * (1450.0 / 900.0) ** 2, rel=1e-14)
+    assert float(torque) == pytest.approx(79.577472, rel=1e-7)
+    assert float(drive.starting_torque()) == float(drive.torque(0.0))
+
+
+def test_belt_passes_time_and_states_of_its_motor():
+    speed = jnp.asarray(30.0)  # of the shaft; that of the motor is 60
+    winding = jv.DCMotorElectrical(24.0, 0.6, 0.08, 0.002, inductance=0.02)
+    drive, current = jv.BeltDrive(winding, 2.0, 0.01), (jnp.asarray(3.0),)
+    assert float(drive.torque_at(0.0, speed, current)) == pytest.approx(2.0 * 0.08 * 3.0)
+    np.testing.assert_allclose(drive.state_rates(0.0, speed, current), [(24.0 - 0.6 * 3.0 - 0.08 * 60.0) / 0.02], rtol=1e-14)
+    assert float(drive.state_units()[0]) == 40.0 and drive.supply_frequency() is None
+    assert float(jv.BeltDrive(jv.InductionMotorElectrical(**CIRCUIT), 2.0, 0.1).supply_frequency()) == 377.0
+    ramp = jv.Converter(MOTOR, jv.RunUp(100.0, acceleration=50.0))
+    drive = jv.BeltDrive(ramp, 2.0, 0.1)
+    assert float(drive.torque_at(1.0, speed)) == pytest.approx(2.0 * float(MOTOR.torque(60.0 + 150.0 - 50.0)), rel=1e-14)
+    assert [float(t) for t in drive.jump_ts()] == [2.0] and drive.starting_torque() is None
+    assert float(drive.speed) == 50.0 == float(drive.largest_speed)
+    for steady in (drive.settled(), drive.at_working_speed()):
+        assert steady.jump_ts() == () and float(steady.torque_at(1.0, speed)) == pytest.approx(float(drive.torque(speed)))
+
+
+def test_run_with_a_belt_equals_that_of_the_referred_motor():
+    machine = jv.one_mass(mass=200.0, stiffness=8e5, damping=600.0)
+
+    def final_angle(drive):
+        run = jv.simulate(jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=0.2)]), "1 s")
+        return float(run.trajectory.state.exciters[0].rotor[0][-1])
+
+    motor = jv.InductionMotor(150.0, breakdown_torque=70.0, breakdown_slip=0.2, inertia=0.3)
+    for ratio in (1.0, 2.0):
+        referred = jv.InductionMotor(150.0 / ratio, 70.0 * ratio, 0.2, inertia=0.05 + 0.3 * ratio**2)
+        found = final_angle(jv.BeltDrive(motor, ratio=ratio, shaft_inertia=0.05))
+        assert found == pytest.approx(final_angle(referred), rel=1e-7)
