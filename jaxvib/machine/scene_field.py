@@ -1,9 +1,6 @@
-"""Field of a result that contains the scene: its TOML text for files, and the names of coordinates, directions and loads."""
+"""Field of a result that contains the scene: its TOML text for files, and the names of coordinates, directions and masses."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -13,17 +10,34 @@ from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import as_text
 
 
-def _labels(scene: Scene) -> dict[str, Sequence[Any]]:
+def mass_names(scene: Scene) -> tuple[str, ...]:
+    """Return the names of the loads, and of the rotors of exciters without loads.
+
+    The first load has the name "1" in a scene with one exciter; with several exciters, "2.1" is the first load of exciter 2,
+    and "2" its rotor.
+    """
+    counts = [0 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters]
+    if len(counts) == 1:
+        return tuple(str(j + 1) for j in range(counts[0]))
+    return tuple(name for k, n in enumerate(counts, 1) for name in ([f"{k}.{j + 1}" for j in range(n)] or [f"{k}"]))
+
+
+def axis_labels(scene: Scene) -> dict[str, tuple[str, ...]]:
+    """Return the labels of results of a scene, or of a batch of scenes, by the name of the axis, see
+    `jaxvib.results.fields.labels_of`."""
     if batch := np.ndim(scene.exciters[0].drive.speed):  # the scenes of a batch have the same names
         scene = jax.tree.map(lambda leaf: leaf[(0,) * batch], scene)
-    structure, counts = scene.machine.structure(), [0 if e.loads is None else e.loads.count for e in scene.exciters]
-    loads = range(1, counts[0] + 1)
-    if len(counts) > 1:
-        loads = [name for k, n in enumerate(counts, 1) for name in ([f"{k}.{j + 1}" for j in range(n)] or [f"{k}"])]
+    structure, masses = scene.machine.structure(), mass_names(scene)
     # A single direction needs no name.
     directions = structure.foundation_directions if len(structure.foundation_directions) > 1 else ()
-    return {"coordinate": structure.coordinates, "unit": structure.units, "load": loads, "direction": directions}
+    return {
+        "coordinate": structure.coordinates,
+        "unit": structure.units,
+        "load": masses,
+        "mass": masses,
+        "direction": directions,
+    }
 
 
-SCENE = as_text(scene_to_toml, scene_from_toml, _labels)
+SCENE = as_text(scene_to_toml, scene_from_toml, axis_labels)
 """Metadata of a result's field that contains a scene."""

@@ -21,6 +21,7 @@ from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import axis_labels
 from jaxvib.motion.analysis.ensemble_regimes import (
     MAX_RELATIVE_ROTATION,
     EnsembleRegimes,
@@ -37,7 +38,7 @@ from jaxvib.motion.plan import ENSEMBLE_PARTS, EqualSteps, plan_ensemble
 from jaxvib.ode.replay import forward_only
 from jaxvib.ode.types import Y
 from jaxvib.results.estimate import Share, estimate_share
-from jaxvib.results.fields import in_unit, part
+from jaxvib.results.fields import in_unit, names_along, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
@@ -101,6 +102,8 @@ class Ensemble(Result):
       push
     - `steps` of each run
     - `seconds` for all runs together, including compilation if a program was new; NaN under a JAX transformation
+    - `coordinates`, `units`: names of the coordinates, and their units; `loads`: names of the loads, "2.1" for the first load
+      of exciter 2, and "2" for its rotor if it has no loads
     """
 
     state: State = eqx.field(metadata=part("run"))
@@ -114,6 +117,9 @@ class Ensemble(Result):
     steps: Array = eqx.field(metadata=in_unit(""))
     seconds: Array = eqx.field(metadata=in_unit("s"))
     masses: RotatingMasses | None = eqx.field(default=None, metadata=part("run"))
+    coordinates: tuple[str, ...] = eqx.field(default=(), static=True, metadata=names_along("coordinate"))
+    units: tuple[str, ...] = eqx.field(default=(), static=True, metadata=names_along("unit"))
+    loads: tuple[str, ...] = eqx.field(default=(), static=True, metadata=names_along("load"))
 
     @property
     def status(self) -> EnsembleStatus:
@@ -287,6 +293,7 @@ def ensemble(
     if len(plan.scenes.exciters) > 1:
         masses = rotating_masses(plan.scenes, last, load_speed, plan.end, plan.end / ENSEMBLE_PARTS)
         relative_rotation = jnp.max(masses.rotation, axis=1) - jnp.min(masses.rotation, axis=1)
+    labels = axis_labels(plan.scenes)
     result = Ensemble(
         *on_device(
             (
@@ -302,7 +309,10 @@ def ensemble(
                 unknown,
                 masses,
             )
-        )
+        ),
+        coordinates=labels["coordinate"],
+        units=labels["unit"],
+        loads=labels["load"],
     )
     if not plan.is_known:
         return forward_only(result, "ensemble", "supports forward derivatives only; use jax.jacfwd or jax.jvp")

@@ -58,6 +58,12 @@ class AsText(TypedDict):
     labels: Callable[[Any], Labels]
 
 
+class Names(TypedDict):
+    """Metadata of `names_along`."""
+
+    labels: Callable[[Any], Labels]
+
+
 def in_unit(unit: str, *axes: str, name: str = "", first: int = 0) -> InUnit:
     """Return the metadata of a field of numbers: their unit ("" for none) and the names of their axes in order.
 
@@ -90,6 +96,12 @@ def as_text(write: Callable[[T], str], read: Callable[[str], T], labels: Callabl
     labels of axes.
     """
     return {"write": write, "read": read, "labels": labels}
+
+
+def names_along(axis: str) -> Names:
+    """Return the metadata of a field that contains the labels of the points on an axis; "unit" stands for the units of the
+    coordinates."""
+    return {"labels": lambda names: {axis: names}}
 
 
 def is_named_tuple(value: object) -> TypeGuard[NamedTuple]:
@@ -182,8 +194,11 @@ def labels_of(result: eqx.Module) -> Labels:
     coordinates."""
     labels: dict[str, Sequence[str]] = {}
     for field in dataclasses.fields(result):
-        if "labels" in field.metadata and getattr(result, field.name) is not None:
-            labels |= field.metadata["labels"](getattr(result, field.name))
+        value = getattr(result, field.name)
+        if "labels" in field.metadata and value is not None:
+            labels |= field.metadata["labels"](value)
+        elif "part" in field.metadata and isinstance(value, eqx.Module):
+            labels |= labels_of(value)
     return labels
 
 

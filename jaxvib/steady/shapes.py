@@ -12,7 +12,7 @@ from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text
 from jaxvib.equations.linear import LOST_FREQUENCY, linear_model, lost_frequencies
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
-from jaxvib.results.fields import in_unit
+from jaxvib.results.fields import in_unit, names_along
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.outcome import REFUSED, outcome
@@ -45,7 +45,7 @@ class ModeShapes(Result):
     frequency: Array = eqx.field(metadata=in_unit("rad/s", "shape_mode"))
     shape: Array = eqx.field(metadata=in_unit("", "shape_mode", "coordinate"))
     lever: Array = eqx.field(metadata=in_unit("m", "coordinate"))
-    coordinates: tuple[str, ...] = eqx.field(static=True)
+    coordinates: tuple[str, ...] = eqx.field(static=True, metadata=names_along("coordinate"))
 
     def summary(self) -> str:
         """Return a line of text for each mode."""

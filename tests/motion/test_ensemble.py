@@ -300,3 +300,21 @@ def test_equal_steps_resolve_the_contact_with_a_stop():
     assert float(jnp.max(many.error)) < 0.05  # 1.7 with steps for the rotor and the support alone
     one = jv.simulate(make(1e7), 1.5, save="window", estimate=False)
     np.testing.assert_allclose(many.state.displacement[1], one.window.state.displacement[-1], atol=1e-5)
+
+
+def test_tables_name_coordinates_and_masses(tmp_path):
+    supports = [jv.support(at=(x, 0.0), stiffness=(1e5, 1e5), damping=(50.0, 50.0)) for x in (-0.5, 0.5)]
+    machine, drive = jv.plane_body(mass=100.0, inertia=5.0, supports=supports), jv.ConstantSpeed(60.0)
+    with_balls = jv.Exciter(jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5), drive, at=(0.0, 0.1))
+    scene = jv.Scene(machine, exciters=[with_balls, jv.Exciter(drive=drive, unbalance=0.05)])
+    change = lambda n: eqx.tree_at(lambda s: s.exciters[0].drive.speed, scene, n)  # noqa: E731
+    runs = jv.ensemble(change, jnp.array([50.0, 60.0]), 0.01, stepsize_controller=jv.EqualSteps(4), estimate=False)
+    heads = set(jv.load(runs.save(tmp_path / "runs")).to_pandas())
+    assert {"displacement x (m)", "velocity psi (rad/s)", "load_speed 1.2 (rad/s)", "load_speed 2 (rad/s)"} < heads
+    assert {"detached 1.1", "phase 2 (rad)", "exciters_1_angle 1 (rad)"} < heads
+    data = runs.to_xarray()
+    assert data.unit.values.tolist() == ["m", "m", "rad"]
+    for axis in ("load", "mass"):
+        assert data[axis].values.tolist() == ["1.1", "1.2", "2"]
+    regimes = runs.regimes.to_xarray()
+    assert regimes.mass.values.tolist() == ["1.1", "1.2", "2"]

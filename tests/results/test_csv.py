@@ -124,9 +124,11 @@ def test_main_axis_of_one_spectrum_is_its_frequency(segments, axis):
     means = np.zeros((segments, 1))
     spectrum = Spectrum(
         np.zeros(segments), np.zeros(5), np.zeros((segments, 5, 2)), np.zeros((segments, 5, 1)), means, means, np.zeros(2),
-        coordinates=("y1", "y2"), units=("m", "m"),
+        coordinates=("y1", "tilt"), units=("m", "rad"),
     )  # fmt: skip
-    assert main_axis(spectrum) == axis and len(table_along(spectrum, axis)) > 3
+    table = table_along(spectrum, axis)
+    assert main_axis(spectrum) == axis and len(table) > 3
+    assert axis == "segment" or {"amplitude y1 (m)", "amplitude tilt (rad)"} < set(table)
 
 
 def test_table_of_a_batch_is_refused():

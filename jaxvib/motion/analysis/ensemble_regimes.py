@@ -18,9 +18,10 @@ from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drives.drive import SwitchedOff
 from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.machine.scene_field import mass_names
 from jaxvib.motion.analysis.measure import turning_angles, turning_directions
 from jaxvib.results.estimate import wilson
-from jaxvib.results.fields import in_unit
+from jaxvib.results.fields import in_unit, names_along
 from jaxvib.results.readable import Readable
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
@@ -66,7 +67,7 @@ class RotatingMasses(Readable):
     rotation: Array = eqx.field(metadata=in_unit("rad", "mass"))
     phase: Array = eqx.field(metadata=in_unit("rad", "mass"))
     resonance: Array = eqx.field(metadata=in_unit("", "mass"))
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True, metadata=names_along("mass"))
     equal: tuple[int, ...] = eqx.field(static=True)
 
 
@@ -78,8 +79,6 @@ def rotating_masses(scenes: Scene, states: State, mean_speed: Array, end: Array,
     last part of the runs, its `length`, s, and the `end`, s, of the runs.
     """
     directions, owners = jnp.asarray(turning_directions(scenes)), _owners(scenes)
-    counts = [0 if exciter.loads is None else exciter.loads.count for exciter in scenes.exciters]
-    names = [name for k, n in enumerate(counts, 1) for name in ([f"{k}.{j + 1}" for j in range(n)] or [f"{k}"])]
 
     def of_run(scene: Scene, state: State, speed: Array) -> RotatingMasses:
         angles, _ = turning_angles(scene, lambda: end[None], jax.tree.map(lambda leaf: leaf[None], state))
@@ -93,7 +92,7 @@ def rotating_masses(scenes: Scene, states: State, mean_speed: Array, end: Array,
         has_equal_loads = [e.loads is not None and all(np.ndim(x) == 0 for x in jax.tree.leaves(e.loads)) for e in exciters]
         equal = [owners.index(owner) if has_equal_loads[k] else k for k, owner in enumerate(owners)]
         phase = jnp.arctan2(jnp.sin(relative), jnp.cos(relative))
-        return RotatingMasses(turned * length, phase, jnp.stack(numbers), tuple(names), tuple(equal))
+        return RotatingMasses(turned * length, phase, jnp.stack(numbers), mass_names(scene), tuple(equal))
 
     return jax.vmap(of_run)(scenes, states, mean_speed)
 
@@ -155,7 +154,7 @@ class EnsembleRegimes(Result):
     phase_low: np.ndarray = eqx.field(metadata=in_unit("rad", "regime", "mass"))
     phase_high: np.ndarray = eqx.field(metadata=in_unit("rad", "regime", "mass"))
     resonance: np.ndarray = eqx.field(metadata=in_unit("", "regime", "mass"))
-    masses: tuple[str, ...] = eqx.field(static=True)
+    masses: tuple[str, ...] = eqx.field(static=True, metadata=names_along("mass"))
 
     @validated
     def name(self, index: int) -> str:

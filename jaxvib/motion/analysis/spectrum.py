@@ -12,8 +12,9 @@ from jaxvib.display import Axes, Drawn, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import axis_labels
 from jaxvib.motion.analysis.measure import Trajectory
-from jaxvib.results.fields import in_unit
+from jaxvib.results.fields import in_unit, names_along
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.units import count
@@ -44,7 +45,8 @@ class Spectrum(Result):
     - `rotor_speeds` (P, E), rad/s, of the E exciters, and `load_speeds` (P, L), rad/s, of the L exciters with loads: means over
       the segments and the loads
     - `resonances` (nd,), rad/s: estimated natural frequencies
-    - `coordinates` and `units` (nd,): names of the coordinates, and their units
+    - `coordinates` and `units` (nd,): names of the coordinates, and their units; `directions`: names of the directions of the
+      force, if there are several
     """
 
     status = Computed.done
@@ -56,8 +58,9 @@ class Spectrum(Result):
     rotor_speeds: np.ndarray = eqx.field(metadata=in_unit("rad/s", "segment", "exciter"))
     load_speeds: np.ndarray = eqx.field(metadata=in_unit("rad/s", "segment", "exciter_with_loads"))
     resonances: np.ndarray = eqx.field(metadata=in_unit("rad/s", "resonance"))
-    coordinates: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="unit"))
+    coordinates: tuple[str, ...] = eqx.field(static=True, metadata=names_along("coordinate"))
+    units: tuple[str, ...] = eqx.field(static=True, metadata=names_along("unit"))
+    directions: tuple[str, ...] = eqx.field(default=(), static=True, metadata=names_along("direction"))
 
     def summary(self) -> str:
         """Return the largest amplitude of each coordinate in the last segment, with its frequency, as text."""
@@ -155,7 +158,7 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     def means(values: np.ndarray) -> np.ndarray:
         return np.array([np.mean(values[s : s + size], axis=0) for s in starts])
 
-    structure = scene.machine.structure()
+    labels = axis_labels(scene)
     return Spectrum(
         time=np.array([0.5 * (time[s] + time[s + size - 1]) for s in starts]),
         frequency=frequency[is_shown],
@@ -164,6 +167,7 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
         rotor_speeds=means(speeds),
         load_speeds=means(np.stack(rates, axis=1) if rates else np.zeros((time.size, 0))),
         resonances=np.asarray(estimated_frequencies(scene), float),
-        coordinates=structure.coordinates,
-        units=structure.units,
+        coordinates=labels["coordinate"],
+        units=labels["unit"],
+        directions=labels["direction"],
     )
