@@ -65,12 +65,13 @@ def _column(path: str | Path, unit: str, column: str | None) -> tuple[float, lis
     if len(matching) != 1:
         wanted = f"with a unit such as {unit}" if column is None else f"{quoted(column)}"
         problem = f"has {len(matching) or 'no'} columns {wanted}"
-        raise InputError(str(path), f"{problem}; name one as column, the columns are: {', '.join(map(quoted, head))}")
+        raise InputError(str(path), f"{problem}; set column to one of: {', '.join(map(quoted, head))}")
     (k,) = matching
     head_unit = names[k][1]
     factor = 1.0 if not unit and head_unit in ("", "-") else unit_factor(head_unit, unit) if head_unit else None
     if factor is None:
-        raise InputError(str(path), f"has the column {quoted(head[k])} without a unit of {unit}; write {names[k][0]} ({unit})")
+        problem = f"has the column {quoted(head[k])}, whose unit is missing or not convertible to {unit}"
+        raise InputError(str(path), f"{problem}; write {names[k][0]} ({unit})")
     cells = [(line, row[k], row[0]) for line, row in rows if len(row) > k and row[k]]
     if not cells:
         raise InputError(str(path), f"has no number in the column {quoted(head[k])}")

@@ -66,9 +66,9 @@ def test_units_with_blanks_follow_a_slash(head, name, unit, tmp_path):
     ("text", "column", "words"),
     [
         ("rate (N/mm)\n", None, "has no rows"),
-        ("a (N/mm),b (N/m)\n1,2\n", None, "has 2 columns with a unit such as N/m; name one as column"),
-        ("a (N/mm),b (N/m)\n1,2\n", "c", "has no columns 'c'; name one as column, the columns are: 'a .N/mm.', 'b .N/m.'"),
-        ("a (mm)\n1\n", "a", "without a unit of N/m; write a .N/m."),
+        ("a (N/mm),b (N/m)\n1,2\n", None, "has 2 columns with a unit such as N/m; set column to one of"),
+        ("a (N/mm),b (N/m)\n1,2\n", "c", "has no columns 'c'; set column to one of: 'a .N/mm.', 'b .N/m.'"),
+        ("a (mm)\n1\n", "a", "whose unit is missing or not convertible to N/m; write a .N/m."),
         ("a (N/mm)\n1\ntwo\n", None, "row 3 has 'two', which is not a number"),
         ("\na (N/mm)\n\n1\n\ntwo\n", None, "row 6 has 'two', which is not a number"),
         ("a (N/mm)\n1_000\n", None, "row 2 has '1_000', which is not a number"),
