@@ -73,11 +73,11 @@ class StoredFunction(Generic[T]):
     exceed `MAX_PROGRAMS_IN_MEMORY` or `MAX_PROGRAM_MEMORY`, the least recently used ones are freed and later read or traced
     again.
 
-    A program is not stored, but traced in each process, and again after it was freed, if it has
+    Some programs cannot be stored. They are traced in each process, and again after they were freed:
 
-    - arguments or results of classes of other packages, whose sources are not part of the key
-    - functions without a name
-    - host callbacks
+    - programs whose arguments or results are of classes of other packages, because their sources are not part of the key
+    - programs with an argument or result that is a function without a name, such as a lambda
+    - programs with host callbacks
 
     Programs of arrays on several devices belong to `jitted`; their memory is not limited.
 
@@ -223,8 +223,8 @@ def _skeleton(structure: Description) -> Skeleton:
 class _Program:
     """Function of all arrays of the arguments, compiled by `jax.jit`.
 
-    `result` is the structure of its result, and `size` that of its stored form in bytes. `used` is a counter that orders
-    programs by their last use.
+    **Attributes**: `run`; `result`: the structure of the result; `size` of the stored form, bytes; `used`: a counter that
+    orders programs by their last use.
     """
 
     run: Callable[..., list[Array]]

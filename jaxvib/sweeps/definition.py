@@ -31,7 +31,7 @@ class CaseStatus(eqx.Enumeration):
 
     missing = "the case has not been computed yet"
     done = "the case was computed"
-    absent = "a requested quantity, such as a jam beyond its fold, does not exist in this case"
+    absent = "a requested quantity does not exist in this case, such as the speed of a jam beyond its fold"
     not_finite = "the motion grew without bounds"
     failed = "an error was raised; its message is stored with the case"
     lost = "the process that computed the case terminated unexpectedly several times"
@@ -84,7 +84,7 @@ class Study:
 
     @property
     def batch(self) -> int:
-        """Number of cases that are computed together: on an accelerator a whole chunk, if it is not very large."""
+        """Number of cases of a chunk that are computed at the same time: on an accelerator all, if they are not very many."""
         return min(batch_size(), _round_up(self._cases_in_chunk, BATCH_SIZE))
 
     @property
@@ -124,7 +124,7 @@ class Study:
         return digest(self.record)
 
     def placeholders(self, cases: int) -> list[np.ndarray]:
-        """Return arrays for the measures of so many `cases` without a value: NaN, or -1 for integers."""
+        """Return arrays of the measures for a number of `cases` that have no values: NaN, or -1 for integers."""
         return [np.full((cases, *f.shape), np.nan if np.issubdtype(f.dtype, np.inexact) else -1, f.dtype) for f in self.forms]
 
 

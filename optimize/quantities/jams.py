@@ -176,7 +176,7 @@ def foundation_force(*, mode: int | None = None, harmonic: int | None = None, ti
 
     **Arguments**
 
-    - `mode`: number of the jam mode; typical: 1, 3, 5; default: the working regime of exciters, see `throw_stroke`
+    - `mode`: number of the jam mode; typical: 1, 3, 5; default: the regime of `jaxvib.working_regime`
     - `harmonic`: number k of a harmonic of the exact motion, for the force at k times the load speed only; typical: 1 to 5;
       default: the whole force
     - `tier`: as for `amplitude`; a harmonic is always computed with the tier "exact"
@@ -338,8 +338,8 @@ def power(*, mode: int | None = None, tier: Tier = "leading") -> Quantity:
 
         P = n (sum_j b_W R^2 (n - Omega) + torque of dry friction)    (jam, leading order)
 
-    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; default: the working regime of exciters, see
-    `throw_stroke`; `tier`: "leading" (the default) or "exact".
+    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; default: the regime of
+    `jaxvib.working_regime`; `tier`: "leading" (the default) or "exact".
 
     **Returns** `Quantity`, NaN if the mode does not exist; typical: 10 to 2000 W for jams, 0.1 to 20 kW for screens.
 

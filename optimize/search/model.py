@@ -26,8 +26,8 @@ _SMALL_OBJECTIVE_SHARE = 1e-4
 class Step(NamedTuple):
     """Steps to the minimum of the model.
 
-    **Attributes**: `p` (s, d); multipliers of `held` quantities (s, me) and of `demands` (s, mi); `shares` (s, parts) of the
-    pieces of the objective, with the sum 1.
+    **Attributes**: `p` (s, d): changes of the free parameters, as fractions of their ranges; multipliers of `held`
+    quantities (s, me) and of `demands` (s, mi); `shares` (s, parts) of the pieces of the objective, with the sum 1.
     """
 
     p: np.ndarray
@@ -210,8 +210,10 @@ def _active(solution: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndar
 
 
 def predicted_decrease(problem: Problem, point: Point, hessian: np.ndarray, model: Step, size: np.ndarray) -> np.ndarray:
-    """Return the decrease of the objective that the model predicts, relative to the objective; if the objective is about 0,
-    relative to its change over the bounds."""
+    """Return the change of the Lagrangian that the model predicts, as a positive number relative to the objective.
+
+    If the objective is about 0, the number is relative to the change of the objective over the bounds.
+    """
     values, slopes = _pieces(problem, point)
     linear_change = np.max(values - point.values[:, :1] + np.einsum("spd,sd->sp", slopes, model.p), axis=1)
     dual = np.concatenate([model.held, model.demands], axis=1) * size[:, None]

@@ -3,8 +3,8 @@
 The knots are evenly spaced, and their number minimizes the Bayesian information criterion. The second derivative of the angle,
 on which the force of an unbalance depends, is smooth, except at jumps, such as the end of a ramp. A smooth spline would either
 deviate there by several times its stated error, or have so many knots that intervals at low speed contain no pulse. Therefore a
-jump is added if it reduces the criterion. Its knot has the multiplicity 5: the slope may change there too, and this change is
-the effect of the error of the time of the jump.
+jump is added if it reduces the criterion. Its knot has the multiplicity 5, so that the slope of the angle may change there too:
+an error of the time of the jump causes such a change.
 """
 
 from __future__ import annotations
@@ -35,13 +35,14 @@ _SEARCH_VALUES, _SEARCH_INTERVALS = 4096, (1, 8, 64)
 between wavy parts is visible with many intervals only, and a weak one with few."""
 
 _MIN_PLACES, _MAX_PLACES = 100, 400
-"""Smallest and largest number of places at which a jump is tried; between them two for each interval."""
+"""Smallest and largest number of times at which a jump is tried; within these limits the number is twice that of the
+intervals."""
 
 _VALUES_BETWEEN_JUMPS = 12
 """Smallest number of values between two jumps, and between a jump and an end of the record."""
 
 _FINER_SEARCHES, _FINER_PLACES = 6, 9
-"""Number of searches of a jump near the last place, each with this number of places."""
+"""Number of searches that refine the time of a jump, and number of times at which each of them tries it."""
 
 
 def fit_spline(
@@ -56,10 +57,14 @@ def fit_spline(
     The scatter is the standard deviation of the values about the spline; with `rates` it is the standard deviation of the
     times, s. The errors are principal components of the covariance of the coefficients, the largest first.
 
-    **Arguments**: `time` (n,) s, ascending; `value` (n,); `marks` (n,): index of the mark of each value; each mark has an
-    unknown offset, 0 on average; `rates` (n,): time derivatives of the values, for values whose errors are errors of their
-    times. A common delay of all times is then included in the covariance; `jump_order`: order of the derivative that may jump;
-    None for a smooth curve.
+    **Arguments**
+
+    - `time` (n,) s, ascending, and `value` (n,)
+    - `marks` (n,): for pulses of a tachometer, index of the mark on the rotor that causes the value; each mark has an unknown
+      offset, 0 on average
+    - `rates` (n,): time derivatives of the values, for values whose errors are errors of their times. A common delay of all
+      times is then included in the covariance
+    - `jump_order`: order of the derivative that may jump; None for a smooth curve
 
     >>> t = np.linspace(0.0, 2.0, 200)
     >>> spline, _ = fit_spline(t, 30.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=t.size))
@@ -86,8 +91,8 @@ def fit_spline(
 class _Data(NamedTuple):
     """Values of a fit: `time` (n,), `weights` (n,), weighted values `value` (n,), and `marks` (n,).
 
-    `columns` (n, o): sparse matrix of the weighted values by the offsets of all marks but the first, whose offset is minus
-    their sum; `gram` (o, o): its normal equations.
+    `columns` (n, o): sparse matrix of the derivatives of the weighted values with respect to the offsets of all marks but the
+    first, whose offset is minus their sum; `gram` (o, o): its normal equations.
     """
 
     time: np.ndarray
@@ -127,11 +132,15 @@ def _mark_offsets(marks: np.ndarray, weights: np.ndarray) -> tuple[Any, np.ndarr
 class _KnotsFit(NamedTuple):
     """Fit of a spline with given `knots`.
 
-    **Attributes**: the `data`; number of even `intervals`, and the `jumps` within them; `basis` (n, k): sparse matrix of the
-    weighted values by the coefficients; `band`: diagonals of the normal equations N of the coefficients; `offset_changes`
-    (k, o): N^-1 B, where B (k, o) couples the coefficients with the o offsets; `offset_covariance` (o, o): inverse of the
-    Schur complement of N, which is the covariance of the offsets divided by the variance; `coefficients` (k,) of the spline;
-    `residuals` (n,), weighted.
+    **Attributes**
+
+    - the `data`; number of even `intervals`, and the `jumps` within them
+    - `basis` (n, k): sparse matrix of the derivatives of the weighted values with respect to the coefficients
+    - `band`: diagonals of the normal equations N of the coefficients
+    - `offset_changes` (k, o): N^-1 B, where B (k, o) couples the coefficients with the o offsets
+    - `offset_covariance` (o, o): inverse of the Schur complement of N, which is the covariance of the offsets divided by the
+      variance
+    - `coefficients` (k,) of the spline; `residuals` (n,), weighted
     """
 
     data: _Data

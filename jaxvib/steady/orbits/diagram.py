@@ -33,7 +33,7 @@ from jaxvib.steady.orbits.stability import Floquet, is_stiff, steps_for
 from jaxvib.units import Number, count, number, validate_tolerance
 
 _ORBITS_PER_BATCH = 32
-"""Number of orbits in a batch: enough to fill vector registers, few enough for the cache."""
+"""Number of orbits in a batch: enough to fill vector registers, few enough for the processor's cache memory."""
 
 _COLLOCATION_POINTS = (16, 32, 64)
 
@@ -183,8 +183,9 @@ class _Solver:
 
     def __init__(self, scene: Scene, accuracy: float, slowest: float):
         self.scene, self.accuracy = scene, accuracy
-        # The ratio of the decay rate to the load speed is largest at the lowest load speed. All points use the same integration
-        # method (explicit or implicit), so that no test function changes sign only because the method changes.
+        # Multipliers of all points are integrated by the same method (explicit or implicit), so that no test function changes
+        # sign only because the method changes. The lowest load speed selects the method, because the decay of loads and
+        # carrier is fastest there in comparison with the load speed.
         self.implicit = bool(_is_stiff(scene, jnp.asarray(slowest, scene.drive.speed.dtype)))
 
     def __call__(self, omega: np.ndarray) -> _Values:

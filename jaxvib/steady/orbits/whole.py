@@ -1,4 +1,8 @@
-"""Periodic motions of whole scenes by trigonometric collocation of the full equations of motion for all coordinates."""
+"""Periodic motions of whole scenes by trigonometric collocation of the full equations of motion for all coordinates.
+
+A body here is a rotating body with an equation of motion of its own: a load, or the rotor of a motor. The rotor of an ideal
+drive is not a body, because its motion is prescribed. The machine itself is the carrier.
+"""
 
 from __future__ import annotations
 
@@ -68,9 +72,14 @@ class PeriodicScene(eqx.Module):
     The coordinates x (n,) are those of the carrier divided by `length`, and a deviation psi for each body, whose angle is
     sigma (theta + alpha + psi) with the direction sigma of its exciter.
 
-    **Attributes**: the assembled `model`; `field`, its equations of motion; `length`, m: a typical displacement; `phases` alpha
-    (bodies,), rad. Deviations about them are small, so that their derivatives lose no digits; `feedback`: d^2 psi/dtheta^2 of a
-    body due to d^2 q/dtheta^2 = `length` of the carrier, the largest of all exciters.
+    **Attributes**
+
+    - the assembled `model`; `field`, its equations of motion
+    - `length`, m: a typical displacement
+    - `phases` alpha (bodies,), rad: approximate phases, so that the deviations psi are small and their derivatives with respect
+      to theta lose no digits
+    - `feedback`: d^2 psi/dtheta^2 that an acceleration of the carrier d^2 q/dtheta^2 = `length` causes, largest value of all
+      exciters
     """
 
     model: Model
@@ -331,7 +340,11 @@ def multipliers_of(
 
 
 def _radians(scene: PeriodicScene, omega: Array) -> Array:
-    """Return the phase of the fastest oscillation, that of the carrier as seen by the bodies, in a period, rad."""
+    """Return the phase, rad, through which the fastest oscillation advances in a period: 2 pi (w/Omega + 2).
+
+    w is the highest natural frequency of the carrier, with an upper bound of its change by gyroscopic forces. The rotating
+    bodies shift frequencies by up to 2 Omega.
+    """
     carrier, gyroscopic = scene.model.carrier, scene.model.mounts[0].gyroscopic
     half = jnp.linalg.inv(jnp.linalg.cholesky(carrier.mass))
     fastest = jnp.sqrt(jnp.max(jnp.abs(jnp.linalg.eigvalsh(half @ carrier.stiffness @ half.T))))
