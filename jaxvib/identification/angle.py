@@ -25,6 +25,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.identification.records.channel import Channel
+from jaxvib.identification.records.pulses import fit_pulses
 from jaxvib.identification.records.spline import DEGREE, fit_spline
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive, IdealDrive
@@ -36,9 +37,6 @@ _MIN_PULSES = 12
 
 _MAX_SPEED_CHANGE = 0.1
 """Relative change of the speed between two pulses above which the angle between them is uncertain."""
-
-_MIN_SPEED = 0.02
-"""Speed relative to the largest one below which the error of a pulse's angle is not assumed to decrease further."""
 
 MAX_ERRORS = 64
 """Largest number of errors z_m of an angle."""
@@ -152,15 +150,15 @@ def rotor_angles(scene: Scene, run: MeasuredRun) -> list[RotorAngle]:
     **Raises** `InputError` for a motor without such a channel, for a scene with several exciters and such a channel, and for
     fewer than 12 pulses or readings of the channel.
     """
-    channels = run.of_kind("pulses", "angle", "speed")
-    if channels and len(scene.exciters) > 1:
+    channel = run.rotor_channel
+    if channel and len(scene.exciters) > 1:
         raise InputError(
             run.source,
-            f"has the {channels[0].kind} of one rotor, but the scene has {len(scene.exciters)} exciters; "
+            f"has the {channel.kind} of one rotor, but the scene has {len(scene.exciters)} exciters; "
             "identify needs a scene with one exciter for such a channel; otherwise remove the channel and prescribe the speeds",
         )
-    if channels:
-        return [_measured(run, min(channels, key=lambda each: ("pulses", "angle", "speed").index(each.kind)))]
+    if channel:
+        return [_measured(run, channel)]
     return [_prescribed(scene, k, exciter, run) for k, exciter in enumerate(scene.exciters)]
 
 
@@ -194,11 +192,7 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
     else:
         tooth = _tooth_after_gap(value, channel.per_turn)
         value, marked = value - (tooth or 0), channel.per_turn == 1 or tooth is not None
-        marks = np.unique(value % channel.per_turn, return_inverse=True)[1]  # without those of missing teeth
-        value = 2.0 * np.pi * value / channel.per_turn
-        rough_speed = np.convolve(np.pad(np.gradient(value, time), 2, mode="edge"), np.full(5, 0.2), mode="valid")
-        spread = np.maximum(rough_speed, _MIN_SPEED * np.max(rough_speed))  # the errors of pulses are errors of their times
-        spline, scatter = fit_spline(time, value, marks, spread, jump_order=2)
+        spline, scatter, value, marks, spread = fit_pulses(time, value, channel.per_turn)
         speed = spline(0.5 * (time[1:] + time[:-1]), 1)[:, 0]
         is_fast = np.abs(speed[1:]) > 0.2 * np.max(np.abs(speed))  # slower rotors excite almost no vibration
         change = float(np.max(np.abs(np.diff(speed) / speed[1:]), where=is_fast, initial=0.0))

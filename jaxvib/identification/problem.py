@@ -16,7 +16,7 @@ from jax import Array
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.angle import RotorAngle, rotor_angles
-from jaxvib.identification.records.agreement import ROTOR_KINDS
+from jaxvib.identification.records.agreement import ROTOR_KINDS, turn_speed
 from jaxvib.identification.records.channel import Channel, gain_errors
 from jaxvib.identification.records.decimation import MIN_SAMPLES, decimated
 from jaxvib.identification.response import BLOCK, STRETCH, Samples, Unknowns, rows_of_channel, state_count
@@ -274,9 +274,9 @@ def _with_reduced_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
     has_stops = any(isinstance(effect, Stop) for effect in scene.effects)
     if has_stops or max(time.size for time in run.times.values()) < MIN_SAMPLES:
         return run
-    measured = run.rotor_speed()
-    if measured is not None:
-        fastest = float(np.quantile(np.abs(measured[1]), 0.999))
+    if channel := run.rotor_channel:
+        speeds = turn_speed(channel, run.times[channel.name], run.values[channel.name])[1]
+        fastest = float(np.quantile(np.abs(speeds), 0.999))
     else:
         times = jnp.linspace(*run.span, _SPEED_TIMES)
         drives = [exciter.drive for exciter in scene.exciters if exciter.drive.ideal]

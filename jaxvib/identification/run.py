@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
-from jaxvib.identification.records.agreement import ROTOR_KINDS, check_agreement, rotor_speed
+from jaxvib.identification.records.agreement import ROTOR_KINDS, check_agreement, turn_speed
 from jaxvib.identification.records.channel import UNITS, Channel
-from jaxvib.identification.records.pulses import number_pulses, rising_edges
+from jaxvib.identification.records.pulses import fit_pulses, number_pulses, rising_edges
 from jaxvib.identification.records.recorded import described_channels, recorded_from_sep005
 from jaxvib.identification.records.sampling import clipped_at, continued_angle, even_samples, require_ascending, without_spikes
 from jaxvib.results.readable import Readable
@@ -173,6 +173,11 @@ class MeasuredRun(Readable):
         """Return the channels of the given `kinds`."""
         return tuple(channel for channel in self.channels if channel.kind in kinds)
 
+    @property
+    def rotor_channel(self) -> Channel | None:
+        """Channel of the rotor: pulses, else an angle or a speed; None without such a channel."""
+        return min(self.of_kind(*ROTOR_KINDS), key=lambda channel: ROTOR_KINDS.index(channel.kind), default=None)
+
     def rate(self, name: str) -> float:
         """Return the sampling rate, Hz, of the channel `name`: the inverse of the median time step."""
         return 1.0 / float(np.median(np.diff(self.times[name])))
@@ -181,10 +186,16 @@ class MeasuredRun(Readable):
         """Return times, s, and the rotor speed, rad/s, from pulses, else from angle or speed; None without such a
         channel.
 
-        The speed from pulses is the average over each turn.
+        The speed from pulses is the derivative of a smooth angle, fitted to the pulses, at the middle between two pulses.
         """
-        channels = sorted(self.of_kind(*ROTOR_KINDS), key=lambda each: ROTOR_KINDS.index(each.kind))
-        return rotor_speed(channels[0], self.times[channels[0].name], self.values[channels[0].name]) if channels else None
+        channel = self.rotor_channel
+        if channel is None:
+            return None
+        time, value = self.times[channel.name], self.values[channel.name]
+        if channel.kind != "pulses":
+            return turn_speed(channel, time, value)
+        middles = 0.5 * (time[1:] + time[:-1])
+        return middles, fit_pulses(time, value, channel.per_turn).spline(middles, 1)[:, 0]
 
     @property
     def span(self) -> tuple[float, float]:

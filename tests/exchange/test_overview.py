@@ -65,7 +65,7 @@ def test_speed_of_a_named_channel():
     np.testing.assert_allclose(speed_of(CHANNELS, None, "motor", 1).values["motor"], 30.0 + T)
     pulses = speed_of(CHANNELS, "tacho", None, 3)
     assert pulses.channels[0].per_turn == 3 and pulses.channels[0].kind == "pulses" and pulses.source == "recording"
-    np.testing.assert_allclose(pulses.rotor_speed()[1], 4.0 * np.pi, rtol=0.03)
+    np.testing.assert_allclose(pulses.rotor_speed()[1], 4.0 * np.pi, rtol=0.002)
     assert speed_of(CHANNELS[:1], None, None, 1) is None
 
 

@@ -69,7 +69,7 @@ def check_agreement(
     too low for the rotor speed.
     """
     signals = [_Signal(channel, times[channel.name], values[channel.name]) for channel in channels]
-    speeds = [_Signal(each.channel, *rotor_speed(*each)) for each in signals if each.channel.kind in ROTOR_KINDS]
+    speeds = [_Signal(each.channel, *turn_speed(*each)) for each in signals if each.channel.kind in ROTOR_KINDS]
     motions = [_Signal(each.channel, each.time, _filled(each.value)) for each in signals if each.channel.kind in _DERIVATIVES]
     notes = []
     for one, other in itertools.combinations(sorted(speeds, key=lambda each: each.channel.kind == "speed"), 2):
@@ -80,10 +80,11 @@ def check_agreement(
     return notes
 
 
-def rotor_speed(channel: Channel, time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def turn_speed(channel: Channel, time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return times, s, and the rotor speed, rad/s, from a channel of pulses (`value`: their numbers), angle or speed.
 
-    For pulses the speed is the average over each turn, because marks may be unevenly spaced.
+    For pulses the speed is the average over each turn, because marks may be unevenly spaced. A pulse that a recorder rounds to
+    its samples changes this average by up to a sample per turn.
     """
     if channel.kind == "speed":
         is_finite = np.isfinite(value)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from jaxvib.errors import InputError
+from jaxvib.identification.records.spline import fit_spline
 
 MIN_PULSES = 12
 """Smallest number of pulses of a run."""
@@ -19,6 +22,9 @@ pulses is false."""
 
 _NEIGHBOURS = 5
 """Number of intervals on each side with which an interval is compared."""
+
+_MIN_SPEED = 0.02
+"""Speed relative to the largest one below which the error of a pulse's angle is not assumed to decrease further."""
 
 _MAX_FAULTS = 0.1
 """Largest share of missed and false pulses."""
@@ -99,6 +105,39 @@ def number_pulses(time: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray,
         verb = "which is counted" if missed == 1 else "which are counted"
         notes.append(f"{where} missed {missed} {_pulses(missed)}, {place}, {verb}")
     return time, np.concatenate([[0.0], np.cumsum(steps)]), notes
+
+
+class PulseFit(NamedTuple):
+    """Smooth angle of a rotor, fitted to pulses.
+
+    **Attributes**: `spline` of the angle and its errors, see `fit_spline`; `scatter` of the times, s; `angle` (n,), rad, of the
+    pulses; `marks` (n,): index of the mark of each pulse; `speeds` (n,): rough speed at each pulse, rad/s, by which an error of
+    time becomes an error of the angle.
+    """
+
+    spline: Any
+    scatter: float
+    angle: np.ndarray
+    marks: np.ndarray
+    speeds: np.ndarray
+
+
+def fit_pulses(time: np.ndarray, number: np.ndarray, per_turn: int) -> PulseFit:
+    """Return the angle of a rotor over time.
+
+    **Arguments**: `time` (n,), s, and `number` (n,) of the pulses, at least 12; `per_turn`: pulses per turn.
+
+    >>> t = np.round(np.sqrt(np.arange(1.0, 60.0)), 3)    # 2 pi t^2 rad; the times have errors up to 0.5 ms
+    >>> spline = fit_pulses(t, np.arange(t.size), 1).spline
+    >>> bool(abs(spline(5.0, 1)[0] / (20.0 * np.pi) - 1.0) < 1e-3)
+    True
+    """
+    marks = np.unique(number % per_turn, return_inverse=True)[1]  # without those of missing teeth
+    angle = 2.0 * np.pi * number / per_turn
+    rough_speed = np.convolve(np.pad(np.gradient(angle, time), 2, mode="edge"), np.full(5, 0.2), mode="valid")
+    speeds = np.maximum(rough_speed, _MIN_SPEED * np.max(rough_speed))
+    spline, scatter = fit_spline(time, angle, marks, speeds, jump_order=2)
+    return PulseFit(spline, scatter, angle, marks, speeds)
 
 
 def _usual_intervals(steps: np.ndarray) -> np.ndarray:

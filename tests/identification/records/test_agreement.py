@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.identification.records.agreement import _factor, _Signal, rotor_speed
+from jaxvib.identification.records.agreement import _factor, _Signal, turn_speed
 
 T = np.arange(0.0, 20.0, 1e-3)
 SPEED = 20.0 + 4.0 * T + 3.0 * np.sin(0.7 * T)
@@ -169,7 +169,7 @@ def test_missing_teeth_do_not_change_the_speed_of_a_wheel():
     time = np.sqrt(marks[1:].size + uneven) / 10.0  # angle = 100 t^2 - 359 teeth
     kept = marks % 12 != 11
     channel = jv.Channel("tacho", "pulses", per_turn=12)
-    found, speeds = rotor_speed(channel, time[kept], marks[kept].astype(float))
+    found, speeds = turn_speed(channel, time[kept], marks[kept].astype(float))
     np.testing.assert_allclose(speeds, 200.0 * found * 2.0 * np.pi / 12.0, rtol=1e-12)
 
 

@@ -119,3 +119,13 @@ def test_constant_level_has_no_pulses():
     time = np.arange(0.0, 1.0, 0.001)
     with pytest.raises(jv.InputError, match="is constant; give a channel with the pulses"):
         jv.MeasuredRun.from_arrays([jv.Channel("tacho", "pulses")], time, {"tacho": np.ones(time.size)})
+
+
+@pytest.mark.parametrize("per_turn", [1, 8])
+def test_speed_does_not_jump_by_a_sample(per_turn):
+    """A sample per turn is up to 1.4 rad/s; the pulses are rounded to samples, because the signal has two levels."""
+    time = np.arange(0.0, 20.0, 1.0 / 1638.3)
+    level = np.where((60.0 * time + 2.0 * time**2) * per_turn / (2.0 * np.pi) % 1.0 < 0.3, 1.0, 0.0)
+    found = jv.MeasuredRun.from_arrays([jv.Channel("tacho", "pulses", per_turn=per_turn)], time, {"tacho": level})
+    middles, speed = found.rotor_speed()
+    np.testing.assert_allclose(speed, 60.0 + 4.0 * middles, atol=0.05)
