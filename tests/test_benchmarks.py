@@ -3,11 +3,20 @@
 import ast
 import importlib
 import importlib.util
+import os
+import signal
+import time
 from pathlib import Path
 
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture
+def mutants(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS / "trials"))
+    return importlib.import_module("mutants")
 
 
 @pytest.mark.parametrize("path", sorted(BENCHMARKS.rglob("*.py")), ids=lambda path: path.stem)
@@ -26,3 +35,27 @@ def test_what_a_benchmark_imports_exists(path):
             own |= {item.target.id for item in body if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)}
             own |= {t.id for item in body if isinstance(item, ast.Assign) for t in item.targets if isinstance(t, ast.Name)}
             assert {name.name for name in node.names} <= own, f"{path.name}, {node.module}"
+
+
+def test_tests_of_a_mutant_end_at_their_wall_time(mutants, tmp_path):
+    begun = time.monotonic()
+    assert mutants.in_process(os.system, "sleep 100", log=tmp_path / "log", wall=3.0) == -signal.SIGKILL
+    assert time.monotonic() - begun < 60.0
+    assert mutants.in_process(os.system, "exit 0", log=tmp_path / "log", wall=60.0) == 0
+
+
+def test_mutants_that_were_not_run_are_reported(mutants, capsys):
+    drawn, fates = mutants.drawn(4, 0, ["jaxvib/units"]), {}
+
+    def run(mutant, left):
+        assert 0.0 < left <= 0.5
+        time.sleep(0.3)
+        fates[mutant.name] = {"fate": "survived" if fates else "killed", "seconds": 0.3}
+
+    mutants.run_until(time.monotonic() + 0.5, drawn, run, 1)
+    mutants.report(drawn, fates)
+    assert list(fates) == [mutant.name for mutant in drawn[:2]]
+    shown = capsys.readouterr().out.splitlines()
+    assert f"  survived: {drawn[1].name}" in shown and "2 mutants, 1 killed; survivors:" in shown
+    begin = shown.index("2 mutants were not run; the same call with more --minutes runs them:")
+    assert shown[begin + 1 :] == [f"  {mutant.name}" for mutant in drawn[2:]]

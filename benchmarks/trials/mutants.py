@@ -18,7 +18,8 @@ module; the shorter of two equal tests comes first. The first test that fails en
 of the whole suite.
 
 A mutant is killed when a test fails or when the process dies. Survivors, those whose tests did not end in `--seconds` of
-processor time, and those without a test are printed with their changes, to be explained or killed by a new test. All results
+CPU time or `--wall` seconds, and those without a test are printed with their changes, to be explained or killed by a new test.
+After `--minutes` no mutant is started, and tests that still run are ended; mutants that were not run are printed. All results
 are kept in `--out`, so that a second call goes on where the first was stopped; `--again` runs the survivors anew, after tests
 were added. Processes are forked from one that has imported the libraries, but nothing of the packages.
 """
@@ -32,15 +33,17 @@ import concurrent.futures
 import functools
 import itertools
 import json
+import math
 import multiprocessing
 import os
 import pathlib
 import re
 import resource
 import shutil
+import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import pytest
 from changes import Mutant, folder_of, mutants
@@ -135,15 +138,20 @@ def _home(path: pathlib.Path) -> tuple[str, ...]:
 _processes = multiprocessing.get_context("forkserver")
 
 
-def _in_process(work, *arguments, log: pathlib.Path) -> int:
-    """The exit code of a function in a forked process whose output goes to a file."""
+def in_process(work, *arguments, log: pathlib.Path, wall: float) -> int:
+    """The exit code of a function in a forked process whose output goes to a file; after `wall` seconds, the process and those
+    that it started are ended, and the code is that of the signal."""
     process = _processes.Process(target=_logged, args=(work, str(log), *arguments))
     process.start()
-    process.join()
+    process.join(wall)
+    if process.is_alive():
+        os.killpg(process.pid, signal.SIGKILL)
+        process.join()
     return process.exitcode
 
 
 def _logged(work, log: str, *arguments) -> None:
+    os.setsid()
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for stream in (1, 2):
         os.dup2(output, stream)
@@ -189,7 +197,7 @@ def _run_tests(place: str, tests: Sequence[str], seconds: int, failed: str) -> i
 # --- fates ---
 
 
-def fate_of(mutant: Mutant, copy_of: pathlib.Path, tests: Sequence[str], seconds: int) -> dict:
+def fate_of(mutant: Mutant, copy_of: pathlib.Path, tests: Sequence[str], seconds: int, wall: float) -> dict:
     """The mutant's fate: "killed", "died" (the process did), "survived", "slow" (no answer) or "without tests"."""
     began, path = time.perf_counter(), copy_of / mutant.file
     log, failed = copy_of.with_suffix(".log"), copy_of.with_suffix(".failed")
@@ -197,13 +205,24 @@ def fate_of(mutant: Mutant, copy_of: pathlib.Path, tests: Sequence[str], seconds
     whole = path.read_bytes()
     path.write_bytes(whole[: mutant.start] + mutant.new.encode() + whole[mutant.end :])
     try:
-        code = _in_process(_run_tests, str(copy_of), tests, seconds, str(failed), log=log)
+        code = in_process(_run_tests, str(copy_of), tests, seconds, str(failed), log=log, wall=wall)
     finally:
         path.write_bytes(whole)
     # 2 and 4: the tests cannot be collected, 5: all of them are slow ones
     fates = {0: "survived", 1: "killed", 2: "killed", 4: "killed", 5: "without tests", -9: "slow", -24: "slow"}
     by = failed.read_text() if failed.exists() else ""
     return {"fate": fates.get(code, "died"), "by": by, "seconds": round(time.perf_counter() - began, 1)}
+
+
+def run_until(end: float, mutants: Sequence[Mutant], run: Callable[[Mutant, float], dict], workers: int) -> None:
+    """Call `run` with each mutant and the seconds that are left until `end`, a time of `time.monotonic`; none after `end`."""
+
+    def one(mutant: Mutant) -> None:
+        if (left := end - time.monotonic()) > 0.0:
+            run(mutant, left)
+
+    with concurrent.futures.ThreadPoolExecutor(workers) as pool:
+        list(pool.map(one, mutants))
 
 
 def main() -> None:
@@ -216,10 +235,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="order of the draw (0)")
     parser.add_argument("--workers", type=int, default=2, help="processes at a time (2)")
     parser.add_argument("--tests", type=int, default=20, help="tests that a mutant is given, beside its examples (20)")
-    parser.add_argument("--seconds", type=int, default=240, help="processor time of a mutant's tests (240)")
+    parser.add_argument("--seconds", type=int, default=240, help="CPU time of a mutant's tests (240)")
+    parser.add_argument("--wall", type=float, default=1200.0, help="time of a mutant's tests, s (1200)")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="time of the whole call (no limit)")
     parser.add_argument("--again", action="store_true", help="run the survivors anew")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/mutants"), help="folder of the results")
     asked = parser.parse_args()
+    end = time.monotonic() + 60.0 * asked.minutes
     out = asked.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
 
@@ -235,22 +257,25 @@ def main() -> None:
         shutil.copytree(ROOT, place, ignore=ignored)
     free = collections.deque(copies)
 
-    def one(mutant: Mutant) -> None:
+    def run(mutant: Mutant, left: float) -> None:
         place = free.popleft()
-        fates[mutant.name] = fate_of(mutant, place, likely_tests(mutant, asked.tests), asked.seconds)
+        fate = fate_of(mutant, place, likely_tests(mutant, asked.tests), asked.seconds, min(asked.wall, left))
         free.append(place)
+        if time.monotonic() >= end and fate["fate"] in ALIVE:  # its tests may have been ended early
+            return
+        fates[mutant.name] = fate
         kept.write_text(json.dumps(fates, indent=1))
         print(
             f"{len(fates):4} {fates[mutant.name]['fate']:11} {fates[mutant.name]['seconds']:6.1f} s {mutant.name}", flush=True
         )
 
-    with concurrent.futures.ThreadPoolExecutor(asked.workers) as pool:
-        list(pool.map(one, [mutant for mutant in taken if mutant.name not in fates]))
+    run_until(end, [mutant for mutant in taken if mutant.name not in fates], run, asked.workers)
     report(taken, fates)
 
 
 def report(taken: list[Mutant], fates: dict[str, dict]) -> None:
-    """Killed and survived, by folder and by kind of change, and every survivor."""
+    """Killed and survived, by folder and by kind of change, every survivor, and every mutant that was not run."""
+    waiting, taken = [one for one in taken if one.name not in fates], [one for one in taken if one.name in fates]
     for title, key in (
         ("folder", lambda one: one.folder),
         ("kind", lambda one: one.kind),
@@ -265,6 +290,10 @@ def report(taken: list[Mutant], fates: dict[str, dict]) -> None:
     print(f"\n{len(taken)} mutants, {len(taken) - len(alive)} killed; survivors:")
     for mutant in sorted(alive, key=lambda one: (one.file, one.line)):
         print(f"  {fates[mutant.name]['fate']}: {mutant.name}")
+    if waiting:
+        print(f"\n{len(waiting)} mutants were not run; the same call with more --minutes runs them:")
+        for mutant in waiting:
+            print(f"  {mutant.name}")
 
 
 if __name__ == "__main__":
