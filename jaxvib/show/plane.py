@@ -7,12 +7,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.draw.machine.parts import Part, Text, circle, ground, turning_arrow
-from jaxvib.draw.style import COLORS, Look
+from jaxvib.draw.machine.parts import Part, Text, circle, ground
+from jaxvib.draw.style import Look
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.plane_body import PlaneBody
 from jaxvib.show.view import BODY, FOUNDATION, View, spring_and_damper
-from jaxvib.show.wheel import Pose, Wheel, value_text
+from jaxvib.show.wheel import Pose, Wheel, numbers_of, value_text
 
 _WIDTH = 6.0
 """Size, in units of the drawing, of the rectangle around all points to which something is attached: the larger of its width and
@@ -23,8 +23,6 @@ _OUTLINE_MARGIN = 0.32
 
 _SPRING_LENGTH = 1.6
 """Length of a spring from the body to the foundation, in units of the drawing."""
-
-_TURN_STYLE: Look = {"color": COLORS[1], "zorder": 3.7}
 
 _STEEP_SPRING_SINE = np.sin(np.radians(40.0))
 """Sine of the angle to the horizontal above which a spring is drawn downward; a flatter spring is drawn sideways."""
@@ -113,12 +111,7 @@ class PlaneView(View):
         parts += [Part(circle(tuple(at), 0.06, 15), {"fc": "black", "ec": "none", "zorder": 2.8}, True) for at in ends]
         parts += _centre_mark(centre)
         for at, wheel, rotor in zip(axes, self.wheels, pose.rotors, strict=True):
-            parts += wheel.parts((float(at[0]), float(at[1])), rotor)
-            arc, head = turning_arrow((float(at[0]), float(at[1])), wheel.rim + 0.13, wheel.direction)
-            parts += [
-                Part(arc, {**_TURN_STYLE, "lw": 1.6}),
-                Part(head, {"fc": _TURN_STYLE["color"], "ec": "none", "zorder": 3.7}, True),
-            ]
+            parts += wheel.parts((float(at[0]), float(at[1])), rotor) + wheel.turning_parts((float(at[0]), float(at[1])))
         return parts
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
@@ -145,10 +138,7 @@ class PlaneView(View):
                 )
             )
         if len(self.wheels) > 1:
-            for k, (at, wheel) in enumerate(zip(self._axes, self.wheels, strict=True)):
-                x, y = self.scale * at
-                look: Look = {"fontsize": "x-small", "ha": "center", "va": "top"}
-                texts.append(Text(float(x), float(y) - wheel.rim - 0.05, str(k + 1), look))
+            texts += numbers_of(self.wheels, [(self.scale * at).tolist() for at in self._axes])
         return texts
 
     def supports(self) -> list[tuple[float, float]]:

@@ -34,10 +34,10 @@ Limits = tuple[float, float, float, float]
 def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) -> Drawn:
     """Draw a scene at rest: its masses, springs, dampers, rotor and loads, with their values and units.
 
-    Platforms are drawn above each other, numbered from the foundation upward. A rotor is drawn along its axis, a rotor with
-    tilt also from the side. Loads are spread over their circle so that each is visible. Only the loads and their circle are to
-    scale. A body in a plane is drawn to scale, with an outline about the points to which something is attached, and with its
-    springs in their directions.
+    Platforms are drawn above each other, numbered from the foundation upward, with all their exciters. A rotor is drawn along
+    its axis, a rotor with tilt also from the side. Loads are spread over their circle so that each is visible. Only the loads
+    and their circle are to scale. A body in a plane is drawn to scale, with an outline about the points to which something is
+    attached, and with its springs in their directions.
 
     **Arguments**
 
@@ -47,8 +47,8 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
 
     **Returns** a matplotlib figure, or the given `ax`.
 
-    **Raises** `InputError` for an argument that is not a scene, a scene with traced values (within `jit` or `grad`), or a
-    `deck` on a machine without points (x, y).
+    **Raises** `InputError` for an argument that is not a scene, a scene with traced values (within `jit` or `grad`), a
+    rotor with several exciters, or a `deck` on a machine without points (x, y).
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxvib.draw.machine.parts import Part, Text, box, circle, ground
 from jaxvib.draw.style import COLORS, GUIDE, Look
-from jaxvib.errors import InputError
-from jaxvib.machine.scene import Scene
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.show.plane import PlaneView
 from jaxvib.show.view import BODY, FOUNDATION, RotorView, View, spring_and_damper, spring_text
-from jaxvib.show.wheel import Pose, places_of, value_text
+from jaxvib.show.wheel import Pose, Wheel, numbers_of, places_of, track_radius, value_text
 
 
 class Connection(NamedTuple):
     """Link between two platforms, or support of a platform.
 
     **Attributes**: `low` and `high`: numbers of the platforms at its ends, counted from the bottom, 0 for the foundation;
-    `stiffness` N/m and `damping` N s/m. The exciter is represented by a connection from its platform to the same platform,
+    `stiffness` N/m and `damping` N s/m. An exciter is represented by a connection from its platform to the same platform,
     without stiffness and damping.
     """
 
@@ -31,7 +32,7 @@ class Connection(NamedTuple):
 
     @property
     def is_exciter(self) -> bool:
-        """True if the connection represents the exciter."""
+        """True if the connection represents an exciter."""
         return self.low == self.high
 
 
@@ -73,32 +74,37 @@ def order_of_connections(connections: list[Connection], levels: int) -> list[int
         best, order = lowest_cost, swapped
 
 
-class PlatformView(RotorView):
-    """Platforms above each other, numbered from the foundation upward, with each spring in a separate lane."""
+class PlatformView(View):
+    """Platforms above each other, numbered from the foundation upward, with each spring and each exciter in a separate lane."""
 
     pitch, thick, lane = 1.9, 0.34, 2.0
 
     def __init__(self, scene: Scene):
-        super().__init__(scene, 0.6)
+        super().__init__(scene)
         n = self.mass.shape[0]
         self.rows = [np.asarray(scene.machine.rows_at(level))[0] for level in range(1, n + 1)]
-        self.exciter_level = int(np.argmax(self.rows @ np.asarray(self.mount.rows[0])[0])) + 1
-        self.connections = [
+        self.wheels, self.scale = _wheels_to_scale(scene.exciters, 0.6)
+        springs = [
             Connection(0, i + 1, float(self.foundation_stiffness[0, i]), float(self.foundation_damping[0, i])) for i in range(n)
         ]
-        self.connections += [
+        springs += [
             Connection(i + 1, j + 1, float(-self.stiffness[i, j]), float(-self.damping[i, j]))
             for j in range(n)
             for i in range(j)
         ]
-        self.connections = [each for each in self.connections if each.stiffness > 0.0 or each.damping > 0.0]
-        self.connections.append(Connection(self.exciter_level, self.exciter_level))
+        springs = [each for each in springs if each.stiffness > 0.0 or each.damping > 0.0]
+        levels = [
+            int(np.argmax(self.rows @ np.asarray(scene.machine.mount(exciter.place).rows[0])[0])) + 1
+            for exciter in scene.exciters
+        ]
+        self.connections = springs + [Connection(level, level) for level in levels]
+        wheel_of = dict(enumerate(self.wheels, len(springs)))
         order = order_of_connections(self.connections, n)
-        widths = [2.0 * self.wheel.rim + 0.2 if self.connections[k].is_exciter else self.lane for k in order]
+        widths = [2.0 * wheel_of[k].rim + 0.2 if k in wheel_of else self.lane for k in order]
         starts = np.concatenate([[0.0], np.cumsum(widths)])
-        self.x = {
-            k: float(starts[p] + (0.5 * widths[p] if self.connections[k].is_exciter else 0.45)) for p, k in enumerate(order)
-        }
+        self.x = {k: float(starts[p] + (0.5 * widths[p] if k in wheel_of else 0.45)) for p, k in enumerate(order)}
+        # For each exciter: its horizontal position, the number of its platform and its rotor.
+        self.exciters = [(self.x[k], self.connections[k].low, wheel) for k, wheel in wheel_of.items()]
         self.spans = []
         for level in range(1, n + 1):
             places = [p for p, k in enumerate(order) if level in (self.connections[k].low, self.connections[k].high)]
@@ -110,7 +116,7 @@ class PlatformView(RotorView):
         return level * self.pitch + (reach * float(self.rows[level - 1] @ pose.displacement) if level else 0.0)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
-        """Return the foundation, the springs and dampers, the platforms, the exciter."""
+        """Return the foundation, the springs and dampers, the platforms, the exciters."""
         parts = [Part(ground((-0.2, 0.0), (self.width, 0.0)), FOUNDATION)]
         for k, each in enumerate(self.connections):
             if not each.is_exciter:
@@ -122,12 +128,13 @@ class PlatformView(RotorView):
         for level, (left, right) in enumerate(self.spans, start=1):
             y = self._height(level, pose, reach)
             parts.append(Part(box(left, right, y - 0.5 * self.thick, y + 0.5 * self.thick), BODY, True))
-        return parts + self.wheel.parts(
-            (self.x[len(self.connections) - 1], self._height(self.exciter_level, pose, reach)), pose.rotors[0]
-        )
+        for (x, level, wheel), rotor in zip(self.exciters, pose.rotors, strict=True):
+            centre = (x, self._height(level, pose, reach))
+            parts += wheel.parts(centre, rotor) + (wheel.turning_parts(centre) if len(self.exciters) > 1 else [])
+        return parts
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
-        """Return the masses on the platforms and the values beside the springs."""
+        """Return the masses on the platforms, the values beside the springs, and the numbers of several exciters."""
         texts = []
         for k, each in enumerate(self.connections):
             if not each.is_exciter:
@@ -135,15 +142,16 @@ class PlatformView(RotorView):
                 place = (self.x[k] + 0.42, middle)
                 texts.append(Text(*place, spring_text(each.stiffness, each.damping), {"va": "center", "fontsize": "small"}))
         for level, (left, right) in enumerate(self.spans, start=1):
-            # The text is on the longer piece of the platform beside the exciter.
-            x = self.x[len(self.connections) - 1]
-            edges = (
-                [(left, x - self.wheel.rim), (x + self.wheel.rim, right)] if level == self.exciter_level else [(left, right)]
-            )
-            a, b = max(edges, key=lambda edge: edge[1] - edge[0])
+            # The text is on the longest piece of the platform that no exciter covers.
+            covered = sorted((x - wheel.rim, x + wheel.rim) for x, at, wheel in self.exciters if at == level)
+            lefts, rights = [left, *(high for _, high in covered)], [*(low for low, _ in covered), right]
+            a, b = max(zip(lefts, rights, strict=True), key=lambda edge: edge[1] - edge[0])
             text = f"M{level} = {value_text(float(self.mass[level - 1, level - 1]), 'kg')}"
             place = (0.5 * (a + b), self._height(level, pose, reach))
             texts.append(Text(*place, text, {"ha": "center", "va": "center", "fontsize": "small"}))
+        if len(self.exciters) > 1:
+            centres = [(x, self._height(level, pose, reach)) for x, level, _ in self.exciters]
+            texts += numbers_of(self.wheels, centres)
         return texts
 
     def supports(self) -> list[tuple[float, float]]:
@@ -154,6 +162,17 @@ class PlatformView(RotorView):
         """Return k_i y_i + b_i y_i' of each support, upward."""
         force = self.foundation_stiffness[0] * pose.displacement + self.foundation_damping[0] * pose.velocity
         return np.array([[0.0, force[each.high - 1]] for each in self.connections if each.low == 0])
+
+
+def _wheels_to_scale(exciters: Sequence[Exciter], radius: float) -> tuple[list[Wheel], float]:
+    """Return the rotors of exciters whose largest circle of loads has the given `radius`, and the common scale of the circles.
+
+    Small circles are enlarged to a third of `radius`. A rotor without loads has no size; it is drawn with `radius`.
+    """
+    tracks = [None if exciter.loads is None else track_radius(exciter.loads) for exciter in exciters]
+    largest = max((track for track in tracks if track is not None), default=0.1)
+    radii = [radius if track is None else radius * max(track / largest, 1.0 / 3.0) for track in tracks]
+    return [Wheel(exciter, each) for exciter, each in zip(exciters, radii, strict=True)], radius / largest
 
 
 class FrontView(RotorView):
@@ -333,8 +352,11 @@ def view_of(scene: Scene) -> View:
     not_drawn = machine.places == "point" and machine.mounting().axes != (0, 1)
     if not_drawn or machine.places not in views or machine.body_count > 1:
         problem = (
-            f"is {machine.kind!r}; sketches are available for machines with platforms, a shaft or one body in a plane, and for "
-            "machines that move horizontally and vertically"
+            f"is {quoted(machine.kind)}; sketches are available for machines with platforms, a shaft or one body in a plane, "
+            "and for machines that move horizontally and vertically"
         )
         raise InputError("machine.kind", problem)
+    if len(scene.exciters) > 1 and machine.places in ("shaft", "point"):
+        problem = f"has {len(scene.exciters)} exciters; on a machine of kind {quoted(machine.kind)} a drawing shows one"
+        raise InputError("scene", f"{problem}; several are drawn on platforms and on a body in a plane")
     return views[machine.places](scene)

@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.display import speed_text
-from jaxvib.draw.machine.parts import Part, circle, sector
-from jaxvib.draw.style import COLORS, GUIDE
+from jaxvib.draw.machine.parts import Part, Text, circle, sector, turning_arrow
+from jaxvib.draw.style import COLORS, GUIDE, Look
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import number_specs
 from jaxvib.machine.scene import Exciter, Scene
+
+_TURN_STYLE: Look = {"color": COLORS[1], "zorder": 3.7}
 
 
 class RotorPose(NamedTuple):
@@ -180,6 +182,12 @@ class Wheel:
         parts.append(Part(circle(centre, 0.04, 13), {"fc": "black", "ec": "none", "zorder": 3.6}, True))
         return parts
 
+    def turning_parts(self, centre: tuple[float, float]) -> list[Part]:
+        """Return an arrow above the rotor in its direction of rotation."""
+        arc, head = turning_arrow(centre, self.rim + 0.13, self.direction)
+        head_look = {"fc": _TURN_STYLE["color"], "ec": "none", "zorder": _TURN_STYLE["zorder"]}
+        return [Part(arc, {**_TURN_STYLE, "lw": 1.6}), Part(head, head_look, True)]
+
     def _load_parts(self, centre: tuple[float, float], pose: RotorPose) -> list[Part]:
         if self.loads is None:
             return []
@@ -193,3 +201,12 @@ class Wheel:
             look = {"fc": color, "ec": "black", "lw": 0.8, "zorder": 3.5 + 0.001 * j}
             found.append(Part(circle(place, self.size, 31), look, True))
         return found
+
+
+def numbers_of(wheels: Sequence[Wheel], centres: Sequence[Sequence[float]]) -> list[Text]:
+    """Return the numbers of several exciters, written below their rotors."""
+    look: Look = {"fontsize": "x-small", "ha": "center", "va": "top"}
+    return [
+        Text(float(x), float(y) - wheel.rim - 0.05, str(k), look)
+        for k, (wheel, (x, y)) in enumerate(zip(wheels, centres, strict=True), 1)
+    ]

@@ -91,7 +91,7 @@ def test_moving_parts_are_drawn_at_their_positions():
     assert lifted == {0.025}  # the platform by 0.05 upward, not across
     balls = [part.points for part in after if len(part.points) == 31]
     middle = [np.mean(points[:-1], axis=0) for points in balls]
-    np.testing.assert_allclose(middle[1] - middle[0], [-view.wheel.radius, view.wheel.radius], atol=1e-9)
+    np.testing.assert_allclose(middle[1] - middle[0], [-0.6, 0.6], atol=1e-9)
 
 
 def test_a_run_between_its_samples(run):

@@ -143,3 +143,46 @@ def test_the_rim_of_a_rotor_encloses_its_loads(ball_radius, size):
 def test_a_rotor_without_loads_has_a_radius_of_100_mm():
     wheel = Wheel(jv.Exciter(drive=jv.ConstantSpeed(100.0), unbalance=0.1), 0.35)
     assert (wheel.scale, wheel.size, wheel.rim) == pytest.approx((3.5, 0.06, 0.45))
+
+
+MOTOR = jv.DCMotor(120.0, stall_torque=8.0, inertia=0.2)
+LARGE, SMALL = (jv.balls(count=3, mass=0.8, radius=radius, drag=1.5) for radius in (0.12, 0.06))
+TWO = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0)
+
+
+def test_all_exciters_of_platforms_are_drawn():
+    """On platform 1 a rotor with balls and one with an unbalance, which turns clockwise; on platform 2 smaller balls."""
+    exciters = [
+        jv.Exciter(LARGE, MOTOR, at=1),
+        jv.Exciter(drive=MOTOR, unbalance=0.3, at=1, direction=-1),
+        jv.Exciter(SMALL, MOTOR, at=2),
+    ]
+    scene = jv.Scene(TWO, exciters=exciters)
+    view, rest = view_of(scene), at_rest(scene)
+    before, after = (view.parts(rest._replace(displacement=np.array(y)), REACH) for y in ([0.0, 0.0], [0.01, 0.02]))
+    rims = [k for k, part in enumerate(before) if part.look.get("fc") == "#f4f4f4"]
+    lifts = [np.mean(after[k].points - before[k].points, axis=0) for k in rims]
+    np.testing.assert_allclose(lifts, [[0.0, 0.2], [0.0, 0.2], [0.0, 0.4]], atol=1e-12)
+    balls = loads_of([part.points for part in before])
+    radii = [np.hypot(*(balls[3 * k] - balls[3 * k + 1])) / np.sqrt(3.0) for k in range(2)]
+    np.testing.assert_allclose(radii, [0.6, 0.3], rtol=1e-9)  # to one scale
+    assert view.scale == pytest.approx(5.0)
+    boxes = [(np.min(before[k].points, axis=0), np.max(before[k].points, axis=0)) for k in rims]
+    first, second = boxes[:2]
+    assert first[1][0] < second[0][0] or second[1][0] < first[0][0]
+    texts = {text.text: text for text in view.texts(rest, REACH)}
+    assert {"1", "2", "3", "M1 = 120 kg", "M2 = 95 kg"} <= set(texts)
+    for low, high in boxes:
+        for name in ("M1 = 120 kg", "M2 = 95 kg"):
+            assert not (low[0] < texts[name].x < high[0] and low[1] < texts[name].y < high[1])
+    heads = [part.points for part in before if part.look.get("zorder") == 3.7 and part.filled]
+    turns = [np.mean(head[:, 0]) - np.mean(before[k].points[:-1, 0]) for head, k in zip(heads, rims, strict=True)]
+    assert np.sign(turns).tolist() == [-1.0, 1.0, -1.0]  # an arrow above an anticlockwise rotor points to the left
+
+
+def test_several_exciters_of_a_rotor_are_refused_by_drawings():
+    machine = jv.planar_rotor(mass=37.0, stiffness=1e6, damping=800.0)
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=MOTOR, unbalance=0.01), jv.Exciter(SMALL, MOTOR)])
+    sentence = "scene has 2 exciters; on a machine of kind 'planar_rotor' a drawing shows one"
+    with pytest.raises(jv.InputError, match=sentence):
+        jv.sketch(scene)
