@@ -19,7 +19,7 @@ from jaxvib.boundary import is_whole
 from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.compat import traced
 from jaxvib.runtime.devices import numpy_of
-from jaxvib.units.reading import Number, Numbers, number_words, to_float
+from jaxvib.units.reading import ADDED, Number, Numbers, number_words, to_float
 
 
 class Bounds(NamedTuple):
@@ -126,7 +126,8 @@ def known_number(value: Number, unit: str, field: str, *, low: float = -math.inf
 
 def _number(value: Number, unit: str, field: str, bounds: Bounds) -> Array | np.ndarray:
     if isinstance(value, (list, tuple)):
-        raise InputError(field, f"is a list of {len(value)} values; one {number_words(unit)} is needed")
+        problem = f"is a list of {len(value)} values; one {number_words(unit)} is needed"
+        raise InputError(field, problem + _hint_of_parts(unit))
     return _converted(to_float(value, unit, field), unit, field, (), bounds)
 
 
@@ -154,14 +155,14 @@ def numbers(
     bounds = Bounds(low, open_low, high, open_high)
     if isinstance(value, Sequence) and not isinstance(value, (str, bytes, bytearray)):
         if len(value) > (_MAX_NUMBERS if length is None else length):
-            needed = f"{length} are needed" if length is not None else f"at most {_MAX_NUMBERS} are allowed"
+            needed = _needed(length, unit) if length is not None else f"at most {_MAX_NUMBERS} are allowed"
             raise InputError(field, f"has {len(value)} values; {needed}")
         for i, part in enumerate(value):
             if isinstance(part, (list, tuple)) or getattr(part, "ndim", 0) != 0:
                 raise InputError(f"{field}[{i}]", f"is not a single number; write a {number_words(unit)}")
         parts = [to_float(v, unit, f"{field}[{i}]") for i, v in enumerate(value)]
         if length is not None and len(parts) != length:
-            raise InputError(field, f"has {len(parts)} values; {length} are needed")
+            raise InputError(field, f"has {len(parts)} values; {_needed(length, unit)}")
         if not parts:
             raise InputError(field, "is an empty list; at least 1 value is needed")
         if not all(isinstance(part, jax.Array) for part in parts):
@@ -182,6 +183,16 @@ def numbers(
     if np.ndim(magnitude) != 1 or (length is not None and np.shape(magnitude)[0] != length):
         raise InputError(field, f"has shape {np.shape(magnitude)}; {'a list' if length is None else f'({length},)'} is needed")
     return _array(magnitude, unit, field, np.shape(magnitude), bounds)
+
+
+def _needed(length: int, unit: str) -> str:
+    """Return the end of a message about a list of another length."""
+    return f"{length} are needed" if length != 1 else f"1 is needed{_hint_of_parts(unit)}"
+
+
+def _hint_of_parts(unit: str) -> str:
+    """Return the notation of equal parts side by side, for a list where one number is needed, if their values are added."""
+    return f"; equal parts side by side are written as '2 x 100 {unit}'" if unit in ADDED else ""
 
 
 def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], bounds: Bounds) -> Array:

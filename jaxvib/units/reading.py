@@ -40,7 +40,7 @@ SEVERAL = r"\d{1,4}\s*[x×*]\s*"
 
 _SEVERAL = re.compile(rf"({SEVERAL})(\S.*)")
 
-_ADDED = ("N/m", "N s/m", "kg", "kg m")
+ADDED = ("N/m", "N s/m", "kg", "kg m")
 """Units of values that add if equal parts are side by side."""
 
 _COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*(?:[^\W\d_%°][^,;()]*)?")
@@ -140,7 +140,7 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         except ValueError:
             pass
         text = value.strip()
-        several = _SEVERAL.fullmatch(text) if unit in _ADDED and len(text) < 100 else None
+        several = _SEVERAL.fullmatch(text) if unit in ADDED and len(text) < 100 else None
         if several is not None and _SEVERAL.fullmatch(several[2]) is None:
             return int(several[1].rstrip("x×* \t")) * to_float(several[2], unit, field)
         parts = _TEXT.fullmatch(text) if len(text) < 100 else None

@@ -38,7 +38,16 @@ WRONG = {
     "no exciter": (lambda: machine(exciter=0), "machine.exciter is 0; it must be a whole number, at least 1"),
     "one mass, two values": (
         lambda: jv.one_mass(mass=[1.0, 2.0], stiffness=1.0, damping=1.0),
-        "machine.mass has 2 values; 1 are needed",
+        "machine.mass has 2 values; 1 is needed; equal parts side by side are written as '2 x 100 kg'",
+    ),
+    "two springs of a rotor without tilt": (
+        lambda: jv.planar_rotor(mass=37.0, stiffness=["150 N/mm", "180 N/mm"], damping=800.0),
+        "machine.stiffness is a list of 2 values; for the horizontal and the vertical direction write stiffness = '150 N/mm', "
+        "stiffness_up = '180 N/mm'; two equal supports: '2 x 150 N/mm'",
+    ),
+    "two dampers of a rotor without tilt": (
+        lambda: jv.planar_rotor(mass=37.0, stiffness=1e5, damping=("5 %", "6 %")),
+        "machine.damping is a list of 2 values; for the horizontal and the vertical direction write damping = '5 %'",
     ),
     "no platform": (lambda: jv.network(mass=[], stiffness=[], damping=[], exciter=1), "machine.mass is an empty list"),
     "a link to nowhere": (

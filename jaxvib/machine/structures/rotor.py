@@ -304,6 +304,10 @@ def _require_possible_inertia(transverse: float, polar: float) -> None:
         raise InputError("machine.polar_inertia", f"is {polar:g} kg m^2; {most}")
 
 
+_UNITS = {"stiffness": "N/mm", "damping": "N s/m"}
+"""Units of the values of a support in messages."""
+
+
 class PlanarRotor(Machine):
     """Rotor on one support, moving without tilt in the two directions across its axis: horizontal and vertical if the axis is
     horizontal.
@@ -379,6 +383,7 @@ def planar_rotor(
 
     Source: the special case of Artyunin 2013, equation (1), see `PlanarRotor`.
     """
+    _require_one_value(stiffness=stiffness, damping=damping)
     read = partial(read_numbers, PlanarRotor, "machine")
     found = read(mass=mass, stiffness=stiffness)
     k = found["stiffness"]
@@ -389,3 +394,12 @@ def planar_rotor(
         vertical = damping_constants(damping_up, "machine.damping_up", k if up is None else up, lambda: found["mass"])
         resisting = read(damping_up=vertical)["damping_up"]
     return PlanarRotor(**found, stiffness_up=up, damping_up=resisting, kind="planar_rotor")
+
+
+def _require_one_value(**values: Number) -> None:
+    """**Raises** `InputError` for a list of 2 values, with the notation of two directions and of two supports."""
+    for name, value in values.items():
+        if isinstance(value, (list, tuple)) and len(value) == 2:
+            across, up = map(quoted, value)
+            problem = f"is a list of 2 values; for the horizontal and the vertical direction write {name} = {across}"
+            raise InputError(f"machine.{name}", f"{problem}, {name}_up = {up}; two equal supports: '2 x 150 {_UNITS[name]}'")
