@@ -28,6 +28,14 @@ def test_an_own_folder_is_used_and_closed_to_others(tmp_path):
     assert (tmp_path / "new" / "programs").stat().st_mode & 0o077 == 0
 
 
+def test_a_chosen_folder_is_kept_if_only_an_unset_one_is_set(tmp_path):
+    assert jv.use_cache(tmp_path / "first", only_if_unset=True) == tmp_path / "first"
+    assert jv.use_cache(tmp_path / "second", only_if_unset=True) == tmp_path / "first"
+    assert cache.program_folder() == tmp_path / "first" / "programs" and not (tmp_path / "second").exists()
+    assert jv.use_cache(tmp_path / "third") == tmp_path / "third"
+    assert cache.program_folder() == tmp_path / "third" / "programs"
+
+
 @pytest.mark.parametrize("mode", [0o775, 0o757, 0o1777])
 @pytest.mark.parametrize("part", [".", "programs"])
 def test_a_folder_others_can_write_to_is_refused(tmp_path, mode, part):
