@@ -201,7 +201,7 @@ NUMBERS = (
         _last_stable,
         within=5e-5,
         differs=9.292e-4,
-        reason="c2 = 0; the pendulums separate already at a friction that is 7 % lower",
+        reason="c2 = 0; above this friction, which is 7 % below the printed one, the pendulums separate",
     ),
     _number(
         "section IV",
@@ -265,7 +265,7 @@ NUMBERS = (
         lambda: min(_ended("balanced")),
         within=5e-4,
         differs=1.75e-2,
-        reason=f"lowest of the computed values ({', '.join(f'{mu:g}' for mu in _TRIED)}); {_READING}",
+        reason=f"computed at {', '.join(f'{mu:g}' for mu in _TRIED)}; below 0.0175 they do not balance the rotor; {_READING}",
     ),
     _friction_number(
         "friction above which the pendulums do not balance the rotor",
