@@ -142,6 +142,6 @@ def _seconds(value: float) -> str:
 
 
 def _operations_table(rows: list[OperationCount]) -> str:
-    cells = [[f"{row.part}: {row.kind}", f"{row.operations}", f"{row.added:+d}", row.beside] for row in rows]
+    cells = [[f"{row.part}: {row.kind}", f"{row.operations}", f"{row.added:+d}", row.reference] for row in rows]
     title = "operations of the traced equations of motion; an operation on a vector counts once"
     return table(title, ["part", "operations", "added", "compared with"], cells)

@@ -25,23 +25,23 @@ class OperationCount(NamedTuple):
     """Number of operations in the equations of motion of a scene with a given part.
 
     **Attributes**: `part` ("effect", "drive", "machine", "loads") and its `kind`; `operations`: number of operations with the
-    part; `added`: increase over the reference scene; `beside`: machine, loads and drive of the reference scene as text.
+    part; `added`: increase over the reference scene; `reference`: machine, loads and drive of the reference scene as text.
     """
 
     part: str
     kind: str
     operations: int
     added: int
-    beside: str
+    reference: str
 
 
 def operation_counts() -> list[OperationCount]:
     """Count the operations that each effect, drive, machine and kind of loads adds to the equations of motion.
 
-    The reference scene is a platform with one ball and a constant rotor speed. Kinds of loads are compared with a planar rotor
-    with one ball at a constant speed. A rotor with loads at stations has two balls, and its count includes the second ball.
-    An effect that the platform with a ball cannot have is counted with other loads, or on a rotor with tilt, see `beside`. The
-    counts do not depend on the values of the parameters.
+    The reference scene is a platform with one ball and a constant rotor speed; for kinds of loads, it is a planar rotor with
+    one ball and a constant rotor speed. A rotor with loads at stations has two balls, and its count includes the second ball.
+    If the platform with a ball cannot have an effect, the reference scene of this effect has other loads, or is a rotor with
+    tilt. The attribute `reference` names the reference scene. The counts do not depend on the values of the parameters.
 
     **Returns** a list of `OperationCount`.
 
@@ -73,10 +73,10 @@ def operation_counts() -> list[OperationCount]:
     loads = {kind: _build_with_halves(build) for kind, build in LOADS.items()}
     constant = ConstantSpeed(1.0)
 
-    def row(part: str, kind: str, scene: Scene, beside: Scene) -> OperationCount:
-        operations_with, operations_beside = field_operations(scene), field_operations(beside)
-        name = f"{beside.machine.kind}, {beside.loads.kind}, {beside.drive.kind}"
-        return OperationCount(part, kind, operations_with, operations_with - operations_beside, name)
+    def row(part: str, kind: str, scene: Scene, reference: Scene) -> OperationCount:
+        operations = field_operations(scene)
+        name = f"{reference.machine.kind}, {reference.loads.kind}, {reference.drive.kind}"
+        return OperationCount(part, kind, operations, operations - field_operations(reference), name)
 
     platform, planar = (Scene(machines[kind], loads["ball"], constant) for kind in ("one_mass", "planar_rotor"))
     counts = [
@@ -107,7 +107,7 @@ def operation_counts() -> list[OperationCount]:
 def _build_with_halves(build: Callable[..., T]) -> T:
     """Build an effect, loads or a drive whose required parameters are 0.5, or a special value if 0.5 is not allowed.
 
-    Balls and rollers have a radius, because some effects require it.
+    Balls and rollers also have a `ball_radius`, because some effects require it.
     """
     special_values = {
         "motor": DCMotor(1.0, 1.0, 1.0),
