@@ -157,7 +157,7 @@ def _find(problem: Problem, options: Options, report: Progress) -> SearchResult 
         drawn = existing = len(begin)
     else:
         starts = draw_starts(problem, options.starts, options.seed, find_speeds)
-        point = starts.point if starts.point is not None else starts.nearest
+        point = starts.point if starts.point is not None else starts.off_held
         drawn, existing = starts.drawn, starts.existing
     if point is None or len(point.z) == 0:
         return None

@@ -30,7 +30,8 @@ from optimize.search.model import (
 from optimize.search.problem import Point, Problem, evaluate
 
 FEASIBILITY_TOLERANCE = 1e-8
-"""Largest violation of held quantities and demands of a final design, relative to their values."""
+"""Violation below which a search treats held quantities and demands as met, relative to held values and limits. A
+final design counts as feasible up to ten times this violation."""
 
 _UNREACHABLE_DECREASE = 1e-10
 """Predicted relative decrease of the objective that counts as zero if no step achieves it. Rounding errors of the derivatives
@@ -44,7 +45,8 @@ _KINK_STEPS = 4
 """Number of first-order steps that move a design back onto a kink."""
 
 ACTIVE_DISTANCE = 1e-6
-"""Largest distance of a demand or a free parameter from its limit, relative to the limit, at which it counts as active."""
+"""Largest distance at which a limit counts as active: of a demand from its limit, relative to the limit, or of a free parameter
+from a bound, relative to the range between its bounds."""
 
 _MAX_PENALTY = 1e9
 """Largest penalty of a violated constraint, in units of the objective. A constraint that is still violated at this penalty
@@ -118,7 +120,9 @@ def restore(
 
 
 def _least_change(z: np.ndarray, slopes: np.ndarray, values: np.ndarray, max_change: float = np.inf) -> np.ndarray:
-    """Return the nearest designs to z (s, d), within the bounds, at which the linearized `values` (s, m) vanish.
+    """Return the nearest designs to z (s, d) at which the linearized `values` (s, m) vanish.
+
+    The bounds and `max_change` then limit the change. If they reduce it, the values do not vanish.
 
     **Arguments**: `slopes` (s, m, d): derivatives of the values; `max_change`: largest change of each entry of z.
     """
@@ -135,13 +139,14 @@ class Starts(NamedTuple):
 
     - `point`: all initial designs, or None
     - `drawn`: number of random designs; `existing`: number of those for which the objective exists
-    - `nearest`: random designs that could not be changed to the held values, at most the requested number, or None
+    - `off_held`: random designs, before the change to the held values, that do not reach these values; at most the requested
+      number of starts, or None
     """
 
     point: Point | None
     drawn: int
     existing: int
-    nearest: Point | None
+    off_held: Point | None
 
 
 def draw_starts(
@@ -154,7 +159,8 @@ def draw_starts(
     """Draw random designs within the bounds, and change them until the held quantities have their values.
 
     Further designs are drawn in place of those that are not usable: the objective does not exist, or the held values are not
-    reached in six steps. The search for usable designs ends after `rounds` times `starts` designs.
+    reached in six steps. The search for usable designs ends after `rounds` times `starts` designs. `speeds_of` returns
+    the load speeds near which the jams and folds in the quantities are searched for, see `find_speeds`.
     """
     random = np.random.default_rng(seed)
     on_held: list[Point] = []
@@ -255,7 +261,7 @@ class _Searches:
 
 def _begin(problem: Problem, point: Point) -> _Searches:
     """Return the searches at their starts, which are first changed to meet the constraints."""
-    if problem.parts > 1:  # the descent does not compute the pieces of the objective
+    if problem.parts > 1:  # `descend`, which may precede this search, does not compute the pieces of the objective
         point = evaluate(problem, point.z, point.speeds)
     size = np.maximum(np.abs(point.values[:, 0]), 1e-9 * np.max(np.abs(point.slopes[:, 0]), axis=1))
     size = np.where(size > 0.0, size, 1.0)
@@ -281,8 +287,10 @@ def _begin(problem: Problem, point: Point) -> _Searches:
 
 
 def _build_models(problem: Problem, searches: _Searches, index: np.ndarray, here: Point) -> tuple[list[Step], np.ndarray]:
-    """Return steps of the searches `index` from `here`, one entry for each of the one or two sets of second derivatives, and
-    True for searches whose penalty was too small.
+    """Return the proposed steps of the searches `index` from `here`, and True for searches whose penalty was too small.
+
+    The list of steps has one entry for each set of second derivatives that `curvatures` returns (one or two). Each entry
+    contains the steps of all these searches.
 
     Updates the second derivatives, the penalties and the remaining decreases.
     """

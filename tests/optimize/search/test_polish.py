@@ -131,7 +131,7 @@ def test_starts_are_random_designs_with_an_objective():
     drawn = np.concatenate([random.uniform(size=(8, 2)) for _ in range(found.drawn // 8)])
     there = drawn[drawn[:, 0] > 0.5]
     np.testing.assert_array_equal(found.point.z, there[:8])
-    assert found.existing == len(there) >= 8 > np.sum(drawn[:-8, 0] > 0.5) and found.nearest is None
+    assert found.existing == len(there) >= 8 > np.sum(drawn[:-8, 0] > 0.5) and found.off_held is None
     nowhere = problem_of(DesignSpace(SCENE, FREE), plain("no", lambda x, y: x * jnp.nan), [], starts=4)
     assert draw_starts(nowhere, 4, 0, find_speeds, rounds=2) == (None, 8, 0, None)
 
@@ -150,7 +150,7 @@ def test_starts_are_moved_to_the_held_values():
     far = problem_of(DesignSpace(SCENE, FREE, [hold(product, 500.0)]), NEAR, [], starts=8)
     none = draw_starts(far, 8, 0, find_speeds, rounds=2)
     assert none.point is None and none.drawn == none.existing == 16
-    np.testing.assert_array_equal(none.nearest.z, np.random.default_rng(0).uniform(size=(8, 2)))
+    np.testing.assert_array_equal(none.off_held.z, np.random.default_rng(0).uniform(size=(8, 2)))
 
 
 def test_polishing_reports_its_residual_and_ends_early(held):
