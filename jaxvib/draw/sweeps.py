@@ -85,7 +85,11 @@ def label_map(
 def _to_edges(
     across: np.ndarray, along: np.ndarray, centres: np.ndarray, edges: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a line whose ends at the first and the last of the `centres` of cells are extended to the `edges` of the map.
+    """Return a line on a map of cells, extended to the edges of the map.
+
+    **Arguments**: coordinates of the points of the line: `along` one axis of the map, and `across` it; on the first axis, the
+    `centres` of the cells and the two `edges` of the map. An end of the line at the first or the last centre is extended with
+    the slope of the line to the edge beside it.
 
     >>> _to_edges(np.array([3.0, 4.0]), np.array([1.0, 2.0]), np.array([1.0, 2.0]), (0.5, 2.5))
     (array([2.5, 3. , 4. , 4.5]), array([0.5, 1. , 2. , 2.5]))
@@ -100,8 +104,9 @@ def _to_edges(
 
 
 def _cells_path(corners: np.ndarray, chosen: np.ndarray) -> Path:
-    """Return one path of the chosen cells (m, n) of a map with the corners (m + 1, n + 1, 2); a hatch of many separate cells
-    takes seconds.
+    """Return one path of all chosen cells (m, n) of a map with the corners (m + 1, n + 1, 2).
+
+    To hatch many cells takes seconds if each has its own path.
 
     >>> corners = np.stack(np.meshgrid([0.0, 1.0, 2.0], [0.0, 1.0]), axis=-1)
     >>> _cells_path(corners, np.array([[False, True]])).vertices.tolist()
@@ -230,8 +235,8 @@ def tornado_chart(
 ) -> Drawn:
     """Draw bars from `middle` to `low` (n,) and from `middle` to `high` (n,), the largest difference at the top.
 
-    Each pair of bars belongs to a parameter in `names`. `low` is the mean of a quantity over the cases in the lowest fifth of
-    the values of the parameter, `high` over those in the highest fifth.
+    Each pair of bars belongs to a parameter in `names`. `middle` is the mean of a quantity over all cases. `low` is its mean
+    over the cases in the lowest fifth of the values of the parameter, `high` over those in the highest fifth.
 
     >>> import numpy as np
     >>> figure = tornado_chart(["a", "b"], np.array([1.0, 0.0]), np.array([3.0, 9.0]), 2.0, x_label="force, N")
@@ -249,7 +254,7 @@ def tornado_chart(
     axis.set_xlabel(x_label)
     axis.grid(False, axis="y")
     entries = [
-        Patch(color=COLORS[0], label="lowest fifth of its values"),
+        Patch(color=COLORS[0], label="lowest fifth of the parameter's values"),
         Patch(facecolor=COLORS[1], hatch="///", edgecolor="white", label="highest fifth"),
     ]
     legend_above(axis, 2, handles=entries)

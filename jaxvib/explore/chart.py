@@ -102,7 +102,11 @@ def _panels(result: Branches, scale: float, rotor_speed: np.ndarray) -> list[tup
 def _jams_at_working_speed(
     panel: Panel, curves: Sequence[np.ndarray], crossed: Sequence[tuple[int, float, str, bool]], at: float
 ) -> tuple[list[Part], list[Text]]:
-    """Return the dots at which the curves cross the working speed `at`, and the numbers of the jams beside the highest."""
+    """Return the dots at which the curves cross the working speed, and the number of each jam beside the highest of its dots.
+
+    **Arguments**: `curves`: values along the branch; `crossed`: the jams at the working speed, see `crossings`; `at`: the
+    working speed, rpm.
+    """
     dots, numbers = [], []
     for i, share, name, filled in crossed:
         heights = [panel.at(at, float(np.interp(share, [0, 1], values[i : i + 2])))[1] for values in curves]

@@ -66,7 +66,7 @@ DRIVES: dict[str, Callable[..., Drive]] = {
 SECTIONS: Mapping[str, Mapping[str, Callable[..., Any]]] = {"machine": MACHINES, "loads": LOADS, "drive": DRIVES}
 """Parts by section and `kind`; each constructor takes the fields of the part's table in a scene file.
 
-A class in a user's file gets an entry by a line of this file such as `DRIVES["turbine"] = Turbine`.
+A class in a user's file gets an entry by a line in that file, such as `DRIVES["turbine"] = Turbine`.
 """
 
 _ENTRIES: Mapping[str, Callable[..., Any]] = {"supports": support, "bodies": body}
@@ -234,8 +234,8 @@ def scene_from_toml(text: str) -> Scene:
     **Arguments**: `text` in TOML
 
     - the tables `[machine]`, `[loads]` and `[drive]` have a `kind` and that kind's arguments, in SI or as text with a unit
-    - for several exciters, a table `[[exciters]]` for each, with its `[exciters.loads]` and `[exciters.drive]`, in place of
-      `[loads]` and `[drive]`
+    - for several exciters, or for one with an unbalance in place of loads, a table `[[exciters]]` for each, with its
+      `[exciters.loads]` and `[exciters.drive]`, in place of `[loads]` and `[drive]`
     - the table `[effects]` contains the effects of the scene, each as `gravity = true` or as a table of its arguments
 
     **Returns** `Scene`.
@@ -274,7 +274,7 @@ def scene_from_tables(tables: Tables) -> Scene:
     parts = {}
     for name in ("machine",) if several else SECTIONS:
         if name not in tables:
-            instead = ", or [[exciters]] with an unbalance if it has no loads" if name == "loads" else ""
+            instead = ", or [[exciters]] with an unbalance if the scene has no loads" if name == "loads" else ""
             kinds = f" with kind, one of {', '.join(SECTIONS[name])}; `jaxvib new` prints examples" if name == "machine" else ""
             raise InputError(name, f"is missing; a scene file needs the table [{name}]{instead}{kinds}")
         parts[name] = build_kind(tables[name], name, SECTIONS[name])
@@ -322,7 +322,10 @@ def _build_effects(chosen: object) -> tuple[Effect, ...]:
 
 
 def build_kind(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -> T:
-    """Return the part of a table with its `kind`, one of `kinds`. **Raises** `InputError` for an unknown or missing name."""
+    """Return the part that a table describes. Its field `kind` is one of `kinds`, the other fields are arguments.
+
+    **Raises** `InputError` for an unknown or missing field.
+    """
     if not isinstance(table, Mapping):
         raise InputError(section, f"is {quoted(table)}; it must be a table; write [{section}]")
     if "kind" not in table:

@@ -26,7 +26,7 @@ from jaxvib.errors import InputError
 def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
     """Compute the run-up of the motors of SCENE from rest by averaged equations, and list the resonances that catch exciters.
 
-    --out adds the figure. For loads (balls, pendulums) and several drags use `run-up-map`."""
+    --out adds the figure. For scenes with loads (balls, pendulums) use `run-up-map`."""
     found = jv.run_up(loaded_scene(scene, without), until, least=least)
     output.picture("run_up.png", found.plot)
     output.csv(csv, found.run, "trajectory_time")

@@ -79,7 +79,7 @@ def record(recording: Path, pulses: str | None, per_turn: int, speed: str | None
         lines = [table(str(recording), heads, rows)]
         if vibrations := _vibration_rows(overviews):
             heads = ["channel", "RMS without mean", "main frequency, Hz", "velocity from 10 to 1000 Hz, mm/s RMS"]
-            lines.append(table("vibration, if the speed is constant", heads, vibrations))
+            lines.append(table("vibration; valid for a constant speed only", heads, vibrations))
         if rows_of_speed:
             lines.append(table("rotor speed", ["time, s", "speed"], rows_of_speed))
         return "\n".join([*lines, *notes])

@@ -30,7 +30,7 @@ class _Support(Effect):
         **Raises** `InputError` for a place that the machine does not have.
         """
         if machine.places in ("plane", "number"):
-            problem = f"acts under a platform or around a rotor's axis, not on {quoted(machine.kind)}; leave it out"
+            problem = f"acts on a platform or around a rotor's axis, not on {quoted(machine.kind)}; leave it out"
             raise InputError(f"effects.{self.kind}", problem)
         if self.position is None:
             return machine.rows_at(self.platform, f"effects.{self.kind}.platform")
@@ -54,7 +54,7 @@ class CubicSupport(_Support):
 
     - `stiffness` k3, N/m^3, negative for a softening support; typical: 1e7 to 1e10. It stiffens a support k by 1 % at the
       amplitude a if (3/4) k3 a^2 = 0.01 k: 3e7 for 5e4 N/m and 5 mm
-    - `platform` above the support, numbered from 1 (default: 1)
+    - `platform` on which the support acts, numbered from 1 (default: 1)
     - `position` along a rotor's axis, m from the rotor's centre of mass, in place of the platform; typical: -0.5 to 0.5;
       default: the station of the loads, or the centre of mass if each load has a separate station
 
@@ -77,9 +77,10 @@ class CubicSupport(_Support):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """Return a support that, averaged over an oscillation of the amplitude a, is 1 % stiffer: (3/4) k3 a^2 = 0.01 k.
+        """Return a cubic support whose stiffness, averaged over an oscillation of the amplitude a, is 1 % of the linear one k.
 
-        It is at the supported platform with the largest motion, or around the rotor's axis.
+        Its coefficient follows from (3/4) k3 a^2 = 0.01 k. The support is at the supported platform with the largest motion, or
+        around the rotor's axis.
         """
         carrier = machine.carrier()
         length = jnp.asarray([unit == "m" for unit in carrier.units])
@@ -105,7 +106,7 @@ class CubicSupport(_Support):
 class Stop(_Support):
     """Stop beyond a gap: force k (x - gap) + c x' on the foundation while it presses; it never pulls.
 
-    Under a platform it acts on the chosen sides; around a rotor's axis it is a ring of radius `gap`.
+    A stop of a platform is above the platform, below it, or on both sides; around a rotor's axis it is a ring of radius `gap`.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -114,7 +115,7 @@ class Stop(_Support):
     - `gap`, m, at least 0; typical: 0.001 to 0.02
     - `damping` c, N s/m, at least 0 (the default); typical: 0 to 5000. With damping, second derivatives of runs are wrong after
       a contact, see `simulate`
-    - `side`: "above", "below" or "both" (the default); platforms only
+    - `side` of the platform: "above", "below" or "both" (the default); around a rotor's axis only "both"
     - `platform` or `position`: as for `CubicSupport`; typical: platform 1
 
     **Raises** `InputError` for values that are not allowed. A scene raises it for a place that the machine does not have.
@@ -151,7 +152,8 @@ class Stop(_Support):
     def penetration(self, displacement: Array, side: Side | None = None) -> tuple[Array, Array]:
         """Return the penetration beyond the gap, m (negative without contact), and its direction (k,).
 
-        **Arguments**: `displacement` (k,), m; `side` of the stop (default: that on which the displacement is).
+        **Arguments**: `displacement` (k,), m; `side` of a platform (default: the `side` of the stop). For the side "both" the
+        displacement is compared with the gap on the side to which it points.
         """
         if displacement.shape[0] == 1:
             x = displacement[0]
@@ -182,9 +184,9 @@ class Stop(_Support):
         return 0.5 * self.stiffness * jnp.maximum(penetration, 0.0) ** 2
 
     def resistance(self, displacement: Array, velocity: Array) -> Array:
-        """Return c x' while the stop presses, (k,) N, at the `displacement` (m) and the `velocity` (m/s).
+        """Return the force of the damper, (k,) N, at the `displacement` (m) and the `velocity` (m/s).
 
-        A stop never pulls.
+        It is c x' during contact, but at least minus the force of the spring, because a stop never pulls.
         """
         penetration, direction = self.penetration(displacement)
         closing = self.damping * jnp.sum(direction * velocity)

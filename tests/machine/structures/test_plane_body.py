@@ -247,7 +247,7 @@ def test_numbers_of_supports_and_places_have_names():
         (lambda: jv.Scene(SCREEN, exciters=[jv.Exciter(drive=DRIVES[0], unbalance=1.0, at=(1, 2, 3))]), "at has 3 values; 2"),
         (lambda: jv.Exciter(drive=DRIVES[0], unbalance=1.0, at=range(10**9)), "at is range"),
         (lambda: jv.Exciter(drive=DRIVES[0], unbalance=1.0, direction=np.zeros(2)), "direction is array"),
-        (lambda: scene_of(1, effects=(jv.Stop(1e5, gap=0.01),)), "effects.stop acts under a platform"),
+        (lambda: scene_of(1, effects=(jv.Stop(1e5, gap=0.01),)), "effects.stop acts on a platform"),
         (
             lambda: jv.jam_modes(jv.Scene(SCREEN, jv.balls(count=1, mass=0.1, radius=0.1, drag=1.0), DRIVES[2])),
             "rotates with the housing",
