@@ -204,6 +204,26 @@ class Carrier(Readable):
         """
         return self.coordinate_units or ("m",) * len(self.coordinates)
 
+    def as_lengths(self, values: Array) -> Array:
+        """Return values (..., nd) of the coordinates as lengths, m, so that translations and rotations can be compared.
+
+        A rotation is multiplied by the length at which its energy is that of a translation, the square root of the mean moment
+        of inertia divided by the mean mass (of the diagonal of M). The values are returned unchanged if all coordinates have
+        the same unit.
+
+        >>> import jax.numpy as jnp, jaxvib as jv
+        >>> springs = [jv.support(at=(x, 0.0), stiffness=(1e4, 1e4), damping=(10.0, 10.0)) for x in (-1.0, 1.0)]
+        >>> machine = jv.plane_body(mass=100.0, inertia=25.0, supports=springs)
+        >>> machine.carrier().as_lengths(jnp.asarray([1e-3, 2e-3, 4e-3])).tolist()  # 0.5 m is sqrt(25/100) m
+        [0.001, 0.002, 0.002]
+        """
+        is_rotation = np.array(self.units) == "rad"
+        if np.all(is_rotation) or not np.any(is_rotation):
+            return values
+        shares = [np.diag(kind / np.sum(kind)).astype(self.mass.dtype) for kind in (is_rotation, ~is_rotation)]
+        inertia, mass = (jnp.sum(self.mass * share) for share in shares)
+        return jnp.where(is_rotation, jnp.sqrt(inertia / mass) * values, values)
+
     @property
     def foundation_directions(self) -> tuple[str, ...]:
         """Names of the directions of the force on the foundation: "up", or "across" and "up"."""

@@ -210,7 +210,8 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
                 return final, True
         if plan.mean_stretches is not None:
             force = float(np.nan_to_num(run.foundation_force))  # 0 if it is unknown
-            measured.append([drifts[-1], float(run.omega), force, *np.asarray(run.amplitude).tolist()])
+            lengths = plan.first.scene.machine.carrier().as_lengths(run.amplitude)
+            measured.append([drifts[-1], float(run.omega), force, *np.asarray(lengths).tolist()])
             if len(measured) >= plan.mean_stretches and _steady_in_the_mean(np.array(measured[-plan.mean_stretches :])):
                 return _with_final_status(run, "beating"), True
             is_plain = plan.first.scene.is_plain
@@ -264,8 +265,8 @@ def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -
 def _steady_in_the_mean(measured: np.ndarray) -> bool:
     """Return True if measured values scatter about constant means.
 
-    **Arguments**: `measured` (4 n, 3 + nd): for each stretch the drift, the load speed, the force and the amplitudes. Changes
-    below half the drift are ignored.
+    **Arguments**: `measured` (4 n, 3 + nd): for each stretch the drift, the load speed, the force and the amplitudes as lengths
+    (`Carrier.as_lengths`). Changes below half the drift are ignored.
     """
     drift, values = measured[:, 0], measured[:, 1:]
     place = np.arange(len(measured)) - (len(measured) - 1) / 2.0

@@ -54,6 +54,13 @@ def scene(machine="two_mass", load="balls", speed=120.0, effects=()):
     return jv.Scene(machines()[machine], loads()[load], jv.ConstantSpeed(speed), effects)
 
 
+def turning_body(size=1.0):
+    """A body whose motion in units of `size` does not depend on the size; sqrt(inertia / mass) is 0.3 size."""
+    springs = [jv.support(at=(x * size, 0.0), stiffness=(4e4, 6e4), damping=(60.0, 80.0)) for x in (-0.5, 0.4)]
+    machine = jv.plane_body(mass=100.0, inertia=9.0 * size**2, supports=springs)
+    return jv.Scene(machine, jv.balls(count=1, mass=0.4, radius=0.1 * size, drag=1.0), jv.ConstantSpeed(60.0))
+
+
 def published(speed=3.0, eps=1e-3, damping=0.01, count=1, form="antiphase", **more):
     """The machine of the antiphase paper, equation (40); `damping` of all, or of both supports with `link_damping`."""
     pair = np.broadcast_to(damping, 2).tolist()

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import published, scene
+from scenes import published, scene, turning_body
 from small_machine import small_machine, small_run, small_start
 
 import jaxvib as jv
@@ -204,6 +204,14 @@ def test_at_least_32_stretches_are_judged(monkeypatch, periods, stretches):
     monkeypatch.setattr("jaxvib.motion.settle._steady_in_the_mean", lambda rows: seen.append(rows.shape) or len(seen) > 1)
     found = jv.settle(small_machine(), start=small_start(), periods=periods)
     assert found.status_name == "beating" and seen == [(stretches, 5)] * 2
+
+
+def test_rotations_are_compared_as_lengths(monkeypatch):
+    run, seen = jv.simulate(turning_body(), 1.0, estimate=False, save="window"), []
+    monkeypatch.setattr("jaxvib.motion.settle.run_planned", lambda *_, **__: run)
+    monkeypatch.setattr("jaxvib.motion.settle._steady_in_the_mean", lambda rows: seen.append(rows[0, 3:]) or True)
+    jv.settle(turning_body(), start="rest")
+    np.testing.assert_allclose(seen[0], run.amplitude * np.array([1.0, 1.0, 0.3]), rtol=1e-12)
 
 
 @pytest.mark.parametrize("periods", [100, 30])

@@ -84,8 +84,8 @@ class AbstractMeasured(Readable):
     The three changes are
 
     - the change of an amplitude from the first to the second half of the window, relative to the largest amplitude, or to 1e-4
-      of the unbalance radius S/M if that is larger (the amplitude of a balanced rotor is almost zero). In this comparison the
-      amplitude of a tilt, 1 rad, counts as 1 m
+      of the unbalance radius S/M if that is larger (the amplitude of a balanced rotor is almost zero). For this comparison the
+      amplitude of a tilt or rotation is multiplied by the length sqrt(mean moment of inertia / mean mass) of the machine
     - the change of the foundation force from the first to the second half, relative to the largest force, or to 1e-4 of S n^2
       (n: rotor speed) if that is larger
     - the difference between the mean speeds of a load in the second half and in the whole window, relative to `omega`
@@ -195,7 +195,8 @@ def measure(model: Model, field: Field, times: Array, states: State, unit: State
 
     speeds, late_speeds = mean_speeds(times, *turning_angles(model.scene, lambda: times, states), (0, half))
     change = jnp.abs(late - early)
-    drift = jnp.max(change[:nd]) / jnp.maximum(jnp.max(whole[:nd]), MIN_CHANGE_SCALE * unit.displacement)
+    amplitude_change, largest = (jnp.max(model.carrier.as_lengths(x[:nd])) for x in (change, whole))
+    drift = amplitude_change / jnp.maximum(largest, MIN_CHANGE_SCALE * unit.displacement)
     force_drift = jnp.max(change[nd:]) / jnp.maximum(jnp.max(whole[nd:]), MIN_CHANGE_SCALE * model.natural_force(unit))
     directions = turning_directions(model.scene)
     omega = jnp.mean(speeds if np.all(directions == 1) else directions * speeds)

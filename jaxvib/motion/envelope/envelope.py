@@ -410,7 +410,8 @@ def _measure(model: Model, window: Envelopes) -> Measured:
     speeds, late = jnp.mean(window.load_speed, axis=0), jnp.mean(window.load_speed[half:], axis=0)
     change = jnp.abs(jnp.max(window.amplitude[half:], axis=0) - jnp.max(window.amplitude[:half], axis=0))
     unit, omega = natural_units(model.scene), jnp.mean(_anticlockwise(model.scene, speeds))
-    drift = jnp.max(change) / jnp.maximum(jnp.max(amplitude), MIN_CHANGE_SCALE * unit.displacement)
+    amplitude_change, largest = (jnp.max(model.carrier.as_lengths(x)) for x in (change, amplitude))
+    drift = amplitude_change / jnp.maximum(largest, MIN_CHANGE_SCALE * unit.displacement)
     force_change = jnp.abs(jnp.max(window.foundation_force[half:], axis=0) - jnp.max(window.foundation_force[:half], axis=0))
     force_drift = jnp.max(force_change) / jnp.maximum(jnp.max(force), MIN_CHANGE_SCALE * model.natural_force(unit))
     force_drift = jnp.nan_to_num(force_drift)  # of an unknown force

@@ -237,8 +237,9 @@ def _values_of_run(scene: Scene, run: Run, fold: float) -> MotionValues:
     largest_displacement = max(a for a, unit in zip(amplitude, scene.machine.structure().units, strict=True) if unit == "m")
     unit = float(natural_units(scene).displacement)
     magnified = max(1.0, MIN_AMPLITUDE_SHARE * unit / largest_displacement) if largest_displacement > 0.0 else 1.0
-    # The drift of a run is relative to a scale with another lower limit, `measure.MIN_CHANGE_SCALE`.
-    drift *= max(largest_displacement, measure.MIN_CHANGE_SCALE * unit) / max(largest_displacement, MIN_AMPLITUDE_SHARE * unit)
+    # The drift of a run is relative to another scale, which includes rotations and has the lower limit `MIN_CHANGE_SCALE`.
+    largest_length = float(np.max(np.asarray(scene.machine.carrier().as_lengths(run.amplitude))))
+    drift *= max(largest_length, measure.MIN_CHANGE_SCALE * unit) / max(largest_displacement, MIN_AMPLITUDE_SHARE * unit)
     return MotionValues(
         kind,
         float(run.omega),

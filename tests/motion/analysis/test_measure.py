@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scenes import scene
+from scenes import scene, turning_body
 from scipy.optimize import brentq
 from small_machine import small_run
 
@@ -117,6 +117,15 @@ def test_drift_of_the_loads_speed_is_relative():
     # Speeds grow evenly: their mean over the second half is that at 15 s, over all of it that at 10 s, but for part of a turn.
     np.testing.assert_allclose(measured.drift, 0.0025 / 1.005, rtol=0.02)
     assert not bool(measured.settled)
+
+
+def test_drift_does_not_depend_on_the_size_of_a_body():
+    """A machine ten times as large has ten times the displacements and the same rotations."""
+    small, large = (
+        jv.simulate(turning_body(size), 2.0, start="spin_up", estimate=False, save="window") for size in (0.1, 10.0)
+    )
+    np.testing.assert_allclose(small.amplitude * np.array([100.0, 100.0, 1.0]), large.amplitude, rtol=1e-6)
+    np.testing.assert_allclose(small.drift, large.drift, rtol=1e-6)
 
 
 def test_a_mean_speed_is_that_over_whole_turns():

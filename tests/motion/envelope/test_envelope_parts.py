@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from scenes import turning_body
 
 import jaxvib as jv
 from jaxvib.equations.averaged import Amplitudes, averaged_model
@@ -505,3 +506,8 @@ def test_run_up_of_a_prescribed_speed_is_refused():
         jv.run_up(ideal, 5.0)
     with pytest.raises(jv.InputError, match=r"^until is 0 s; it must be greater than 0"):
         jv.run_up(mixed(), 0.0)
+
+
+def test_drift_of_an_envelope_does_not_depend_on_the_size():
+    small, large = (jv.envelope(turning_body(size), 2.0) for size in (0.1, 10.0))
+    np.testing.assert_allclose(small.drift, large.drift, rtol=0.01)
