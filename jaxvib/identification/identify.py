@@ -43,10 +43,12 @@ from jaxvib.study.bearing.swing import BearingPendulum
 from jaxvib.units import Number
 
 _REFITS_NEAR_FIRST_VALUES = 2
-"""Number of fits in which undetermined combinations of numbers are moved back towards their first values."""
+"""Largest number of repeated fits that begin with undetermined combinations of parameters moved back towards their first
+values."""
 
 _SAME_NOISE = 1.01
-"""Noise of a channel in such a fit, relative to the fit before, above which the fit has ended at another, worse minimum."""
+"""Noise of a channel in such a repeated fit, relative to the fit before it, above which the repeated fit has ended at another,
+worse minimum."""
 
 _STEP = 1e-4
 """Relative change of a parameter in a difference quotient."""
@@ -57,7 +59,7 @@ class MachineFit(Result):
 
     Returned by `identify`.
 
-    **Attributes** (k parameters of the scene, m damped modes, g gains)
+    **Attributes** (k parameters of the scene, m modes that oscillate, g gains)
 
     - `status`: a `FitStatus`
     - `notes`: sentences with repairs, doubts and advice
@@ -70,7 +72,8 @@ class MachineFit(Result):
       about the angle of the first unbalance
     - `undetermined`: a `Direction` for each combination of parameters that the records do not determine
     - `by_gain`: a `Direction` for each combination that only the known gains of the sensors determine
-    - `frequency` (m,), rad/s, and `damping_ratio` (m,): natural frequencies and damping ratios of the damped modes
+    - `frequency` (m,), rad/s, and `damping_ratio` (m,): natural frequencies and damping ratios of the modes that
+      oscillate (damping ratio below 1)
     - `gain_names` (g,) and `gains` (g,) of the channels
     - `phase`, rad: direction of the unbalance of each exciter at the rotor angle 0, anticlockwise from the horizontal
     - `first_states`, SI: of each run with loads on its rotor, the coordinates of the machine, their velocities, the angles of
@@ -227,11 +230,12 @@ def identify(
     Source: this package; for pendulums Artyunin, Sumenkov 2019.
     """
     if isinstance(subject, BearingPendulum):
-        if unknown or known:
-            raise InputError("unknown", "is for a Scene; the unknowns of a BearingPendulum are fixed, see dry")
+        for name in (name for name, value in {"unknown": unknown, "known": known}.items() if value):
+            problem = "is for a Scene; the unknowns of a BearingPendulum are selected by dry, air and torque"
+            raise InputError(name, problem)
         if not isinstance(records, Record):
             raise InputError(
-                "record", f"is {type(records).__name__}; it must be a Record(time, angle) or come from read_record"
+                "records", f"is {type(records).__name__}; it must be a Record(time, angle) or come from read_record"
             )
         return identify_bearing(subject, records, dry=dry, air=air, torque=torque, instrument=instrument, throw=throw)
     of_pendulum = {"dry": dry, "air": air, "torque": torque, "instrument": instrument}
@@ -244,7 +248,8 @@ def identify(
     problem = build_problem(scene, runs, unknown, known or {})
     free, readings = unknown_count(problem), sum(int(np.count_nonzero(mask)) for mask in problem.masks)
     if free >= readings:
-        raise InputError("unknown", f"has {free} unknowns with those of the runs, for {readings} readings; record longer runs")
+        problem = f"has {free} unknowns, including first states and offsets of the runs, for {readings} readings"
+        raise InputError("unknown", f"{problem}; record longer runs")
     if problem.has_loads:
         problem, first = with_first_motion(problem)
         starts = [first]
@@ -357,7 +362,7 @@ def fitted_scene(problem: Problem, x: np.ndarray, linear: np.ndarray) -> Scene:
 
 
 def _estimate(value: float, scale: float, logarithmic: bool, spread: float, determined: bool) -> Estimate:
-    """Return an estimate from the standard error of its coordinate."""
+    """Return an estimate from the standard error `spread` of its logarithm if `logarithmic`, otherwise in units of `scale`."""
     value, error = float(value), float(scale * spread)
     if not determined:
         return Estimate(value, math.inf, 0.0 if logarithmic else -math.inf, math.inf)

@@ -268,6 +268,20 @@ def test_wrong_arguments_end_in_one_sentence(arguments, words):
         jv.identify(start(), run_of(), **arguments)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({}, r"^records is MeasuredRun; it must be a Record"),
+        ({"unknown": NAMES}, r"^unknown is for a Scene; .* dry, air and torque$"),
+        ({"known": {"machine.mass[0]": "95 kg"}}, r"^known is for a Scene; .* dry, air and torque$"),
+    ],
+)
+def test_arguments_of_a_scene_are_refused_for_a_pendulum(arguments, words):
+    rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625)
+    with pytest.raises(jv.InputError, match=words):
+        jv.identify(rod, run_of(), **arguments)
+
+
 def test_loads_that_are_not_jammed_are_refused():
     scene = jv.Scene(start().machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
     with pytest.raises(jv.InputError, match="has no vibration of jammed loads"):
