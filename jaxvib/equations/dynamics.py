@@ -55,7 +55,8 @@ class Dynamics(eqx.Module):
     """Equations of a scene for time integration. Everything that does not change with time is computed once.
 
     The accelerations of the carrier are those without exciters plus those due to the forces of the exciters. P contains, one
-    below the other, the nP rows of all mounts on which loads or an unbalanced rotor act.
+    below the other, nP rows: those of all mounts on which loads or an unbalanced rotor act, and those of the rotations of the
+    housings on which drives act.
 
     - `stiffness_per_mass` M^-1 K, `damping_per_mass` M^-1 C, `gyroscopic_per_mass` M^-1 G (or None), (nd, nd)
     - `input_matrix` M^-1 P^T (nd, nP): acceleration per force on the rows
@@ -244,6 +245,9 @@ def vector_field(scene: Scene) -> Dynamics:
         M q'' + (C + speed G) q' + K q + sum_j m_j B_j^T (B_j q'' + d^2 p_j/dt^2) = forces of the effects
         kappa_j m_j J_j^T J_j u_j'' + kappa_j m_j J_j^T (dJ_j/dt) u_j' + m_j J_j^T B_j q'' = Q_u,      J_j = dp_j/du_j
         I theta'' = T(theta') - torque of loads and imbalance        (under a motor; I: moment of inertia of the rotor)
+
+    Load j has the mass m_j, the inertia factor kappa_j (7/5 for balls), the coordinates u_j, such as its angle, the position
+    p_j(u_j) relative to the point that carries it, and the generalized forces Q_u; B_j q is the displacement of this point.
 
     **Arguments**: `scene`, on any machine, with any drive and effects.
 

@@ -66,7 +66,7 @@ def outcome(
 
 
 def entry(batch: Result, kind: type[SomeResult], index: int) -> SomeResult:
-    """Return the entry `index` of a batch of results, as a result of a `kind` that has part of its fields."""
+    """Return the entry `index` of a batch of results, as a result of a `kind` with some of the fields of the batch."""
     fields = {name: getattr(batch, name) for name in kind.__dataclass_fields__}
     return _entry(kind(**fields), np.asarray(index, np.uint32))
 
@@ -83,7 +83,10 @@ def unknown_is_positive(number: Array | None) -> Array | None:
 
 
 def without_numbers(allowed: Array, tree: Tree) -> Tree:
-    """Return a tree with NaN and False in place of its numbers if `allowed` is False; a scene in the tree is unchanged."""
+    """Return a tree with NaN in place of floating-point numbers, and False in place of Booleans, if `allowed` is False.
+
+    Integers, and a scene in the tree, are unchanged.
+    """
 
     def replace(value: object) -> object:
         if not isinstance(value, Array):

@@ -92,7 +92,10 @@ def _draw_torques(
     names: Sequence[str],
     scale: float,
 ) -> None:
-    """Draw the torque of each drive, that which the vibration needs, and the regimes; equal curves are one line."""
+    """Draw the torque of each motor, the torque that the vibration needs from it, and the regimes.
+
+    Equal curves are one line. An ideal drive has points of regimes but no curves.
+    """
     top = float(np.nanmax(curves.driving))
     for k, w in enumerate(resonances[(resonances > 0.0) & (resonances < curves.speed[-1])]):
         axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "resonance")

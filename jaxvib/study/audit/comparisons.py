@@ -51,7 +51,8 @@ class MotionValues(NamedTuple):
     - `omega` of the loads, rad/s; `amplitude` of each coordinate, m (rad for tilts); `foundation_force` N
     - `fold`: the rotor speed (rad/s) at which the jam ends, NaN if there is none or if it was not computed
     - `uncertainty`: relative uncertainty of these values
-    - `closest`: smallest distance of two loads in units of their diameter, not finite for points and for coincident loads
+    - `closest`: smallest distance of two loads of a run in units of their diameter, infinite for loads without a size; NaN for
+      an exact orbit, for which it is not computed
     - `magnified`: relative changes of amplitudes and force refer to these values times this factor. It is above 1 if the
       machine is almost at rest, see `MIN_AMPLITUDE_SHARE`
     """
@@ -117,7 +118,7 @@ class JamComparison(NamedTuple):
         return with_spin(scene, State(displacement, velocity, (angle + spread,), rate))
 
     def full(self, scene: Scene) -> MotionValues:
-        """Return the values of the full equations, integrated from near the exact jam until they have settled."""
+        """Return the values of a run with the full equations that starts near the exact jam and ends when it has settled."""
         run = settle(scene, start=self.state(scene), throw=False)
         return _values_of_run(scene, run, fold_speed(without_excluded_effects(scene), float(run.omega)))
 
@@ -134,8 +135,9 @@ class RunComparison(NamedTuple):
     def state(self, scene: Scene) -> State:
         """Return the initial state of `scene`, completed by `with_spin`."""
         if isinstance(self.start, State):
-            with contextlib.suppress(InputError):  # the state is of a scene with another effect
+            with contextlib.suppress(InputError):
                 return with_spin(scene, self.start)
+            # The effects of this scene do not allow the spin in the state, which is of the other scene: replace the spin.
             start = self.start
             return with_spin(scene, State(start.displacement, start.velocity, start.angle, start.rate, start.rotor))
         if self.start == "turning":
