@@ -1,6 +1,11 @@
 """Floquet multipliers of periodic jams.
 
 Sizes of arrays: P orbits, G bodies of loads (1 if all loads are equal), nd coordinates, K harmonics, m angles.
+
+Symbols: theta is the angle of the mean rotation of the loads, with the speed Omega; phi is the angle of a body, e(phi) its
+point on the unit circle in the directions of the mount, and t = de/dphi. M, C, K and G are the matrices of the machine with its
+loads. S, I and T are the unbalance, the moment of inertia and the torque of a body. B maps the coordinates to the displacement
+of the mount.
 """
 
 from __future__ import annotations
@@ -22,15 +27,15 @@ from jaxvib.ode.dopri8 import NODES, ROWS
 from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution
 
 _PHASE_PER_STEP = 0.7
-"""Phase of the carrier's fastest motion in an explicit step, rad. With order 8 the error of the multipliers is then 1e-12 for
-loads as fast as the carrier, and 1e-10 for loads three times as fast as the carrier."""
+"""Phase of the carrier's fastest oscillation in an explicit step, rad. With order 8 the error of the multipliers is then 1e-12
+if the load speed Omega is equal to the frequency of this oscillation, and 1e-10 if it is three times as high."""
 
 _GROWTH_ERROR = 5e-8
 """Twice the relative growth of an undamped oscillation in an explicit step of the phase 1 rad; it is proportional to the 10th
 power of the phase."""
 
 _ROUNDING_ERRORS = 1e3
-"""Smallest error of multipliers, in units of rounding."""
+"""Lower bound of the error of multipliers that is reported, in multiples of the machine epsilon."""
 
 _STIFF_DECAY_RATIO = 3.0
 """Ratio of decay rate and fastest oscillation above which the implicit method is used. Explicit steps would have to resolve
@@ -62,10 +67,10 @@ class Floquet(NamedTuple):
 
 
 def decay_error(needed: int | Array, steps: int | Array, turn: float, *, implicit: bool) -> Array:
-    """Return a bound of the relative growth or decay of an undamped oscillation of the carrier in a turn of the grid.
+    """Return a bound of the relative growth or decay of an undamped oscillation of the carrier over the span of the grid.
 
     **Arguments**: the `needed` number of integration steps, see `steps_for`, from which the phase of the fastest oscillation
-    follows; the number of `steps` that are taken; the angle `turn`, rad.
+    follows; the number of `steps` that are taken; the span as an angle `turn`, rad.
     """
     phase = ((radau.PHASE if implicit else _PHASE_PER_STEP) * needed - 2.0 * turn) / jnp.asarray(steps)
     return radau.decay_error(phase, steps) if implicit else _GROWTH_ERROR * phase**10 * steps
@@ -101,6 +106,8 @@ def _drag_rate(model: JammedBodies, omega: Array, speed: Array) -> Array:
     The motion of the carrier reduces the inertia of a body of loads. The rate is
 
         max_g(-T_rate / I)_g / (1 - mu sum_g S_g^2 / I_g),      mu the largest eigenvalue of B M^-1 B^T
+
+    T_rate is the derivative of the torque on a body with respect to its speed.
     """
     linear, mount = model.linear, model.linear.mount
     still = jnp.zeros((len(mount.axes), 1), linear.mass.dtype)
@@ -123,7 +130,7 @@ def is_stiff(model: JammedBodies, omega: Array, speed: Array) -> Array:
 
 
 def steps_for(model: JammedBodies, omega: Array, speed: Array, *, implicit: bool) -> Array:
-    """Return the number of integration steps in a turn of the grid at load speeds `omega` and the rotor's `speed`, rad/s.
+    """Return the number of integration steps over the span of the grid at load speeds `omega` and the rotor's `speed`, rad/s.
 
     An `implicit` method is stable at any rate of decay; its steps follow the oscillation only.
     """
@@ -138,7 +145,7 @@ class _Coefficients(NamedTuple):
 
     **Attributes** (s: share of each body in the total unbalance)
 
-    - `moving` s e', its derivatives `moving1` and `moving2` with respect to theta, and `coupling`, s e' minus the part of dry
+    - `moving` s t, its derivatives `moving1` and `moving2` with respect to theta, and `coupling`, s t minus the part of dry
       friction, (directions, G, P)
     - `by_angle`, `by_rate` (G, P): derivatives of the torque, divided by I Omega^2
     """
@@ -234,21 +241,21 @@ class _Disturbances(NamedTuple):
         return acceleration if self.gyroscopic is None else acceleration + self.n * _times(self.gyroscopic, q1) / self.w
 
     def whole_motion(self, c: _Coefficients, x: Array, x1: Array) -> Array:
-        """Return second derivatives of carrier and bodies; x contains their displacements, those of the carrier first."""
+        """Return second derivatives of carrier and bodies, from x and x1: Q and d of `floquet`, and their first derivatives."""
         nd = self.stiffness.shape[0]
-        (q, d), (q1, d1) = ((part[:nd], part[nd:]) for part in (x, x1))
+        (shifted, d), (shifted1, d1) = ((part[:nd], part[nd:]) for part in (x, x1))
         t, t1, t2 = (v[:, :, None, :] for v in (c.moving, c.moving1, c.moving2))
-        below = q - _times(self.shift, jnp.sum(t * d[None], axis=1))
-        below1 = q1 - _times(self.shift, jnp.sum(t * d1[None] + t1 * d[None], axis=1))
-        q2 = -self.damped(below1) - _times(self.stiffness, below) / self.w**2
-        driven = _times(self.port, q2) - _times(self.accelerance, jnp.sum(2.0 * t1 * d1[None] + t2 * d[None], axis=1))
+        q = shifted - _times(self.shift, jnp.sum(t * d[None], axis=1))
+        q1 = shifted1 - _times(self.shift, jnp.sum(t * d1[None] + t1 * d[None], axis=1))
+        shifted2 = -self.damped(q1) - _times(self.stiffness, q) / self.w**2
+        driven = _times(self.port, shifted2) - _times(self.accelerance, jnp.sum(2.0 * t1 * d1[None] + t2 * d[None], axis=1))
         torque = c.by_rate[:, None] * d1 + c.by_angle[:, None] * d
         # Acceleration of the mount including the motion of the bodies: one equation for each direction.
         responses = self.lever * c.coupling[:, :, None]
         weight = jnp.sum(t[:, None] * responses[None], axis=2)
         factor = _times(self.accelerance, weight)
         acceleration = _small_solve(factor, driven - _times(self.accelerance, jnp.sum(t * torque[None], axis=1)))
-        return jnp.concatenate([q2, torque - jnp.sum(responses * acceleration[:, None], axis=0)])
+        return jnp.concatenate([shifted2, torque - jnp.sum(responses * acceleration[:, None], axis=0)])
 
     @staticmethod
     def relative_motion(c: _Coefficients, x: Array, x1: Array) -> Array:
@@ -283,16 +290,16 @@ def floquet(
 ) -> Floquet:
     """Compute Floquet multipliers of the full state about periodic motions by one integration of all linear equations.
 
-    With Q = q + M^-1 B^T sum_g S_g t_g d_g, t = e'(phi), d_g the disturbance of a body of loads and ' = d/dtheta:
+    q is the disturbance of the coordinates, and d_g that of the angle of a body of loads. With ' = d/dtheta and
+    Q = q + M^-1 B^T sum_g S_g t_g d_g:
 
         Q'' = - M^-1 (C + n G)/Omega q' - M^-1 K/Omega^2 q
         I_g Omega^2 d_g'' = T_rate Omega d_g' + (T_phi + S_g e.a) d_g - Omega^2 (S_g t_g - T_a).B q''
 
-    S_g is the unbalance of body g, I_g its moment of inertia, and B maps the coordinates to the displacement of the mount. T is
-    the torque on the body; T_phi, T_rate and T_a are its derivatives with respect to angle, speed and a. With dry friction it
-    also depends on the acceleration of the mount, a = Omega^2 B q''. Loads of one body that separate (sum d_j = 0) leave the
-    carrier at rest: they obey the second equation without its last term. Loads that lie side by side are pressed together and
-    do not separate.
+    T_phi, T_rate and T_a are the derivatives of T with respect to the angle and the speed of the body, and to the acceleration
+    a of the mount, on which T depends if there is dry friction. phi, e, t, a and these derivatives are those of the periodic
+    motion; the disturbance of a is Omega^2 B q''. Loads of one body that separate (sum d_j = 0) leave the carrier at rest: they
+    obey the second equation without its last term. Loads that lie side by side are pressed together and do not separate.
 
     All orbits are integrated with equal steps of the same length by Dormand and Prince's method of order 8 or, if `implicit`,
     by `radau.transition`, which resolves any drag of the loads and any damping of the carrier.
@@ -332,7 +339,8 @@ def _explicit_transition(
     steps: int | Array,
     max_steps: int | None,
 ) -> tuple[Array, ...]:
-    """Return transition matrices (2 n, 2 n, P) over a turn of the grid, one for each field, by explicit steps of length `h`."""
+    """Return transition matrices (2 n, 2 n, P) over the span of the grid, one for each field, by explicit steps of length
+    `h`."""
     dtype = equations.omega.dtype
 
     def step(at: _Coefficients, state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -421,7 +429,7 @@ def _units(size: int, equations: _Disturbances) -> Array:
 
 
 def _wave(orders: np.ndarray, theta: Array) -> Array:
-    """Return exp(i k theta) at angles theta (n,): (1, n, K)."""
+    """Return exp(i k theta) at angles theta (m,): (1, m, K)."""
     return jnp.exp(1j * np.asarray(orders, theta.dtype)[None, None] * theta[None, :, None])
 
 
@@ -431,9 +439,10 @@ def _derivatives(orders: np.ndarray, number: int, like: Array) -> Array:
 
 
 def _signals(harmonics: Array, waves: Array) -> Array:
-    """Return Re sum_k c_k exp(i k theta) and derivatives, (number, m, n, P), from c (m, K, P) and waves (number, n, K)."""
+    """Return Re sum_k c_k exp(i k theta) and derivatives, (number, s, m, P), of s signals, from c (s, K, P) and waves
+    (number, m, K)."""
     parts = jnp.concatenate([harmonics.real, harmonics.imag], -2)
-    return jnp.einsum("dnk,mkp->dmnp", jnp.concatenate([waves.real, -waves.imag], -1), parts)
+    return jnp.einsum("dmk,skp->dsmp", jnp.concatenate([waves.real, -waves.imag], -1), parts)
 
 
 def _times(matrix: Array, vectors: Array) -> Array:
