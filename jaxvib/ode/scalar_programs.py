@@ -40,14 +40,14 @@ def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
     done: dict[tuple[object, ...], JaxprEqn] = {}
     kept: list[tuple[JaxprEqn, list[Var | Literal]]] = []
 
-    def known(atoms: Sequence[Var | Literal]) -> list[Var | Literal]:
+    def replaced(atoms: Sequence[Var | Literal]) -> list[Var | Literal]:
         return [first.get(atom, atom) if isinstance(atom, Var) else atom for atom in atoms]
 
     def name(atom: Var | Literal) -> str:
         return f"{np.asarray(atom.val).tobytes()!r} {atom.aval}" if isinstance(atom, Literal) else str(id(atom))
 
     for equation in program.jaxpr.eqns:
-        inputs = known(equation.invars)
+        inputs = replaced(equation.invars)
         names = [name(atom) for atom in inputs]
         if equation.primitive in _commutative():
             names.sort()
@@ -59,7 +59,7 @@ def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
         else:
             done[key] = equation
             kept.append((equation, inputs))
-    results = known(program.jaxpr.outvars)
+    results = replaced(program.jaxpr.outvars)
     read = {atom for atom in results if isinstance(atom, Var)}
     live = []
     for equation, inputs in reversed(kept):
@@ -70,7 +70,7 @@ def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 def fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
-    """Return the results of a program on scalars whose values the compiler cannot recompute for each use.
+    """Return the results of a program on scalars, computed so that the compiler cannot repeat the computation of shared values.
 
     Every value with several uses and more than a few operations is fenced, see `jaxvib.numerics.fence`. Without fences, the
     compiler computes shared values again for each use. In derivatives of equations, shared values contain other shared values:
@@ -106,7 +106,7 @@ def _evaluate_equation(equation: JaxprEqn, values: list[Array]) -> Sequence[Arra
     if inner is None:
         found = equation.primitive.bind(*values, **equation.params)
         return found if equation.primitive.multiple_results else [found]
-    # This is the only operation with a custom derivative in these programs.
+    # Sine and cosine are the only operation with a custom derivative (`call_jaxpr`) in these programs.
     return unfenced_sine_and_cosine(*values) if "call_jaxpr" in equation.params else jaxpr_as_fun(inner)(*values)
 
 
@@ -140,16 +140,16 @@ def substituted(program: ClosedJaxpr, chosen: Callable[[JaxprEqn, Atoms], Instea
     instead: dict[int, Var] = {}
     equations: list[tuple[JaxprEqn, Atoms]] = []
 
-    def known(atoms: Sequence[Var | Literal]) -> Atoms:
+    def replaced(atoms: Sequence[Var | Literal]) -> Atoms:
         return [instead.get(id(atom), atom) for atom in atoms]
 
     for equation in program.jaxpr.eqns:
-        inputs = known(equation.invars)
+        inputs = replaced(equation.invars)
         found = chosen(equation, inputs)
         equations += [(equation, inputs)] if found is None else found[0]
         if found is not None:
             instead[id(equation.outvars[0])] = found[1]
-    return rewritten(program, equations, known(program.jaxpr.outvars))
+    return rewritten(program, equations, replaced(program.jaxpr.outvars))
 
 
 def with_reciprocals(program: ClosedJaxpr, changing: int) -> ClosedJaxpr:

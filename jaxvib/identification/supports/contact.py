@@ -32,8 +32,9 @@ _MAX_TRIALS, _ACCURACY = 60, 1e-13
 """Largest number of trials for the time of a switch, and its error relative to the length of the step."""
 
 _NEAR_TURN = 0.2
-"""A side may approach its stop and move away again within one step. If it stops short of the stop by less than this fraction
-of its approach (in a parabola through the rates at both ends of the step), a short contact is possible."""
+"""The machine may approach a side of a stop and move away again within one step. If the remaining gap at the nearest point is
+less than this fraction of the approach (in a parabola through the rates at both ends of the step), a short contact is
+possible."""
 
 Step = Callable[[Array, Array, Array, Dynamics], Array]
 """Function of a time, a state, the length of a step, and equations of motion, that returns the state after the step."""
@@ -158,8 +159,8 @@ def switched_step(
 
 
 def _turning(start: tuple[Array, Array], last: Array, presses: Array, h: Array) -> Array:
-    """Return the time from the beginning of a step to the moment at which a free side is nearest to its stop, if a contact is
-    possible at this moment, see `_NEAR_TURN`; otherwise 0.
+    """Return the time from the beginning of a step to the moment at which the machine is nearest to a free side of a stop, if a
+    contact is possible at this moment, see `_NEAR_TURN`; otherwise 0.
 
     **Arguments**: penetrations (s,) and their rates at the `start`; the `last` rates (s,); length of the step.
     """
@@ -205,7 +206,7 @@ def _first_change(
         values, slopes = jax.jvp(wrong, (new,), (rates(t + at.length, new, at.length, dynamics),))
         which = jnp.argmax(values)
         is_late = values[which] > 0.0
-        # The end of the step is tried first, and then the moment at which a free side is nearest to its stop.
+        # The end of the step is tried first, and then the moment at which the machine is nearest to a free side of a stop.
         turn = _turning(start, penetrations(dynamics, new[:nd], new[nd : 2 * nd])[1], presses, h)
         is_turn = (at.trials == 0) & ~is_late & (turn > 0.0)
         is_found = at.is_found | is_late

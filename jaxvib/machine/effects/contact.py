@@ -28,9 +28,10 @@ class LoadContact(Effect):
     r is the loads' `ball_radius`.
 
     - On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other: load j+1 follows load j, and load 1
-      follows the last one a turn later, so there are N pairs. The angles of a start must be in this order, within one turn;
-      starts by name, such as "rest", place coincident loads side by side
-    - Only loads at one station of a rotor can touch. The attribute `tracks` contains the stations while a motion is computed
+      follows the last one a turn later, so there are as many pairs as loads. The angles of a start must be in this order,
+      within one turn; starts by name, such as "rest", place coincident loads side by side
+    - Only loads at one station of a rotor can touch. For loads at several stations `prepare` sets the attribute `tracks`, see
+      `Tracks`; otherwise it is None
     - If loads have several coordinates, as in a torus, each pair can touch, s = |p(u_i) - p(u_j)|, and no two loads may start
       nearer than 0.9 times 2 r
 
@@ -73,7 +74,8 @@ class LoadContact(Effect):
     def __init__(self, stiffness: Number, damping: Number = 0.0, restitution: Number | None = None):
         given = {"stiffness": stiffness, "damping": damping, "restitution": restitution}
         self.stiffness, self.damping, self.restitution = read_numbers(LoadContact, "effects.load_contact", **given).values()
-        # A scene with traced values is built anew for its checks; the damping was then checked before.
+        # The constructor is called again with traced values to check the bounds of an existing scene. The value of the damping
+        # is then unknown, and was examined before.
         if restitution is not None and when_known(lambda damping: damping == 0.0, self.damping) is False:
             problem = "excludes damping, which it determines; leave one of them out"
             raise InputError("effects.load_contact.restitution", problem)
