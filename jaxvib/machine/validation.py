@@ -18,7 +18,7 @@ from jaxvib.boundary import call_user
 from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.drives.drive import Motor
+from jaxvib.machine.drives.drive import Motor, SwitchedOff
 from jaxvib.machine.effects.base import static_imbalances, total_gravity
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import MAX_USUAL_SPEED, Exciter, Scene, read_unbalance, require_comparable
@@ -268,6 +268,20 @@ def start_notes(scene: Scene, exciters: Iterable[int] | None = None) -> list[str
         else:
             notes.append(f"the motor{f' of exciter {numbers[0]}' if len(scene.exciters) > 1 else ''} {reason}")
     return notes
+
+
+def off_notes(scene: Scene) -> list[str]:
+    """Return a sentence about the motors that a run switches off at some time: steady motions are those without them.
+
+    >>> import jaxvib as jv
+    >>> motor = jv.SwitchedOff(jv.DCMotor(100.0, stall_torque=2.5, inertia=0.5), at="8 s")
+    >>> off_notes(jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0),
+    ...                    exciters=[jv.Exciter(drive=motor, unbalance=0.4)]))
+    ['exciter 1 is switched off at 8 s: steady motions are those after this time; leave switched_off out for those before it']
+    """
+    times = {k: float(e.drive.at) for k, e in enumerate(scene.exciters, 1) if isinstance(e.drive, SwitchedOff)}
+    end = "steady motions are those after this time; leave switched_off out for those before it"
+    return [f"exciter {k} is switched off at {at:g} s: {end}" for k, at in times.items() if at > 0.0]
 
 
 _CARRIED = ("loads", "unbalance")

@@ -156,8 +156,8 @@ class VibrationMeasures(Readable):
       forces is unknown
     - `foundation_load` (directions,), N zero to peak: force on the foundation in each direction, across and up for a body in a
       plane or a rotor
-    - `static_deflection` (nt,), m: downward displacement of each coordinate under the weight of machine and loads, NaN and 0 as
-      in `weight_deflection`; typical: 5 to 30 mm for screens
+    - `static_deflection` (nt,), m: downward displacement of each coordinate (of x: to the left) under the weight of machine
+      and loads, NaN and 0 as in `weight_deflection`; typical: 5 to 30 mm for screens
     - `static_load` (ns,), N: weight that each support carries, negative if a support on the foundation is pulled up; NaN if the
       supports cannot carry the weight, and if the directions of the coordinates are unknown
     - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on a support.
@@ -233,19 +233,19 @@ class VibrationMeasures(Readable):
             if not float(self.stroke[k]) < _NEGLIGIBLE * float(np.max(self.stroke))
         ]
         sag, most = np.asarray(self.static_deflection), np.nanmax(np.abs(self.static_deflection), initial=0.0)
-        sagging = [k for k, each in enumerate(sag) if abs(each) > _NEGLIGIBLE * most]
-        if sagging:
-            named = ", ".join(f"{self.coordinates[k]} {quantity_text(sag[k], 'm', 4)}" for k in sagging)
-            lines.append(f"static deflection{of}, down: {named}")
-        loads = np.stack([np.asarray(each) for each in (self.static_load, self.dynamic_load, self.side_load)], axis=1)
-        for k, each in enumerate(loads):
+        sagging = [(name, each) for name, each in zip(self.coordinates, sag, strict=True) if abs(each) > _NEGLIGIBLE * most]
+        for way, across in (("down", False), ("to the left", True)):
+            named = [f"{name} {quantity_text(each, 'm', 4)}" for name, each in sagging if (name[0] == "x") == across]
+            lines += [f"static deflection{of}, {way}: {', '.join(named)}"] if named else []
+        for k, each in enumerate(zip(self.static_load, self.dynamic_load, self.side_load, strict=True)):
             named = zip(each, ("static", "dynamic", "to the sides"), strict=True)
             largest = np.max(np.abs(each), initial=0.0, where=~np.isnan(each))
-            parts = [f"{load:.4g} N {word}" for load, word in named if abs(load) > _NEGLIGIBLE * largest]
+            parts = [f"{quantity_text(load, 'N', 4)} {word}" for load, word in named if abs(load) > _NEGLIGIBLE * largest]
             lines += [f"support {k + 1}: {', '.join(parts)}"] if parts else []
         if len(self.directions) > 1 and not np.any(np.isnan(self.foundation_load)):
-            forces = zip(self.foundation_load, self.directions, strict=True)
-            lines.append(f"foundation: {', '.join(f'{float(force):.4g} N {name}' for force, name in forces)} (dynamic)")
+            loads = zip(self.foundation_load, self.directions, strict=True)
+            forces = ", ".join(f"{quantity_text(force, 'N', 4)} {name}" for force, name in loads)
+            lines.append(f"foundation: {forces} (dynamic)")
         ratio = float(self.transmissibility)
         if ratio < _LARGEST_TRANSMISSIBILITY:
             passed = f"of the exciter's {quantity_text(self.exciter_force, 'N', 4)}, {100.0 * ratio:.3g} % reach the foundation"

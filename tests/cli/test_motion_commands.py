@@ -336,6 +336,17 @@ def test_a_motor_that_cannot_start_is_named(tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
+def test_steady_motions_name_motors_that_are_switched_off(typed, tmp_path):
+    motor = jv.DCMotor(100.0, stall_torque=40.0, inertia=0.5)
+    exciter = jv.Exciter(drive=jv.SwitchedOff(motor, at="8 s", bearing=0.01), unbalance=0.4)
+    table = jv.one_mass(mass=300.0, stiffness=3e5, damping=600.0)
+    jv.save_scene(jv.Scene(table, exciters=[exciter]), tmp_path / "table.toml")
+    sentence = "exciter 1 is switched off at 8 s: steady motions are those after this time; leave switched_off out"
+    out = typed("regimes", "table.toml")[1]
+    assert out.startswith("no regime") and sentence in out and "resonances: 301.98 rpm" in out
+    assert sentence in typed("response", "table.toml", "--points", "200")[1]
+
+
 def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     springs = [jv.support(at=(x, 0.0), stiffness=(3e3, 3e3), damping=(150.0, 150.0)) for x in (-0.6, 0.6)]
     motor = jv.InductionMotor(100.0, breakdown_torque=60.0, breakdown_slip=0.1, inertia=0.05)

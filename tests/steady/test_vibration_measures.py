@@ -217,6 +217,24 @@ def test_one_mass_has_the_measures_of_the_closed_form():
         np.testing.assert_allclose(measures.transmissibility, abs(k + 1j * w * c) * y / (unbalance * w**2), rtol=1e-4)
 
 
+def test_weight_moves_a_feeder_on_inclined_springs_to_the_left():
+    """Leaf springs that let the trough move at 25 degrees: it slides by g sin(25 deg)/w^2 in this direction."""
+    m, soft, stiff, angle = 1800.0, 3e6, 8e8, np.deg2rad(25.0)
+    springs = [
+        jv.support(at=(x, 0.0), stiffness=(soft / 2.0, stiff / 2.0), damping=(0.0, 0.0), angle=angle) for x in (-0.6, 0.6)
+    ]
+    feeder = jv.Scene(jv.plane_body(mass=m, inertia=250.0, supports=springs), exciters=[EXCITER])
+    along, across = m * G * np.sin(angle) / soft, m * G * np.cos(angle) / stiff
+    x, y = along * np.cos(angle) - across * np.sin(angle), along * np.sin(angle) + across * np.cos(angle)
+    measures = of_values(feeder, force=2e4, displacement=(1e-3, 1e-3, 0.0))
+    np.testing.assert_allclose(measures.static_deflection, [x, y], rtol=1e-12)
+    text = measures.summary()
+    assert f"static deflection of the centre of mass, down: y {1e3 * y:.4g} mm\n" in text
+    assert f"static deflection of the centre of mass, to the left: x {1e3 * x:.4g} mm\n" in text
+    up = abs(measures.foundation_load[1])
+    assert f"{up / 1e3:.4g} kN up (dynamic)" in text and up > 1e4
+
+
 def test_bearings_of_a_rotor_carry_weight_and_whirl():
     machine = jv.rotor(
         mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(6e5, 5e5), damping=(400.0, 300.0),

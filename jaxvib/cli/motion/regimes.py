@@ -36,7 +36,7 @@ from jaxvib.errors import InputError
 def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], csv: Path | None, output: Output) -> None:
     """List the synchronous regimes of SCENE: motions in which all exciters turn at one speed; --out adds a figure of
     phases."""
-    from jaxvib.machine.validation import start_notes  # slow imports, which --help does not need
+    from jaxvib.machine.validation import off_notes, start_notes  # slow imports, which --help does not need
     from jaxvib.results.status import status_name
 
     loaded = loaded_scene(scene, without)
@@ -67,23 +67,25 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
     }
 
     def text() -> str:
-        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
+        from jaxvib.display import shown_unit, speed_text, speed_unit  # slow import, which --help does not need
 
         unit, scale = speed_unit()
+        resonances = f"resonances: {speed_text(frequencies)}"
         if not selected:
-            return result.summary()
-        rows = [_row(regime, scale) for regime in selected]
-        head = [unit, "", " ", "phases, degrees", "margin", "power, W", "foundation force, N"]
+            return f"{result.summary()}\n{resonances}"
+        force_unit, factor = shown_unit("N", max(float(regime.foundation_force) for regime in selected))
+        rows = [[*_row(regime, scale), f"{factor * float(regime.foundation_force):.4g}"] for regime in selected]
+        head = [unit, "", " ", "phases, degrees", "margin", "power, W", f"foundation force, {force_unit}"]
         drawing = table("synchronous regimes; phases in the direction of rotation, force zero to peak", head, rows)
         stable = [(regime, figures) for regime, figures in zip(selected, measures, strict=True) if figures is not None]
         directions = ("anticlockwise" if exciter.direction == 1 else "clockwise" for exciter in loaded.exciters)
         notes = [
-            f"resonances: {speed_text(frequencies)}",
+            resonances,
             f"rotation: {', '.join(f'exciter {k} {direction}' for k, direction in enumerate(directions, 1))}",
             "margin: factor by which the differences of the motors' torques can grow; inf for",
             "equal motors",
             *([] if status_name(result.search) == "done" else [jv.RegimeSearchStatus[result.search]]),
-            *(textwrap.fill(note, 80) for note in start_notes(loaded)),
+            *(textwrap.fill(note, 80) for note in (*off_notes(loaded), *start_notes(loaded))),
         ]
         blocks = (
             indented(f"at {speed_text(regime.speed)}, stable, {_place_among(float(regime.speed), frequencies)}:", figures)
@@ -104,7 +106,7 @@ def _place_among(speed: float, frequencies: list[float]) -> str:
 
 
 def _row(regime: jv.SynchronousRegime, scale: float) -> list[str]:
-    """Return a regime as a row of the table; `scale` converts rad/s to the display unit."""
+    """Return a regime as a row of the table without its force; `scale` converts rad/s to the display unit."""
     from jaxvib.results.status import status_name  # slow imports, which --help does not need
     from jaxvib.steady.jams.phases import degrees
 
@@ -115,5 +117,4 @@ def _row(regime: jv.SynchronousRegime, scale: float) -> list[str]:
         " ".join(f"{degrees(float(a)):.4g}" for a in regime.phases),
         f"{float(regime.margin):.4g}",
         " ".join(f"{float(p):.4g}" for p in regime.power),
-        f"{float(regime.foundation_force):.4g}",
     ]

@@ -103,22 +103,25 @@ def _text(
     import numpy as np  # slow import, which --help does not need
 
     from jaxvib.display import shown_unit, speed_text, speed_unit
+    from jaxvib.machine.validation import off_notes
 
     unit, scale = speed_unit()
     structure = result.scene.machine.structure()
     kinds = [shown_unit(each, float(np.max(result.amplitude[:, k]))) for k, each in enumerate(structure.units)]
+    force_unit, force_scale = shown_unit("N", float(np.max(result.foundation_force)))
     moves = [f"{name}, {shown}" for name, (shown, _) in zip(structure.coordinates, kinds, strict=True)]
 
     def motion(of: AbstractResponse, k: int, *texts: str) -> list[str]:
         amplitudes = [f"{factor * a:.4g}" for a, (_, factor) in zip(of.amplitude[k], kinds, strict=True)]
-        last = [f"{of.foundation_force[k]:.4g}", f"{np.sum(of.torque[k]):.4g}"]
+        last = [f"{force_scale * of.foundation_force[k]:.4g}", f"{np.sum(of.torque[k]):.4g}"]
         return [f"{scale * of.speed[k]:.5g}", *texts, *amplitudes, *last]
 
-    lines, several = [f"resonances {speed_text(result.resonances)}"], len(result.scene.exciters) > 1
+    lines = [f"resonances {speed_text(result.resonances)}", *off_notes(result.scene)]
+    several = len(result.scene.exciters) > 1
     if several:
         written = ", ".join(f"{a:.4g}" for a in np.rad2deg(phases[0]))
         lines.append(f"phases of the unbalances {written} deg ({phases[1]}), at all speeds")
-    end = ["force, N", "torque, N m"]
+    end = [f"force, {force_unit}", "torque, N m"]
     if operating:
         points = result.operating
         rows = [motion(points, k, "yes" if points.stable[k] else "no") for k in operating]

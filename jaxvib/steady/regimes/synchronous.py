@@ -34,7 +34,7 @@ from jaxvib.equations.torque_balance import (
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.machine.validation import start_notes, validate_scene
+from jaxvib.machine.validation import off_notes, start_notes, validate_scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -224,11 +224,11 @@ class SynchronousRegimes(AbstractSynchronousRegime):
         return SynchronousRegime(**jax.tree.map(lambda leaf: leaf[index], fields), scene=self.scene)
 
     def summary(self) -> str:
-        """Return a line of text for each regime, and for the motors of its masses that cannot start from rest."""
+        """Return a line of text for each regime, and for motors that are switched off or cannot start from rest."""
         lines = [self.select(k).summary() for k in range(self.speed.shape[0])]
         complete = lines and status_name(self.search) == "done"
         owners = np.unique(mass_owners(self.scene)[np.ravel(self.masses)]).tolist()
-        notes = start_notes(self.scene, owners or None)
+        notes = [*off_notes(self.scene), *start_notes(self.scene, owners or None)]
         return "\n".join([*lines, *([] if complete else [RegimeSearchStatus[self.search]]), *notes])
 
     @validated
