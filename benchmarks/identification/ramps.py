@@ -45,7 +45,7 @@ def recorded(duration: float, rng: np.random.Generator) -> tuple[np.ndarray, np.
 
 
 def turns(readings: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return speeds and amplitudes of the vibration in stretches of whole turns."""
+    """Return speeds and amplitudes of the vibration in segments of whole turns."""
     speed, size, _ = amplitudes(readings[:, None], np.ones((angle.size, 1), bool), angle, 1.0 / RATE)
     return speed, size[:, 0]
 
@@ -78,7 +78,7 @@ def steady(speed: np.ndarray, size: np.ndarray) -> tuple[float, float]:
 def averaged(time: np.ndarray, angle: np.ndarray, size: np.ndarray, duration: float) -> tuple[float, float]:
     """Return stiffness and damping by a fit of the averaged equations.
 
-    The amplitudes of their solution are those of its readings in the stretches of `turns`, which smear the peak as they do in
+    The amplitudes of their solution are those of its readings in the segments of `turns`, which smear the peak as they do in
     the record.
     """
     rise = TOP / duration

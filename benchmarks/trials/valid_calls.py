@@ -230,17 +230,15 @@ def calls() -> Iterator[Callable[[], Call]]:
     slow = dict(start="rest", mode=None, spin_up=None, save="all", samples=16, window_periods=4)
     fewer = {k: v for k, v in more.items() if k != "progress_meter"} | {"max_steps": 999}
     yield call("envelope", scene=s, until=0.5, **slow, **fewer)
-    yield call(
-        "settle", scene=s, start="jam", mode=3, drift=0.05, periods=4, stretches=2, stepsize_controller=None, throw=False
-    )
+    yield call("settle", scene=s, start="jam", mode=3, drift=0.05, periods=4, segments=2, stepsize_controller=None, throw=False)
     drags = later(lambda: jnp.asarray([1.0, 2.0]))
     fast = later(lambda: jv.EqualSteps(200))
     batch = dict(stepsize_controller=fast, estimate=False, batch=2, equations=jv.vector_field)
     yield call("ensemble", make=make, values=drags, until=0.2, **batch)
     ups = dict(drag=[1.0, 2.0], starts=2, seed=0, angles=None, stepsize_controller=fast, batch=4, max_steps=None)
     yield call("run_up_map", scene=s, until=0.2, **ups)
-    yield call("growth", scene=s, until=1.0, start="jam", mode=3, stretches=8)
-    yield call("regime", scene=s, stretch=later(lambda: run().window))
+    yield call("growth", scene=s, until=1.0, start="jam", mode=3, segments=8)
+    yield call("regime", scene=s, segment=later(lambda: run().window))
     yield call("Tolerance", tolerance=1e-8)
     yield call("Accuracy", error=1e-4)
     yield call("EqualSteps", number=200)

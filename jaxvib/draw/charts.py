@@ -235,7 +235,7 @@ def solid_and_dashed(
     `widths` are those of solid and dashed segments. With a `marker`, a few markers distinguish the line without colour.
     """
     labelled = False
-    for along, solid in stretches(stable):
+    for along, solid in segments(stable):
         if not np.any(np.isfinite(x[along]) & np.isfinite(y[along])):
             continue  # matplotlib cannot distribute markers on a line without points
         name = label if solid and not labelled else None
@@ -246,10 +246,10 @@ def solid_and_dashed(
         axis.plot(x[along], y[along], color=color, ls=style, lw=width, label=name, **sparse)
 
 
-def stretches(stable: np.ndarray) -> list[tuple[slice, bool]]:
+def segments(stable: np.ndarray) -> list[tuple[slice, bool]]:
     """Return the segments of a line with their stability (True if stable); neighbouring segments share a point.
 
-    >>> stretches(np.array([True, True, False]))
+    >>> segments(np.array([True, True, False]))
     [(slice(0, 3, None), True), (slice(2, 3, None), False)]
     """
     cuts = (np.flatnonzero(stable[1:] != stable[:-1]) + 1).tolist()

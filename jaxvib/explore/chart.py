@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxvib.display import speed_unit
-from jaxvib.draw.charts import crossings, log_limits, scaled_amplitudes, stretches
+from jaxvib.draw.charts import crossings, log_limits, scaled_amplitudes, segments
 from jaxvib.draw.machine.parts import Part, Text
 from jaxvib.draw.machine.svg import svg
 from jaxvib.draw.style import COLORS, GUIDE, join_names
@@ -60,7 +60,7 @@ def chart(result: Branches, max_speed: float) -> str:
         parts += [
             panel.line(scale * rotor_speed[along], values[along], {**(_STABLE if solid else _UNSTABLE), "color": color})
             for values, color in zip(curves.values(), COLORS, strict=False)
-            for along, solid in stretches(stable)
+            for along, solid in segments(stable)
         ]
         dots, numbers = _jams_at_working_speed(panel, [*curves.values()], crossed, scale * at)
         parts += [panel.line([scale * at] * 2, panel.y, WORKING), *dots]

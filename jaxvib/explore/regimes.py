@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.display import quantity_text, speed_unit
-from jaxvib.draw.charts import log_limits, scaled_amplitudes, stretches
+from jaxvib.draw.charts import log_limits, scaled_amplitudes, segments
 from jaxvib.draw.machine.svg import svg
 from jaxvib.draw.style import COLORS, GUIDE
 from jaxvib.equations.linear import natural_frequencies
@@ -101,7 +101,7 @@ def regime_chart(scene: Scene, max_speed: float) -> str:
         parts += [
             panel.line(scale * curves.drive_speed[along], values[along], {**(_LINE if solid else _UNSTABLE), "color": color})
             for values, color in zip(drawn.values(), COLORS, strict=False)
-            for along, solid in stretches(np.asarray(curves.stable))
+            for along, solid in segments(np.asarray(curves.stable))
             if np.any(np.isfinite(values[along]))
         ]
     speeds = panels[0][0]

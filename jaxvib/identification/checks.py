@@ -21,7 +21,7 @@ channel, for the angle of the rotor or of jammed loads) causes the status `patte
 _ANGLE_NAMES = ("the rotor's angle", "the angle of the jammed loads")
 
 _WINDOWS, _ORDERS = 16, 3
-"""Number of stretches of a record, and number of orders of the rotor speed, at which residuals are compared with noise."""
+"""Number of segments of a record, and number of orders of the rotor speed, at which residuals are compared with noise."""
 
 _CONTRADICTION = 4.0
 """Distance of a fitted value from its known value, in standard errors, above which the records contradict the known value."""
@@ -173,7 +173,7 @@ def residual_p_value(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray,
     """Return the probability that pure noise has vibrations at orders of the rotor speed as strong as those of the residuals.
 
     The residuals are whitened by a filter and compared with vibrations at the first orders of the rotor speed in each
-    stretch of the record, by an F test.
+    segment of the record, by an F test.
 
     **Arguments**: `residuals` (n,), NaN for samples that do not count; `taps` of the filter; `angle` (n,) rad; `fitted_count`:
     number of fitted unknowns.

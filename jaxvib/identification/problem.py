@@ -19,7 +19,7 @@ from jaxvib.identification.angle import RotorAngle, rotor_angles
 from jaxvib.identification.records.agreement import ROTOR_KINDS, turn_speed
 from jaxvib.identification.records.channel import Channel, gain_errors
 from jaxvib.identification.records.decimation import MIN_SAMPLES, decimated
-from jaxvib.identification.response import BLOCK, STRETCH, Samples, Unknowns, rows_of_channel, state_count
+from jaxvib.identification.response import BLOCK, SEGMENT, Samples, Unknowns, rows_of_channel, state_count
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.supports import Stop
@@ -53,9 +53,9 @@ _FREQUENCY_MARGIN, _SPEED_TIMES = 1.5, 64
 """Factor on the highest natural frequency, and number of times at which the speed of a drive is evaluated, for the choice of a
 sampling rate."""
 
-_STRETCH_ANGLE, _MAX_STRETCHES = 25.0, 64
-"""Length of a stretch of a nonlinear motion, rad of the slowest vibration, and largest number of stretches. With the first
-values of the unknowns, the phase error within a stretch must be less than a radian."""
+_SEGMENT_ANGLE, _MAX_SEGMENTS = 25.0, 64
+"""Length of a segment of a nonlinear motion, rad of the slowest vibration, and largest number of segments. With the first
+values of the unknowns, the phase error within a segment must be less than a radian."""
 
 _STEPS_PER_RADIAN = 1.0
 """Number of steps of order 8 per radian of the fastest motion, with errors of about 2e-7 in a turn."""
@@ -86,7 +86,7 @@ class Problem(NamedTuple):
     **Attributes** (p unknowns x, E exciters, C channels, n samples)
 
     - `scene` with the known values; `unknowns`, see `Unknowns`
-    - `runs`: the samples of each run, padded to whole stretches
+    - `runs`: the samples of each run, padded to whole segments
     - for each run, without the padding: `masks` (n, C), True for samples that count; `raw` (n, C), readings without a filter;
       `bounds` (n, C), 1 for readings clipped from above, -1 from below, otherwise 0; `times` (n,), s; `angles` of the rotors
       (n, E), rad
@@ -434,8 +434,8 @@ def _samples(
             run.source,
             f"has {max(count, 0)} samples while the angle of the rotor is known; record more, or check the times",
         )
-    stretch = min(STRETCH, max(BLOCK, 2 ** math.ceil(math.log2(count))))
-    stretches = -(-count // stretch)
+    segment = min(SEGMENT, max(BLOCK, 2 ** math.ceil(math.log2(count))))
+    segments = -(-count // segment)
     time = origin + step * (first + np.arange(count))
     raw, mask, bounds = _on_grid(run, channels, time)
     numbers, actions, amounts = _changes(scene, run)
@@ -443,8 +443,8 @@ def _samples(
         drives=tuple(angle.without_errors() for angle in angles),
         begin=jnp.asarray(time[0]),
         end=jnp.asarray(time[-1]),
-        readings=jnp.zeros((stretches, stretch, len(channels))),
-        weights=jnp.zeros((stretches, stretch, len(channels))),
+        readings=jnp.zeros((segments, segment, len(channels))),
+        weights=jnp.zeros((segments, segment, len(channels))),
         taps=jnp.ones((1, len(channels))),
         step=jnp.asarray(step),
         amounts=jnp.asarray(np.array(amounts)),
@@ -452,7 +452,7 @@ def _samples(
         changed=tuple(numbers),
         actions=tuple(actions),
         turn=turn,
-        stretches=_stretches(_changed(scene, run), count, step) if is_nonlinear(scene) else (0, 0, 0),
+        segments=_segments(_changed(scene, run), count, step) if is_nonlinear(scene) else (0, 0, 0),
         guide=jnp.zeros((state_count(scene, channels), len(channels))) if has_supports(scene) else None,
     )
     return samples, mask, raw, bounds, time, np.stack([angle.at(time) for angle in angles], axis=1)
@@ -483,8 +483,8 @@ def _on_grid(run: MeasuredRun, channels: Sequence[Channel], time: np.ndarray) ->
     return raw, mask, bounds
 
 
-def _stretches(scene: Scene, count: int, step: float) -> tuple[int, int, int]:
-    """Return the number of the stretches of a nonlinear motion, the samples of each, and the steps per sample.
+def _segments(scene: Scene, count: int, step: float) -> tuple[int, int, int]:
+    """Return the number of the segments of a nonlinear motion, the samples of each, and the steps per sample.
 
     **Arguments**: `count` of the samples, and their `step`, s.
     """
@@ -496,7 +496,7 @@ def _stretches(scene: Scene, count: int, step: float) -> tuple[int, int, int]:
             "scene",
             "has loads whose drag makes their speeds settle much faster than the vibration; reduce loads.drag or loads.radius",
         )
-    number = max(1, min(_MAX_STRETCHES, round(count * step * slowest / _STRETCH_ANGLE)))
+    number = max(1, min(_MAX_SEGMENTS, round(count * step * slowest / _SEGMENT_ANGLE)))
     return number, -(-count // number), max(1, math.ceil(step / longest))
 
 

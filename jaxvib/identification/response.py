@@ -8,12 +8,12 @@ the free motion between two samples is exact, and the force of the rotor is inte
 
     x_{k+1} = exp(A h) x_k + sum_j w_j h exp(A (h - c_j h)) B F(t_k + c_j h)
 
-The steps are computed in blocks: first the responses from the state zero in all blocks of a stretch of the record at once, then
+The steps are computed in blocks: first the responses from the state zero in all blocks of a segment of the record at once, then
 the state at the start of each block from that of the block before, then the responses to these states. Readings are linear in
 the state at the first sample, the two components (a, b) of each unbalance, and the offsets: these are the linear unknowns, in
 this order. Derivatives with respect to all other unknowns are forward derivatives of the same steps; those with respect to
 errors of a rotor's angle (`RecordedDrive`) are responses to changes of the force. The normal equations of a whole record are
-sums over stretches, which bounds the memory.
+sums over segments, which bounds the memory.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ GAUSS_POINTS = 0.5 + np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.15)
 
 _GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
-STRETCH = 4096
+SEGMENT = 4096
 """Largest number of samples whose derivatives are in memory at once."""
 
 BLOCK = 64
@@ -89,9 +89,9 @@ class Unknowns(eqx.Module):
 
 
 class Samples(eqx.Module):
-    """Samples of a run on an even grid, in stretches: input of the compiled programs.
+    """Samples of a run on an even grid, in segments: input of the compiled programs.
 
-    **Attributes** (N stretches of n samples, C channels, E exciters)
+    **Attributes** (N segments of n samples, C channels, E exciters)
 
     - `drives`: for each exciter the drive that turns its rotor in this run
     - `begin` and `end`, s: times of the first and the last sample
@@ -103,7 +103,7 @@ class Samples(eqx.Module):
       changes
     - `channels` that are compared; `turn`: index of the run's unknown zero of the angle, or None
     - `errors`: index of the first error of the rotor's angle among the unknowns, and their number
-    - `stretches` in which the motion of loads or on nonlinear supports is integrated: their number, samples of each, steps per
+    - `segments` in which the motion of loads or on nonlinear supports is integrated: their number, samples of each, steps per
       sample; (0, 0, 0) for a linear response
     - `guide` (ns, C) of a motion on nonlinear supports: change of the state at a sample per difference between recorded and
       computed readings; otherwise None
@@ -122,7 +122,7 @@ class Samples(eqx.Module):
     actions: tuple[str, ...] = eqx.field(static=True)
     turn: int | None = eqx.field(static=True)
     errors: tuple[int, int] = eqx.field(static=True, default=(0, 0))
-    stretches: tuple[int, int, int] = eqx.field(static=True, default=(0, 0, 0))
+    segments: tuple[int, int, int] = eqx.field(static=True, default=(0, 0, 0))
     guide: Array | None = None
 
     def scene(self, scene: Scene) -> Scene:
@@ -248,7 +248,7 @@ def _readings(steps: _Steps, force: Array, start: Array) -> tuple[Array, Array]:
     """Return the derivatives (n, C, ns + 2 E) of the readings with respect to the state at the first sample and the components
     of the unbalances, and those of the state at the end.
 
-    **Arguments**: `start` (ns, ns + 2 E): derivatives of the state at the start of the stretch.
+    **Arguments**: `start` (ns, ns + 2 E): derivatives of the state at the start of the segment.
     """
     ns = steps.power.shape[0]
     n, exciters = force.shape[0], steps.inputs.shape[2]
@@ -273,7 +273,7 @@ def _response(steps: _Steps, force: Array, start: Array, unbalance: Array) -> tu
 
 
 def _filtered(taps: Array, before: Array, values: Array) -> tuple[Array, Array]:
-    """Return the readings (n, C, k) after the filter `taps` (m + 1, C), and the last m readings for the next stretch."""
+    """Return the readings (n, C, k) after the filter `taps` (m + 1, C), and the last m readings for the next segment."""
     m, n = taps.shape[0] - 1, values.shape[0]
     every = jnp.concatenate([before, values])
     parts = [taps[j][None, :, None] * every[m - j : m - j + n] for j in range(m + 1)]
@@ -290,12 +290,12 @@ def _built(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> _Ste
     return steps._replace(outputs=gains[:, None] * steps.outputs, through=gains[:, None, None, None] * steps.through)
 
 
-def _forces(samples: Samples, scene: Scene, x: Array, stretch: Array) -> tuple[Array, Array]:
-    """Return F (n, 4, 2 E), (horizontal, up) for each exciter, at each sample of a stretch and at the three Gauss points of the
+def _forces(samples: Samples, scene: Scene, x: Array, segment: Array) -> tuple[Array, Array]:
+    """Return F (n, 4, 2 E), (horizontal, up) for each exciter, at each sample of a segment and at the three Gauss points of the
     step that follows, and the derivatives (m, n, 4, 2) of F with respect to the errors of the rotor's angle."""
     first, count = samples.errors
     n = samples.readings.shape[1]
-    places = (stretch * n + jnp.arange(n))[:, None] + jnp.asarray([0.0, *GAUSS_POINTS])[None]
+    places = (segment * n + jnp.arange(n))[:, None] + jnp.asarray([0.0, *GAUSS_POINTS])[None]
     times = jnp.minimum(samples.begin + samples.step * places, samples.end).ravel()
     forces, changes = [], jnp.zeros((0, n, 4, 2))
     for drive, exciter in zip(samples.drives, scene.exciters, strict=True):
@@ -318,8 +318,8 @@ def _forces(samples: Samples, scene: Scene, x: Array, stretch: Array) -> tuple[A
 
 
 def _linear_columns(steps: _Steps, samples: Samples):
-    """Return the initial carry of a scan over the stretches, and its function, which also returns the linear columns
-    (n, C, ns + 2 E + C) of a stretch."""
+    """Return the initial carry of a scan over the segments, and its function, which also returns the linear columns
+    (n, C, ns + 2 E + C) of a segment."""
     ns, exciters, count = steps.power.shape[0], steps.inputs.shape[2], len(samples.channels)
     size, m = ns + 2 * exciters, samples.taps.shape[0] - 1
     first = jnp.concatenate([jnp.eye(ns), jnp.zeros((ns, 2 * exciters))], axis=1), jnp.zeros((m, count, size))
@@ -340,7 +340,7 @@ def linear_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
     """Return the products Z^T Z of the weighted columns Z = (linear unknowns of the run, readings) at the unknowns `x`."""
     first, columns = _linear_columns(_built(unknowns, samples, scene, x), samples)
 
-    def stretch(carry, part):
+    def segment(carry, part):
         (state, total), (k, readings, weights) = carry, part
         state, found = columns(state, _forces(samples, scene, x, k)[0])
         z = (jnp.concatenate([found, readings[:, :, None]], axis=2) * weights[:, :, None]).reshape(-1, found.shape[2] + 1)
@@ -348,7 +348,7 @@ def linear_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
 
     size = first[0].shape[1] + len(samples.channels) + 1
     parts = jnp.arange(samples.readings.shape[0]), samples.readings, samples.weights
-    (_, total), _ = jax.lax.scan(stretch, (first, jnp.zeros((size, size))), parts)
+    (_, total), _ = jax.lax.scan(segment, (first, jnp.zeros((size, size))), parts)
     return total
 
 
@@ -369,7 +369,7 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
 
     changes = jax.vmap(tangent)(jnp.eye(x.shape[0])[:moved])
 
-    def stretch(carry, part):
+    def segment(carry, part):
         (linear_state, (moving, turning, before), total), (k, readings, weights) = carry, part
         force, force_changes = _forces(samples, scene, x, k)
         at = linear_state[0] @ linear[: linear_state[0].shape[1]]
@@ -396,9 +396,9 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
     count, size, states = x.shape[0], x.shape[0] + linear.shape[0] + 1, steps.power.shape[0]
     before = jnp.zeros((samples.taps.shape[0] - 1, len(samples.channels), count))
     start = (first, (jnp.zeros((moved, states)), jnp.zeros((errors, states)), before), jnp.zeros((size, size)))
-    # Reverse derivatives compute each stretch again and keep only the states between the stretches.
+    # Reverse derivatives compute each segment again and keep only the states between the segments.
     parts = jnp.arange(samples.readings.shape[0]), samples.readings, samples.weights
-    (_, _, total), _ = jax.lax.scan(jax.checkpoint(stretch), start, parts)
+    (_, _, total), _ = jax.lax.scan(jax.checkpoint(segment), start, parts)
     return total
 
 
@@ -431,11 +431,11 @@ def _all_readings(steps: _Steps, samples: Samples, scene: Scene, x: Array, linea
     """Return the readings (N n, C) of the model without offsets."""
     state, unbalance, _ = _split(steps, linear)
 
-    def stretch(state: Array, k: Array) -> tuple[Array, Array]:
+    def segment(state: Array, k: Array) -> tuple[Array, Array]:
         readings, state = _response(steps, _forces(samples, scene, x, k)[0], state, unbalance)
         return state, readings
 
-    _, found = jax.lax.scan(stretch, state, jnp.arange(samples.readings.shape[0]))
+    _, found = jax.lax.scan(segment, state, jnp.arange(samples.readings.shape[0]))
     return found.reshape(-1, found.shape[2])
 
 

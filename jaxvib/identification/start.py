@@ -21,7 +21,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 
 _WINDOWS = 128
-"""Largest number of stretches of a run. A stretch has whole turns and gives one amplitude of each channel."""
+"""Largest number of segments of a run. A segment has whole turns and gives one amplitude of each channel."""
 
 _PRIOR_WEIGHT = 0.05
 """Weight of the logarithm of the change of an unknown, relative to that of the logarithm of an amplitude."""
@@ -30,10 +30,10 @@ _PRIOR_WEIGHT = 0.05
 def amplitudes(
     readings: np.ndarray, mask: np.ndarray, angle: np.ndarray, step: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the speeds (W,), rad/s, in W stretches, the amplitudes (W, C) of the vibrations of C channels at the
+    """Return the speeds (W,), rad/s, in W segments, the amplitudes (W, C) of the vibrations of C channels at the
     rotor speed, and their weights (W, C) between 0 and 1.
 
-    The readings of each stretch of whole turns are fitted by c + a cos(angle) + b sin(angle). The weight is small if the
+    The readings of each segment of whole turns are fitted by c + a cos(angle) + b sin(angle). The weight is small if the
     amplitude is not above its standard error.
 
     >>> angle = np.linspace(0.0, 300.0, 20000)
@@ -42,8 +42,8 @@ def amplitudes(
     (True, True, False)
     """
     turns = np.abs(angle - angle[0]) / (2.0 * np.pi)
-    turns_of_stretch = max(1.0, np.ceil(turns[-1] / _WINDOWS))
-    cuts = np.searchsorted(turns, np.arange(0.0, turns[-1], turns_of_stretch))
+    turns_of_segment = max(1.0, np.ceil(turns[-1] / _WINDOWS))
+    cuts = np.searchsorted(turns, np.arange(0.0, turns[-1], turns_of_segment))
     speeds, sizes, weights = [], [], []
     for begin, end in itertools.pairwise(cuts):
         if end - begin < 8:

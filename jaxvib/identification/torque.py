@@ -240,8 +240,8 @@ def _runs(fitted: Fitted) -> tuple[list[_Run], np.ndarray]:
         drive, rotor = samples.drives[0], angle.samples
         assert isinstance(drive, RecordedDrive) and rotor is not None
         factor = max(1, math.ceil(float(samples.step) * float(drive.speed) / _FINE_ANGLE))
-        stretches, n, _ = samples.readings.shape
-        empty = jnp.zeros((stretches * factor, n, 2))
+        segments, n, _ = samples.readings.shape
+        empty = jnp.zeros((segments * factor, n, 2))
         fine = dataclasses.replace(
             samples, drives=(angle.without_errors(),), readings=empty, weights=empty, taps=jnp.ones((1, 2)),
             step=samples.step / factor, channels=_AXES, errors=(0, 0),

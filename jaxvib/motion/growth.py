@@ -18,7 +18,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, with_nearest_turns
 from jaxvib.motion.integrate import angle_wrapping, whole_turns
-from jaxvib.motion.plan import Tolerance, plan_stretch, with_settled_drives
+from jaxvib.motion.plan import Tolerance, plan_segment, with_settled_drives
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import last_state, run_planned, simulate
 from jaxvib.motion.start import Start, start_state
@@ -68,14 +68,14 @@ class Growth(Result):
     **Attributes**
 
     - `status`: a `GrowthStatus`
-    - `exponent`: the largest Lyapunov exponent, 1/s, over the later half of the stretches, and its `uncertainty`: the largest
+    - `exponent`: the largest Lyapunov exponent, 1/s, over the later half of the segments, and its `uncertainty`: the largest
       of the standard error, half of the change of the rate between the quarters of this half, and 0.1 divided by the length of
       this half (exponents that are closer to each other cannot be separated)
     - `horizon`: the time, s, after which rounding errors have grown to the size of the motion itself, ln(1/eps)/exponent, with
       the relative rounding error eps. A derivative with respect to a parameter has then grown by 1/eps, and predicts nothing
       about a change that is larger than rounding. The horizon is infinite for a regular motion; for an undecided one it is a
       lower bound, ln(1/eps)/(exponent + 3 uncertainty)
-    - `rates` (stretches,): growth rate in each stretch, 1/s; `time` (stretches,): end of each stretch, s
+    - `rates` (segments,): growth rate in each segment, 1/s; `time` (segments,): end of each segment, s
     """
 
     status: GrowthStatus
@@ -93,7 +93,7 @@ class Growth(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the rate of each stretch and the exponent over time."""
+        """Plot the rate of each segment and the exponent over time."""
         from jaxvib.draw.results import growth_chart  # slow to import
 
         return growth_chart(self.time, self.rates, self.exponent, self.uncertainty, ax=ax)
@@ -107,13 +107,13 @@ def growth(
     start: Start | State = "rest",
     mode: int | None = None,
     separation: Number | None = None,
-    stretches: int = 40,
+    segments: int = 40,
 ) -> Growth:
     """Estimate the largest Lyapunov exponent of a motion: the rate at which two motions with nearly equal starts separate.
 
-        exponent = mean of ln(d_k / d_0) / T over the later stretches of length T
+        exponent = mean of ln(d_k / d_0) / T over the later segments of length T
 
-    A second motion starts at the distance d_0. At the end of stretch k its distance is d_k; it is then reset to d_0 in the
+    A second motion starts at the distance d_0. At the end of segment k its distance is d_k; it is then reset to d_0 in the
     current direction (Benettin's method).
 
     Derivatives of a run grow at the same rate. If the rate is positive, a derivative of a run that is longer than the horizon
@@ -135,10 +135,10 @@ def growth(
     **Arguments**
 
     - `scene` with drives of constant speed or motors; a single exciter with loads needs a constant speed
-    - `until`, s or text: approximate length of all stretches together; each stretch is a whole number of turns of the rotor;
+    - `until`, s or text: approximate length of all segments together; each segment is a whole number of turns of the rotor;
       typical: 20 to 200
     - `start`, `mode`, `separation`: as for `simulate`, except "spin_up"
-    - `stretches`: number of stretches, at least 8; typical: 40 (the default). One stretch must be so short that two motions
+    - `segments`: number of segments, at least 8; typical: 40 (the default). One segment must be so short that two motions
       with the initial distance d_0 are still close to each other at its end
 
     **Returns** `Growth`. **Raises** `InputError` for a drive whose prescribed speed changes, and for the motor of a
@@ -156,15 +156,15 @@ def growth(
     require_known(scene, "scene", "growth", "use jam_orbit or simulate in it")
     scene = validate_scene(scene)
     scene = with_settled_drives(scene, start, "the growth of disturbances needs a constant rotor speed; use ConstantSpeed")
-    if count(stretches, "stretches") < 8:
-        raise InputError("stretches", f"is {stretches}; at least 8 are needed to estimate the scatter of the rate")
+    if count(segments, "segments") < 8:
+        raise InputError("segments", f"is {segments}; at least 8 are needed to estimate the scatter of the rate")
     end = float(number(until, "s", "until", low=0.0, open_low=True))
     state = start_state(scene, start, mode, separation)
-    stretch, unit = whole_turns(scene, end / stretches), natural_units(scene)
+    segment, unit = whole_turns(scene, end / segments), natural_units(scene)
     double = state.displacement.dtype.itemsize >= 8
     separation, steps = (1e-6, Tolerance(1e-10)) if double else (1e-2, Tolerance(1e-5))
 
-    plan = plan_stretch(scene, stretch, state, steps, throw=False)
+    plan = plan_segment(scene, segment, state, steps, throw=False)
 
     def run_on(begin: State) -> Run:
         run = run_planned(dataclasses.replace(plan, state=begin), throw=False)
@@ -173,34 +173,34 @@ def growth(
         return run
 
     rng, rates, neighbour, quarters = np.random.default_rng(0), [], None, []
-    for k in range(stretches):
+    for k in range(segments):
         if neighbour is None:  # a random direction, because disturbances along the motion do not grow
             scale = error_scale(jax.tree.map(lambda x: x[None], state), unit)
             noise = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), state)
             neighbour = _at_distance(state, jax.tree.map(jnp.add, state, noise), scale, separation)
-        if k in (stretches // 2, 3 * stretches // 4):
+        if k in (segments // 2, 3 * segments // 4):
             quarters.append(state)
         first, second = run_on(state), run_on(neighbour)
         scale = error_scale(first.window.state, unit)
         ours, neighbour_end = (jax.tree.map(lambda x: x[-1], run.window.state) for run in (first, second))
         if angle_wrapping(scene, ours.displacement.dtype)[0]:
             neighbour_end = with_nearest_turns(neighbour_end, ours)
-        rates.append(math.log(max(_distance(ours, neighbour_end, scale), 1e-300) / separation) / stretch)
+        rates.append(math.log(max(_distance(ours, neighbour_end, scale), 1e-300) / separation) / segment)
         state, difference = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, neighbour_end)
         neighbour = _at_distance(state, jax.tree.map(jnp.add, state, difference), scale, separation)
-    late = np.array(rates[stretches // 2 :])
-    exponent, uncertainty = float(np.mean(late)), _uncertainty(late, stretch)
-    name = _classify_growth(late * stretch)
+    late = np.array(rates[segments // 2 :])
+    exponent, uncertainty = float(np.mean(late)), _uncertainty(late, segment)
+    name = _classify_growth(late * segment)
     if name == "chaotic" and all(_has_returned(scene, quarter, steps) for quarter in quarters):
         name = "unstable"
     fastest = {"regular": 0.0, "undecided": exponent + 3.0 * uncertainty}.get(name, exponent)
     horizon = math.log(1.0 / float(jnp.finfo(scene.top_speed.dtype).eps)) / fastest if fastest > 0.0 else math.inf
-    times = stretch * np.arange(1, stretches + 1)
+    times = segment * np.arange(1, segments + 1)
     return Growth(member(GrowthStatus, name), exponent, uncertainty, horizon, np.array(rates), times)
 
 
 def _classify_growth(late: np.ndarray) -> str:
-    """Return the name of the `GrowthStatus` from the logarithms `late` (n,) of the growth in the stretches of the later half.
+    """Return the name of the `GrowthStatus` from the logarithms `late` (n,) of the growth in the segments of the later half.
 
     This function does not test whether the motion is periodic: "chaotic" includes "unstable".
     """
@@ -215,14 +215,14 @@ def _classify_growth(late: np.ndarray) -> str:
     return "regular" if total + 3.0 * error < _EXPONENTIAL_LOG_GROWTH and (decreases or not is_resolved) else "undecided"
 
 
-def _uncertainty(late: np.ndarray, stretch: float) -> float:
-    """Return the uncertainty of the mean of the rates `late` (n,), 1/s, in the stretches of the later half.
+def _uncertainty(late: np.ndarray, segment: float) -> float:
+    """Return the uncertainty of the mean of the rates `late` (n,), 1/s, in the segments of the later half.
 
-    `stretch`: length of each stretch, s.
+    `segment`: length of each segment, s.
     """
     first, last = np.split(late, [late.size // 2])
     change = abs(float(np.mean(last) - np.mean(first)))
-    return max(_sum_error(late) / late.size, 0.5 * change, _UNSEPARATED_LOG_GROWTH / (late.size * stretch))
+    return max(_sum_error(late) / late.size, 0.5 * change, _UNSEPARATED_LOG_GROWTH / (late.size * segment))
 
 
 def _sum_error(values: np.ndarray) -> float:
@@ -231,7 +231,7 @@ def _sum_error(values: np.ndarray) -> float:
         s^2 = n c_0 + 2 (n - 1) c_1
 
     with the autocovariances c_k; the result is at least the error of one value. The correlation matters: if the phase of the
-    motion differs between the ends of stretches, neighbouring logarithms of growth are large and cancel each other.
+    motion differs between the ends of segments, neighbouring logarithms of growth are large and cancel each other.
     """
     deviation = values - np.mean(values)
     variance = float(np.sum(deviation**2)) / (values.size - 1)

@@ -349,8 +349,8 @@ _MAX_TURNS = 1e15
 """Largest number of turns that double precision resolves."""
 
 
-def whole_turns(scene: Scene, stretch: float) -> float:
-    """Return the longest time within `stretch`, s, that is a whole number of turns of all rotors, but at least one turn.
+def whole_turns(scene: Scene, segment: float) -> float:
+    """Return the longest time within `segment`, s, that is a whole number of turns of all rotors, but at least one turn.
 
     The rotors of motors are ignored, because their angles are part of the state; a period of their supply counts as a turn. If
     there are several rotors, only those with an unbalance are considered. **Raises** `InputError` for rotors with an unbalance
@@ -365,14 +365,14 @@ def whole_turns(scene: Scene, stretch: float) -> float:
     supplies = [frequency for e in scene.exciters if (frequency := e.drive.supply_frequency()) is not None]
     speeds = sorted({float(w) for w in (*(exciter.drive.speed for exciter in counted), *supplies)})
     if not speeds:
-        return stretch
+        return segment
     if len(speeds) > 1:
         problem = f"have unbalances or supplies at {speeds} rad/s and no common period; use simulate, or other motors"
         raise InputError("exciters", problem)
     turn = 2.0 * math.pi / speeds[0]
-    turns = stretch / turn
+    turns = segment / turn
     if turns > _MAX_TURNS:
         raise InputError(
-            "until", f"gives stretches of {turns:.3g} turns of the rotor; they must be shorter than {_MAX_TURNS:.0e}"
+            "until", f"gives segments of {turns:.3g} turns of the rotor; they must be shorter than {_MAX_TURNS:.0e}"
         )
     return max(math.floor(turns), 1) * turn

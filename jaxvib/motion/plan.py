@@ -1,6 +1,6 @@
 """Plans of runs: choices that depend on the values of a scene and are made on the host, before a program is traced.
 
-The method and the static sizes (samples, steps, stretches) depend on values that are known (not traced). Under a JAX
+The method and the static sizes (samples, steps, segments) depend on values that are known (not traced). Under a JAX
 transformation, these values are unknown, and the sizes are fixed. The traced program does not test which values are known.
 """
 
@@ -49,8 +49,8 @@ _FEW_SAMPLES, _MANY_SAMPLES = 2**14, 2**18
 _IMPLICIT_STEPS_FACTOR = 16.0
 """Factor by which the implicit method increases the default of `max_steps`."""
 
-_STRETCH_TURNS = 2.0e4
-"""Number of turns after which single precision no longer resolves time; longer runs are divided into stretches."""
+_SEGMENT_TURNS = 2.0e4
+"""Number of turns after which single precision no longer resolves time; longer runs are divided into segments."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class RunPlan:
 
     - `given_scene`: the scene of the call; `scene`: the scene of the run, with a spin-up drive for the start "spin_up"
     - `end`, s; `state` at the start
-    - `integration`: the choices for one integration; `stretches`: the number of consecutive integrations
+    - `integration`: the choices for one integration; `segments`: the number of consecutive integrations
     - `is_known`: True if scene, end and state have values
     - `is_estimated`: True if a second run with larger steps estimates the error; `accuracy`: the error that repeated runs must
       reach, or None
@@ -159,7 +159,7 @@ class RunPlan:
     end: Array
     state: State
     integration: IntegrationPlan
-    stretches: int
+    segments: int
     is_known: bool
     is_estimated: bool
     accuracy: float | None
@@ -220,7 +220,7 @@ def plan_run(
         end=end,
         state=state,
         integration=integration,
-        stretches=_stretches(scene, end, state, fastest) if known and save == "window" else 1,
+        segments=_segments(scene, end, state, fastest) if known and save == "window" else 1,
         is_known=known,
         is_estimated=is_estimated,
         accuracy=steps.error if isinstance(steps, Accuracy) else None,
@@ -234,15 +234,15 @@ def _solver_for_derivatives(adjoint: diffrax.AbstractAdjoint | None) -> LoopDopr
     return LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
 
 
-def _stretches(scene: Scene, end: Array, state: State, fastest: Array | np.ndarray) -> int:
+def _segments(scene: Scene, end: Array, state: State, fastest: Array | np.ndarray) -> int:
     """Return the number of consecutive integrations. It is above 1 for long runs in single precision, which cannot resolve a
     step at a late time."""
     if state.displacement.dtype.itemsize >= 8 or len(scene.exciters) != 1 or not scene.exciter.drive.constant:
         return 1
-    return max(1, math.ceil(float(end * fastest) / (2.0 * math.pi * _STRETCH_TURNS)))
+    return max(1, math.ceil(float(end * fastest) / (2.0 * math.pi * _SEGMENT_TURNS)))
 
 
-def plan_stretch(scene: Scene, length: float, state: State, steps: StepChoice, *, throw: bool) -> RunPlan:
+def plan_segment(scene: Scene, length: float, state: State, steps: StepChoice, *, throw: bool) -> RunPlan:
     """Plan one of several consecutive runs, without a trajectory and an error estimate. **Raises** `InputError`."""
     return plan_run(
         scene, length, start=state, mode=None, separation=None, spin_up=None, save="window", samples=None, window_periods=20,
@@ -262,7 +262,7 @@ def enough_steps(fastest: Array | np.ndarray, end: Array, chosen: StepChoice | N
         turns = end * fastest / (2.0 * math.pi)
         steps = 4096 + 500 * turns
         if not steps <= MAX_STEPS:
-            raise InputError("until", f"is {end:g} s, {turns:.2g} turns of the fastest motion; run shorter stretches")
+            raise InputError("until", f"is {end:g} s, {turns:.2g} turns of the fastest motion; run shorter segments")
         return min(2 ** math.ceil(math.log2(steps)), MAX_STEPS)
 
     steps = when_known(count_steps, fastest, end)

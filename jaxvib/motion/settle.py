@@ -20,7 +20,7 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.regime import Regime, RegimeName
 from jaxvib.motion.analysis.separation import prepare_separation, would_separate
 from jaxvib.motion.integrate import WINDOW_SAMPLES, frequency_bounds, whole_turns
-from jaxvib.motion.plan import EqualSteps, RunPlan, StepChoice, Tolerance, plan_stretch, require, with_settled_drives
+from jaxvib.motion.plan import EqualSteps, RunPlan, StepChoice, Tolerance, plan_segment, require, with_settled_drives
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.simulate import last_state, prepare_run, run_planned
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state, must_compile_jams, start_state
@@ -32,22 +32,22 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_known
 
-_MEAN_STRETCHES = 32
-"""Number of stretches, of 100 slow periods each, that show whether a motion is steady in the mean. A slow period is a period of
+_MEAN_SEGMENTS = 32
+"""Number of segments, of 100 slow periods each, that show whether a motion is steady in the mean. A slow period is a period of
 the lowest natural frequency."""
 
 _MAX_QUARTER_DIFFERENCE = 3.6
-"""Range (largest minus smallest) of the means of the four quarters of these stretches, in standard errors of one mean. For one
-quantity and many stretches, scatter alone exceeds it in about 5 % of cases (studentized range)."""
+"""Range (largest minus smallest) of the means of the four quarters of these segments, in standard errors of one mean. For one
+quantity and many segments, scatter alone exceeds it in about 5 % of cases (studentized range)."""
 
 _MAX_DISTANCE_IN_DRIFTS = 10.0
 """Largest distance of a settled motion from its steady state, divided by the limit of the drift."""
 
-_CREEP_STRETCHES = 4
-"""Number of stretches that show whether loads creep."""
+_CREEP_SEGMENTS = 4
+"""Number of segments that show whether loads creep."""
 
 _MAX_CREEP_DIFFERENCE = 0.05
-"""Largest relative difference between the angles by which loads creep in two of these stretches."""
+"""Largest relative difference between the angles by which loads creep in two of these segments."""
 
 _MAX_UNBALANCE_CHANGE_RATIO = 0.01
 """Largest ratio of the change of the residual unbalance and the change of the angles, in rad, of loads that creep along
@@ -66,23 +66,23 @@ def settle(
     separation: Number | None = None,
     drift: float | None = None,
     periods: int = 100,
-    stretches: int = 200,
+    segments: int = 200,
     stepsize_controller: StepChoice | None = None,
     throw: bool = True,
 ) -> Run:
-    """Simulate one stretch after another until amplitudes and speed no longer change, or change without a trend.
+    """Simulate one segment after another until amplitudes and speed no longer change, or change without a trend.
 
     Two kinds of motion never repeat themselves and count as settled too:
 
     - `beating`: a motion that never becomes periodic but is steady in the mean, for example the vibration of jammed loads that
-      beats with that of an imbalance, which turns faster. The last 32 stretches are considered (of 100 periods of the lowest
-      natural frequency; more if stretches are shorter). The motion is steady in the mean if the drift does not decrease, and if
-      the means of amplitudes, force and speed over the four quarters of these stretches differ by no more than the larger of
+      beats with that of an imbalance, which turns faster. The last 32 segments are considered (of 100 periods of the lowest
+      natural frequency; more if segments are shorter). The motion is steady in the mean if the drift does not decrease, and if
+      the means of amplitudes, force and speed over the four quarters of these segments differ by no more than the larger of
       two limits: what their scatter explains, and half the drift
     - `creeping`: four loads or more, or three with an imbalance, can balance the rotor in infinitely many arrangements
       (`balanced_states`). Small disturbances such as gravity move the loads slowly from one to the next, for hours. The status
       is `creeping` if the loads balance the rotor, free vibrations of the carrier have decayed, and the loads creep evenly
-      over four stretches while the residual unbalance does not change
+      over four segments while the residual unbalance does not change
 
     **Arguments**
 
@@ -94,17 +94,17 @@ def settle(
       the estimated distance of the motion from its steady state must be below ten times this limit: with little damping a
       motion that is still far from its steady state changes only slowly. The distance is estimated from the slowest decay of
       the carrier, or from the decrease of the drift
-    - `periods`: approximate length of a stretch, in periods of the lowest natural frequency; typical: 100 (the default)
-    - `stretches`: largest number of stretches; typical: 200 (the default); 1 to 3 suffice at damping ratios of 0.05 to 0.01
+    - `periods`: approximate length of a segment, in periods of the lowest natural frequency; typical: 100 (the default)
+    - `segments`: largest number of segments; typical: 200 (the default); 1 to 3 suffice at damping ratios of 0.05 to 0.01
     - `stepsize_controller`: as for `simulate`, except `Accuracy`; default: `Tolerance(1e-9)`, in single precision 1e-5
-    - `throw`: True to raise `ComputationError` if the motion has not settled after all stretches; otherwise the `drift` of the
+    - `throw`: True to raise `ComputationError` if the motion has not settled after all segments; otherwise the `drift` of the
       last run shows this, or its status if the run failed
 
     A motion that is stable only as long as loads are coincident does not count as settled: if loads start at one angle
     (`separation=0`) and would separate after a small disturbance, the status is `would_separate` (see `Run`), `settled` is
     False, and no error is raised.
 
-    **Returns** the `Run` of the last stretch, without a trajectory and without an estimate of its error.
+    **Returns** the `Run` of the last segment, without a trajectory and without an estimate of its error.
 
     **Raises** `ComputationError` (status "not_settled", or "left_mode" if the loads settled in another mode than `mode`),
     `InputError` for a rotor whose speed changes; and the errors of `simulate`.
@@ -116,14 +116,14 @@ def settle(
     >>> bool(jv.settle(scene, mode=1).drift < 1e-6)
     True
     """
-    plan = _plan_settle(scene, start, mode, separation, drift, periods, stretches, stepsize_controller, throw=throw)
+    plan = _plan_settle(scene, start, mode, separation, drift, periods, segments, stepsize_controller, throw=throw)
     run, is_final = _integrate_until_settled(plan, throw=throw)
     if throw and not is_final:
         raise ComputationError(
             "not_settled",
-            f"after {stretches} stretches of {periods} periods of the lowest natural frequency the motion still changes "
+            f"after {segments} segments of {periods} periods of the lowest natural frequency the motion still changes "
             f"by {float(run.drift):.1e}; "
-            "it may have no steady state at this speed; otherwise allow more stretches or a larger drift",
+            "it may have no steady state at this speed; otherwise allow more segments or a larger drift",
         )
     if throw and mode is not None:
         _require_mode(scene, run, mode)
@@ -132,19 +132,19 @@ def settle(
 
 @dataclasses.dataclass(frozen=True)
 class _SettlePlan:
-    """Plan of a run in stretches.
+    """Plan of a run in segments.
 
-    **Attributes**: `first`: plan of the first stretch; `stretches`: their largest number; `drift`: the drift below which the
-    motion has settled; `default_drift`: the default drift of the precision; `mean_stretches`: the number of stretches that
+    **Attributes**: `first`: plan of the first segment; `segments`: their largest number; `drift`: the drift below which the
+    motion has settled; `default_drift`: the default drift of the precision; `mean_segments`: the number of segments that
     show whether the motion is steady in the mean, None if the motion must reach the drift; `decay`: the slowest decay of the
     carrier, 1/s.
     """
 
     first: RunPlan
-    stretches: int
+    segments: int
     drift: float
     default_drift: float
-    mean_stretches: int | None
+    mean_segments: int | None
     decay: float
 
 
@@ -155,12 +155,12 @@ def _plan_settle(
     separation: Number | None,
     drift: float | None,
     periods: int,
-    stretches: int,
+    segments: int,
     steps: StepChoice | None,
     *,
     throw: bool,
 ) -> _SettlePlan:
-    """Validate the arguments of `settle` and choose its stretches. **Raises** `InputError`."""
+    """Validate the arguments of `settle` and choose its segments. **Raises** `InputError`."""
     require_known(scene, "scene", "settle", "use jam_orbit or simulate in it")
     scene = validate_scene(scene)
     scene = with_settled_drives(scene, start, "a motion settles at a constant rotor speed; use ConstantSpeed")
@@ -168,7 +168,7 @@ def _plan_settle(
     require(steps, Tolerance, EqualSteps, diffrax.AbstractStepSizeController)
     double = scene.top_speed.dtype.itemsize >= 8
     default_drift = 1e-6 if double else 1e-3
-    # Each stretch is a whole number of turns, so that an imbalance continues at its angle.
+    # Each segment is a whole number of turns, so that an imbalance continues at its angle.
     length = whole_turns(scene, 2.0 * math.pi * periods / float(frequency_bounds(scene)[1]))
     start = ("rest" if mode is None else "jam") if start is None else start
     is_jam = isinstance(start, str) and start == "jam"
@@ -176,21 +176,21 @@ def _plan_settle(
     steps = Tolerance(1e-9 if double else 1e-5) if steps is None else steps
     if is_jam and must_compile_jams(scene, mode):
         rest = initial_state(scene)
-        prepare_run(plan_stretch(scene, length, rest, steps, throw=throw))
+        prepare_run(plan_segment(scene, length, rest, steps, throw=throw))
         prepare_separation(scene, rest, WINDOW_SAMPLES)
     state = start_state(scene, start, mode, separation, throw=throw)
     return _SettlePlan(
-        first=plan_stretch(scene, length, state, steps, throw=throw),
-        stretches=count(stretches, "stretches"),
+        first=plan_segment(scene, length, state, steps, throw=throw),
+        segments=count(segments, "segments"),
         drift=default_drift if drift is None else float(number(drift, "", "drift", low=0.0, open_low=True)),
         default_drift=default_drift,
-        mean_stretches=4 * math.ceil(_MEAN_STRETCHES * max(1.0, 100.0 / periods) / 4.0) if drift is None else None,
+        mean_segments=4 * math.ceil(_MEAN_SEGMENTS * max(1.0, 100.0 / periods) / 4.0) if drift is None else None,
         decay=_slowest_decay(scene),
     )
 
 
 def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
-    """Return the run of the last stretch, and False if an error must be raised.
+    """Return the run of the last segment, and False if an error must be raised.
 
     No error is raised if the motion has settled or has the status `would_separate` or `overlapping`.
     """
@@ -208,18 +208,18 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
             # If the loads are not at exactly one angle and would separate, the run continues until they have left this motion.
             if is_coincident or status_name(final.status) == "done" or not would_separate(run.scene, run.window):
                 return final, True
-        if plan.mean_stretches is not None:
+        if plan.mean_segments is not None:
             force = float(np.nan_to_num(run.foundation_force))  # 0 if it is unknown
             lengths = plan.first.scene.machine.carrier().as_lengths(run.amplitude)
             measured.append([drifts[-1], float(run.omega), force, *np.asarray(lengths).tolist()])
-            if len(measured) >= plan.mean_stretches and _steady_in_the_mean(np.array(measured[-plan.mean_stretches :])):
+            if len(measured) >= plan.mean_segments and _steady_in_the_mean(np.array(measured[-plan.mean_segments :])):
                 return _with_final_status(run, "beating"), True
             is_plain = plan.first.scene.is_plain
             if is_plain and drifts[-1] < SETTLED_DRIFT and plan.decay * length * len(measured) > -math.log(plan.default_drift):
                 regimes.append(run.regime)
-                if _is_creeping(regimes[-_CREEP_STRETCHES:]):
+                if _is_creeping(regimes[-_CREEP_SEGMENTS:]):
                     return _with_final_status(run, "creeping"), True
-        if len(drifts) == plan.stretches:
+        if len(drifts) == plan.segments:
             last = _with_final_status(run, "done") if drifts[-1] < SETTLED_DRIFT else run
             return last, status_name(last.status) in ("would_separate", "overlapping")
         state = last_state(plan.first.scene, run)
@@ -244,18 +244,18 @@ def _slowest_decay(scene: Scene) -> float:
     return slowest if slowest > 1e-12 * float(np.max(np.abs(poles))) else 0.0
 
 
-def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -> float:
-    """Estimate the relative distance of a motion from its steady state from the drifts of its stretches so far.
+def _distance(drifts: Sequence[float], run: Run, decay: float, segment: float) -> float:
+    """Estimate the relative distance of a motion from its steady state from the drifts of its segments so far.
 
     A distance that decays at the rate a decreases by the fraction 1 - exp(-a T) during the time T between the two halves of the
     measuring window; this decrease is the drift. Free vibrations that beat with the jam make some drifts small by chance.
     Therefore the largest of the last three drifts is used; fewer suffice if the vibrations decay within a window. The rate a is
     the slowest `decay` of the carrier; if a vibration does not decay, it is the rate at which the drift decreases from one
-    stretch, of the length `stretch`, to the next.
+    segment, of the length `segment`, to the next.
     """
     half, recent = 0.5 * float(np.ptp(np.asarray(run.window.time))), max(drifts[-3:])
     if decay == 0.0 and len(drifts) >= 6 and recent > 0.0:
-        decay = max(math.log(max(drifts[-6:-3]) / recent) / (3.0 * stretch), 0.0)
+        decay = max(math.log(max(drifts[-6:-3]) / recent) / (3.0 * segment), 0.0)
     fall = -math.expm1(-decay * half)
     if recent == 0.0:
         return 0.0
@@ -265,7 +265,7 @@ def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -
 def _steady_in_the_mean(measured: np.ndarray) -> bool:
     """Return True if measured values scatter about constant means.
 
-    **Arguments**: `measured` (4 n, 3 + nd): for each stretch the drift, the load speed, the force and the amplitudes as lengths
+    **Arguments**: `measured` (4 n, 3 + nd): for each segment the drift, the load speed, the force and the amplitudes as lengths
     (`Carrier.as_lengths`). Changes below half the drift are ignored.
     """
     drift, values = measured[:, 0], measured[:, 1:]
@@ -284,8 +284,8 @@ def _steady_in_the_mean(measured: np.ndarray) -> bool:
 
 
 def _is_creeping(regimes: Sequence[Regime]) -> bool:
-    """Return True if the loads balance the rotor in each stretch, and creep evenly along balanced arrangements."""
-    if len(regimes) < _CREEP_STRETCHES or not all(bool(regime.name == RegimeName.balanced) for regime in regimes):
+    """Return True if the loads balance the rotor in each segment, and creep evenly along balanced arrangements."""
+    if len(regimes) < _CREEP_SEGMENTS or not all(bool(regime.name == RegimeName.balanced) for regime in regimes):
         return False
     phase = np.array([np.asarray(regime.phase) for regime in regimes])
     unbalance = np.array([float(regime.unbalance) for regime in regimes])

@@ -103,7 +103,7 @@ def simulate(
       a contact with a `Stop` or a `LoadContact` that has damping begins, and its force jumps; second derivatives do not
     - In single precision, the default methods of order 8 keep angles within one turn during the integration, and angles of the
       window are relative to the number of turns at its beginning. Runs of one exciter of more than 20,000 turns at constant
-      speed that keep only a window are divided into stretches. Long runs therefore keep their phase
+      speed that keep only a window are divided into segments. Long runs therefore keep their phase
 
     **Raises** `InputError` for values that are not allowed, `ComputationError` for a run that does not finish.
 
@@ -162,13 +162,13 @@ def run_planned(plan: RunPlan, *, throw: bool) -> Run:
 
 
 def _run(plan: RunPlan, control: Control, *, is_measured: bool = True) -> Run:
-    """Return a run with the steps of `control`, in the stretches of the plan; `is_measured`: True to measure its window."""
-    if plan.stretches > 1:
-        return _run_in_stretches(plan, control, is_measured=is_measured)
-    return _run_stretch(plan, plan.end, plan.state, control, is_measured=is_measured)
+    """Return a run with the steps of `control`, in the segments of the plan; `is_measured`: True to measure its window."""
+    if plan.segments > 1:
+        return _run_in_segments(plan, control, is_measured=is_measured)
+    return _run_segment(plan, plan.end, plan.state, control, is_measured=is_measured)
 
 
-def _run_stretch(plan: RunPlan, end: Array, state: State, control: Control, *, is_measured: bool) -> Run:
+def _run_segment(plan: RunPlan, end: Array, state: State, control: Control, *, is_measured: bool) -> Run:
     return integrate(*_integration(plan, end, state, control, is_measured=is_measured))
 
 
@@ -181,7 +181,7 @@ def prepare_run(plan: RunPlan) -> None:
 def _integration(
     plan: RunPlan, end: Array, state: State, control: Control, *, is_measured: bool
 ) -> tuple[Scene, Array, State, IntegrationPlan, np.ndarray | None]:
-    """Return the arguments of `integrate` for one stretch."""
+    """Return the arguments of `integrate` for one segment."""
     integration, measuring = plan.integration._replace(control=control), None
     if plan.is_known and plan.integration.adjoint is None:
         # One program serves runs with any limit of steps, measured or not.
@@ -198,19 +198,19 @@ def _with_limit_as_number(integration: IntegrationPlan) -> IntegrationPlan:
     return integration._replace(control=StepControl(control.tolerance, control.steps, limit), max_steps=MAX_STEPS)
 
 
-def _run_in_stretches(plan: RunPlan, control: Control, *, is_measured: bool) -> Run:
-    """Return the run of the last of several stretches.
+def _run_in_segments(plan: RunPlan, control: Control, *, is_measured: bool) -> Run:
+    """Return the run of the last of several segments.
 
-    Each stretch begins at time 0 after a whole number of turns of the rotor, with angles within one turn.
+    Each segment begins at time 0 after a whole number of turns of the rotor, with angles within one turn.
     """
-    number, end = plan.stretches, float(plan.end)
+    number, end = plan.segments, float(plan.end)
     if isinstance(control, StepControl) and control.steps is not None:
         control = StepControl(steps=np.asarray(np.ceil(control.steps / number), control.steps.dtype))
     length, state, runs = whole_turns(plan.scene, end / number), plan.state, []
     for k in range(number):
         is_last = k == number - 1
         span = jnp.asarray(end - (number - 1) * length if is_last else length, plan.end.dtype)
-        run = _run_stretch(plan, span, state, control, is_measured=is_measured and is_last)
+        run = _run_segment(plan, span, state, control, is_measured=is_measured and is_last)
         runs.append(run)
         if status_name(run.status) != "done":
             break

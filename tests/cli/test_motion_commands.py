@@ -101,15 +101,15 @@ def test_settle_and_growth_pass_their_options(typed, tmp_path, monkeypatch):
         return kept
 
     monkeypatch.setattr("jaxvib.settle", noted)
-    words = ("settle", "machine.toml", "--mode", "3", "--step-tolerance", "1e-7", "--drift", "1e-5", "--stretches", "9")
+    words = ("settle", "machine.toml", "--mode", "3", "--step-tolerance", "1e-7", "--drift", "1e-5", "--segments", "9")
     code, out, _ = typed(*words, "--json", "--out", "o")
     assert code == 0 and json.loads(out)["omega"] == float(kept.omega) and (tmp_path / "o" / "run.npz").exists()
     (named,) = asked[0]
-    assert (named["mode"], named["drift"], named["stretches"], named["start"]) == (3, 1e-5, 9, None)
+    assert (named["mode"], named["drift"], named["segments"], named["start"]) == (3, 1e-5, 9, None)
     assert named["stepsize_controller"] == jv.Tolerance(1e-7)
     assert "--tolerance is for jams; these loads are unsettled" in typed("settle", "machine.toml", "--tolerance", "mass=5%")[2]
-    code, _, err = typed("growth", "machine.toml", "--until", "4s", "--stretches", "5")
-    assert code == 2 and "stretches is 5; at least 8 are needed" in err
+    code, _, err = typed("growth", "machine.toml", "--until", "4s", "--segments", "5")
+    assert code == 2 and "segments is 5; at least 8 are needed" in err
     code, _, err = typed("growth", "machine.toml", "--until", "4s", "--start", "spin_up")
     assert code == 2 and "start is 'spin_up'" in err
 

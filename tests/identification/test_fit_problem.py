@@ -135,7 +135,7 @@ def test_span_of_the_angle_bounds_the_samples():
     assert found.marked and found.raw[0][0, 0] == np.sin(0.5)
 
 
-def test_long_records_are_in_stretches():
+def test_long_records_are_in_segments():
     t = 1e-3 * np.arange(9000)
     run = run_with({"a": np.sin(t)}, {"a": t})
     found = build_problem(scene_of(), [run], ["machine.stiffness"], {})

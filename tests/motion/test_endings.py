@@ -13,7 +13,7 @@ from scenes import published, scene
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.integrate import _diverged, _status, is_finite
-from jaxvib.motion.plan import plan_stretch
+from jaxvib.motion.plan import plan_segment
 from jaxvib.ode.control import PIController
 from jaxvib.ode.dopri8 import UnrolledDopri8
 
@@ -38,7 +38,7 @@ def test_a_run_that_does_not_finish_says_so():
 
 def test_equal_steps_are_within_the_default_limit():
     s = published().scene()
-    plan = plan_stretch(s, 1.0, jv.initial_state(s), jv.EqualSteps(40_000), throw=True)
+    plan = plan_segment(s, 1.0, jv.initial_state(s), jv.EqualSteps(40_000), throw=True)
     assert plan.integration.max_steps == 65_536 and float(plan.integration.control.steps) == 40_000
 
 

@@ -24,7 +24,7 @@ def forced(cubic, stiffness):
 def test_a_strange_attractor_is_named():
     """Ueda's; the validation compares its exponent with SciPy's, over more turns."""
     scene, start = forced(1.0, 1e-6)
-    found = jv.growth(scene, 4800.0, start=start, stretches=160)
+    found = jv.growth(scene, 4800.0, start=start, segments=160)
     assert found.status_name == "chaotic" and 0.05 < found.exponent < 0.2
     np.testing.assert_allclose(found.horizon * found.exponent, -np.log(np.finfo(float).eps))
 
@@ -32,7 +32,7 @@ def test_a_strange_attractor_is_named():
 def test_a_linear_oscillator_is_regular():
     """It forgets at half its damping over its mass, the load's angle keeps what it has."""
     scene, start = forced(0.0, 1.0)
-    found = jv.growth(scene, 100.0, start=start, stretches=8)
+    found = jv.growth(scene, 100.0, start=start, segments=8)
     assert found.status_name == "regular" and np.isinf(found.horizon) and found.rates.shape == (8,)
     assert -0.026 < found.exponent < 1e-3
 
@@ -56,18 +56,18 @@ def on_orbit(scene, mode):
 def test_an_unstable_jam_grows_as_its_multiplier(numbers):
     scene = jammed(**numbers)
     start, rate = on_orbit(scene, 2)
-    found = jv.growth(scene, 20.0 / rate, start=start, stretches=16)
+    found = jv.growth(scene, 20.0 / rate, start=start, segments=16)
     assert found.status_name == "unstable"
     np.testing.assert_allclose(found.exponent, rate, rtol=0.01)
     np.testing.assert_allclose(found.horizon, -np.log(np.finfo(float).eps) / rate, rtol=0.01)
 
 
-@pytest.mark.parametrize(("until", "stretches"), [(1.0, 8), (2.0, 8), (3.0, 20)])
-def test_a_short_run_at_an_unstable_jam_is_undecided(until, stretches):
+@pytest.mark.parametrize(("until", "segments"), [(1.0, 8), (2.0, 8), (3.0, 20)])
+def test_a_short_run_at_an_unstable_jam_is_undecided(until, segments):
     """Its rate is certain long before disturbances have grown a thousandfold."""
     scene = jammed()
     start, rate = on_orbit(scene, 2)
-    found = jv.growth(scene, until, start=start, stretches=stretches)
+    found = jv.growth(scene, until, start=start, segments=segments)
     assert found.status_name == "undecided" and found.exponent > 3.0 * found.uncertainty
     assert 0.7 < found.horizon * rate / -np.log(np.finfo(float).eps) < 1.0
     assert "horizon at least" in found.summary()
@@ -76,7 +76,7 @@ def test_a_short_run_at_an_unstable_jam_is_undecided(until, stretches):
 def test_growth_after_leaving_a_jam_is_that_of_the_new_motion():
     """Rounding leaves the unstable jam after some 8 s; the later half of the run is at the stable one."""
     scene = jammed()
-    found = jv.growth(scene, 40.0, start=on_orbit(scene, 2)[0], stretches=40)
+    found = jv.growth(scene, 40.0, start=on_orbit(scene, 2)[0], segments=40)
     assert found.status_name == "regular" and np.isinf(found.horizon)
     np.testing.assert_allclose(found.rates[2:6], on_orbit(scene, 2)[1], rtol=0.01)
 
@@ -141,7 +141,7 @@ def test_wrapped_angles_are_compared_across_a_turn(monkeypatch):
     monkeypatch.setattr("jaxvib.motion.growth._has_returned", lambda *_: False)
     with jax.enable_x64(False):
         scene, start = forced(0.0, 1.0)
-        found = jv.growth(scene, 100.0, start=start, stretches=8)
+        found = jv.growth(scene, 100.0, start=start, segments=8)
     # From 0.01 apart, of which what is no angle stays.
     grown = 0.01 * np.exp(found.rates * found.time[0])
     assert np.all((grown > 2.0 * np.pi - 6.2 - 1e-5) & (grown < np.hypot(2.0 * np.pi - 6.2, 0.01) + 1e-5))
@@ -150,7 +150,7 @@ def test_wrapped_angles_are_compared_across_a_turn(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (dict(stretches=4), "at least 8 are needed"),
+        (dict(segments=4), "at least 8 are needed"),
         (dict(start="jam"), "mode is missing"),
         (dict(start="spin_up"), "start is 'spin_up'; the growth of disturbances needs a constant rotor speed"),
         (dict(until=0.0), "greater than 0"),
@@ -201,7 +201,7 @@ def test_growth_of_two_motors_is_that_of_their_multiplier(phase, name):
     exciters = [jv.Exciter(drive=d, unbalance=1.0, at=(x, 0.0)) for d, x in zip(drives, (-0.4, 0.4), strict=True)]
     scene = jv.Scene(machine, exciters=exciters)
     orbit = jv.synchronous_orbit(scene, phases=[0.0, phase])
-    growth = jv.growth(scene, 5.0 if name == "unstable" else 20.0, start=orbit.at(0.0), stretches=16)
+    growth = jv.growth(scene, 5.0 if name == "unstable" else 20.0, start=orbit.at(0.0), segments=16)
     assert growth.status_name == name and bool(orbit.stable) == (name == "regular")
     if name == "unstable":
         exponent = np.log(float(orbit.multiplier)) * float(orbit.speed) / (2.0 * np.pi)

@@ -1,4 +1,4 @@
-"""Runs until nothing changes: where they end, and how they go on from stretch to stretch."""
+"""Runs until nothing changes: where they end, and how they go on from segment to segment."""
 
 from types import SimpleNamespace
 
@@ -33,24 +33,24 @@ def test_settle_does_not_pass_a_jam_that_only_glued_loads_keep():
     assert caught.value.status in ("left_mode", "not_settled")
 
 
-def test_a_stretch_goes_on_where_the_last_one_ended():
+def test_a_segment_goes_on_where_the_last_one_ended():
     """Under an imbalance too: the rotor is where it was after whole turns, and every load where it is within a turn."""
     machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     loads = jv.pendulums(count=2, mass=0.05, radius=0.08, drag=1.94)
     s = jv.Scene(machine, loads, jv.ConstantSpeed(460.0), effects=(jv.StaticImbalance("8 g m"),))
     start = jv.initial_state(s, angles=[0.3, 2.0])
-    stretch = whole_turns(s, 0.2)
-    assert stretch <= 0.2 and abs(np.sin(460.0 * stretch)) < 1e-12
+    segment = whole_turns(s, 0.2)
+    assert segment <= 0.2 and abs(np.sin(460.0 * segment)) < 1e-12
     given = dict(save="window", stepsize_controller=jv.Tolerance(1e-11), estimate=False)
-    once = jv.simulate(s, 2.0 * stretch, start=start, **given).window.state
-    first = last_state(s, jv.simulate(s, stretch, start=start, **given))
+    once = jv.simulate(s, 2.0 * segment, start=start, **given).window.state
+    first = last_state(s, jv.simulate(s, segment, start=start, **given))
     assert float(jnp.max(jnp.abs(first.angle[0]))) <= np.pi
-    twice = jv.simulate(s, stretch, start=first, **given).window.state
+    twice = jv.simulate(s, segment, start=first, **given).window.state
     np.testing.assert_allclose(twice.displacement[-1], once.displacement[-1], rtol=1e-6)
     np.testing.assert_allclose(np.sin(twice.angle[0][-1]), np.sin(once.angle[0][-1]), atol=1e-6)
 
 
-def test_a_stretch_is_a_whole_number_of_periods_of_the_supply():
+def test_a_segment_is_a_whole_number_of_periods_of_the_supply():
     circuit = dict(stator_resistance=1.2, rotor_resistance=1.0, stator_leakage=6e-3, rotor_leakage=6e-3)
 
     def motor(frequency):
@@ -70,7 +70,7 @@ def test_balls_that_touch_settle_side_by_side():
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
     loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5, ball_radius=0.03)
     s = jv.Scene(machine, loads, jv.ConstantSpeed(60.0), effects=(jv.LoadContact(1e5, 200.0),))
-    run = jv.settle(s, mode=1, drift=1e-3, periods=20, stretches=8)
+    run = jv.settle(s, mode=1, drift=1e-3, periods=20, segments=8)
     angle = np.asarray(run.window.state.angle[0])
     ahead, beside = angle[:, 1] - angle[:, 0], 2.0 * np.arcsin(0.03 / 0.1)
     assert np.all(np.abs(ahead - beside) < 0.1), (ahead.min(), ahead.max(), beside)
@@ -96,18 +96,18 @@ def two_pendulums(mass, drag, imbalance):
 def test_a_motion_that_beats_has_settled_in_the_mean():
     """Jammed loads and an imbalance beat for ever; asked for a motion that repeats itself, there is none."""
     s, start = two_pendulums(mass=0.2, drag=0.5, imbalance="4 g m")
-    run = jv.settle(s, start=start, stretches=100)
+    run = jv.settle(s, start=start, segments=100)
     assert run.status_name == "beating" and run.regime.label == "jammed" and 1e-4 < float(run.drift) < 1e-2
     assert "steady in the mean" in run.summary()
-    with pytest.raises(jv.ComputationError, match="after 40 stretches of 100 periods of the lowest") as caught:
-        jv.settle(s, start=start, drift=1e-6, stretches=40)
+    with pytest.raises(jv.ComputationError, match="after 40 segments of 100 periods of the lowest") as caught:
+        jv.settle(s, start=start, drift=1e-6, segments=40)
     assert caught.value.status == "not_settled"
 
 
 def test_a_balanced_rotor_settles_although_its_rounding_does_not():
     """Only changes from turn to turn remain of its amplitude."""
     s, start = two_pendulums(mass=0.2, drag=1.94, imbalance="8 g m")
-    run = jv.settle(s, start=start, stretches=40)
+    run = jv.settle(s, start=start, segments=40)
     assert run.status_name == "done" and run.regime.label == "balanced" and float(run.drift) < 1e-6
     assert float(run.amplitude.max()) < 1e-12
 
@@ -131,34 +131,34 @@ def test_what_is_steady_in_the_mean():
 
 
 def test_settle_refuses_a_spin_up_and_an_accuracy():
-    """Each stretch begins with the rotor at its full speed, so that this start would be that at rest."""
+    """Each segment begins with the rotor at its full speed, so that this start would be that at rest."""
     with pytest.raises(jv.InputError, match=r"start is 'spin_up'; a motion settles at a constant rotor speed; use .*'rest'"):
         jv.settle(scene(), start="spin_up")
     with pytest.raises(jv.InputError, match=r"^stepsize_controller is Accuracy\(error=0.1\); it must be one of: Tolerance"):
         jv.settle(scene(), stepsize_controller=jv.Accuracy(0.1))
 
 
-def test_settle_stops_where_a_stretch_fails():
+def test_settle_stops_where_a_segment_fails():
     soft = scene("one_mass", "rollers", speed=60.0, effects=(jv.CubicSupport(-4e9),))
     start = jv.State(jnp.asarray([0.01]), jnp.zeros(1), (jnp.zeros(1),), (jnp.zeros(1),))
     run = jv.settle(soft, start=start, periods=1, throw=False)
     assert not bool(run.status == jv.RunStatus.done) and not bool(run.status == jv.RunStatus.no_start)
 
 
-def test_single_precision_goes_on_from_stretch_to_stretch(monkeypatch):
-    """A long run in stretches ends where a run in double precision does, with the rotor's imbalance where it was."""
+def test_single_precision_goes_on_from_segment_to_segment(monkeypatch):
+    """A long run in segments ends where a run in double precision does, with the rotor's imbalance where it was."""
     machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     loads = jv.pendulums(count=2, mass=0.05, radius=0.08, drag=1.94)
     s = jv.Scene(machine, loads, jv.ConstantSpeed(460.0), effects=(jv.StaticImbalance("4 g m"),))
     start = eqx.tree_at(lambda y: y.rate, jv.initial_state(s, angles=[1.5, -2.0]), (jnp.full(2, 460.0),))
     exact = jv.simulate(s, 3.0, start=start, save="window", estimate=False)
-    monkeypatch.setattr("jaxvib.motion.plan._STRETCH_TURNS", 60.0)
+    monkeypatch.setattr("jaxvib.motion.plan._SEGMENT_TURNS", 60.0)
     with jax.enable_x64(False):
         single = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), (s, start))
         run = jv.simulate(single[0], 3.0, start=single[1], save="window", estimate=False)
         phase, unbalance = run.regime.phase, run.regime.unbalance
     np.testing.assert_allclose(run.window.time[-1], 3.0, rtol=1e-6)
-    assert int(run.evaluations) > 10 * int(run.steps) > 0  # those of all stretches
+    assert int(run.evaluations) > 10 * int(run.steps) > 0  # those of all segments
     np.testing.assert_allclose(np.exp(1j * phase), np.exp(1j * exact.regime.phase), atol=1e-2)
     np.testing.assert_allclose(unbalance, exact.regime.unbalance, atol=1e-2)
     assert not np.allclose(np.exp(1j * phase), 1.0, atol=0.3)
@@ -166,7 +166,7 @@ def test_single_precision_goes_on_from_stretch_to_stretch(monkeypatch):
 
 @pytest.mark.parametrize(("separation", "steady"), [(2.5, True), (6.0, False)])
 def test_means_of_quarters_are_compared_with_their_error(separation, steady):
-    """40 stretches a quarter, scattering by +-1e-3 about means that are so many errors of a mean apart."""
+    """40 segments a quarter, scattering by +-1e-3 about means that are so many errors of a mean apart."""
     swing = 1e-3 * np.tile([1.0, -1.0], 20)
     error = np.std(swing, ddof=1) / np.sqrt(40.0)
     quarters = [1.0 + swing + (separation * error if k == 2 else 0.0) for k in range(4)]
@@ -176,7 +176,7 @@ def test_means_of_quarters_are_compared_with_their_error(separation, steady):
 
 
 def begins_at(monkeypatch, s, **given):
-    """The state that the first stretch starts from."""
+    """The state that the first segment starts from."""
     starts = []
 
     def interrupted(plan, **_):
@@ -196,14 +196,14 @@ def test_loads_settle_from_angles_one_degree_apart(monkeypatch, given):
     np.testing.assert_array_equal(np.diff(begins_at(monkeypatch, s, separation=0.0).azimuth), [0.0, 0.0])
 
 
-@pytest.mark.parametrize(("periods", "stretches"), [(100, 32), (400, 32), (50, 64), (30, 108)])
-def test_at_least_32_stretches_are_judged(monkeypatch, periods, stretches):
-    """A stretch has 100 slow periods; every quarter has a whole number of stretches."""
+@pytest.mark.parametrize(("periods", "segments"), [(100, 32), (400, 32), (50, 64), (30, 108)])
+def test_at_least_32_segments_are_judged(monkeypatch, periods, segments):
+    """A segment has 100 slow periods; every quarter has a whole number of segments."""
     run, seen = small_run(save="window"), []
     monkeypatch.setattr("jaxvib.motion.settle.run_planned", lambda *_, **__: run)
     monkeypatch.setattr("jaxvib.motion.settle._steady_in_the_mean", lambda rows: seen.append(rows.shape) or len(seen) > 1)
     found = jv.settle(small_machine(), start=small_start(), periods=periods)
-    assert found.status_name == "beating" and seen == [(stretches, 5)] * 2
+    assert found.status_name == "beating" and seen == [(segments, 5)] * 2
 
 
 def test_rotations_are_compared_as_lengths(monkeypatch):
@@ -215,11 +215,11 @@ def test_rotations_are_compared_as_lengths(monkeypatch):
 
 
 @pytest.mark.parametrize("periods", [100, 30])
-def test_a_stretch_is_so_many_periods_of_the_slowest_resonance(monkeypatch, periods):
-    """A stretch has a whole number of turns of the rotor, which turns three times in a time unit of this machine."""
+def test_a_segment_is_so_many_periods_of_the_slowest_resonance(monkeypatch, periods):
+    """A segment has a whole number of turns of the rotor, which turns three times in a time unit of this machine."""
     asked, run = [], small_run(save="window")
     monkeypatch.setattr("jaxvib.motion.settle.run_planned", lambda plan, **_: asked.append(float(plan.end)) or run)
-    jv.settle(small_machine(), start=small_start(), periods=periods, stretches=1, throw=False)
+    jv.settle(small_machine(), start=small_start(), periods=periods, segments=1, throw=False)
     slowest, turn = float(np.min(jv.natural_frequencies(small_machine()))), 2.0 * np.pi / float(small_machine().drive.speed)
     turns = asked[0] / turn
     np.testing.assert_allclose(turns, round(turns), rtol=1e-9)
@@ -277,7 +277,7 @@ def test_the_distance_from_the_end_follows_from_decays():
     weak = 1.0 - np.exp(-0.1)
     assert far([1e-3], 0.1) == far([1e-3, 1e-4], 0.1) == np.inf  # a single drift may be small by chance
     np.testing.assert_allclose(far([9.0, 1e-4, 1e-3, 1e-5], 0.1), 1e-3 / weak, rtol=1e-12)
-    # Without a decay of the carrier that of the drifts counts: the largest of three fall to a hundredth in three stretches.
+    # Without a decay of the carrier that of the drifts counts: the largest of three fall to a hundredth in three segments.
     falling = [1e-2, 5e-3, 1e-3, 1e-4, 2e-5, 1e-5]
     np.testing.assert_allclose(far(falling, 0.0), 1e-4 / (1.0 - 100.0 ** (-1.0 / 30.0)), rtol=1e-12)
     assert far(falling[::-1], 0.0) == far(falling[:5], 0.0) == np.inf and far([0.0], 0.0) == 0.0
@@ -302,7 +302,7 @@ def test_loads_that_creep_along_balanced_arrangements_settle(monkeypatch):
     assert np.max(np.abs(change)) > 1e-6
     assert abs(np.sum(np.exp(1j * after) * change)) < 0.02 * np.sum(np.abs(change))
     with pytest.raises(jv.ComputationError) as caught:
-        jv.settle(s, start=start, periods=40, drift=1e-6, stretches=8)
+        jv.settle(s, start=start, periods=40, drift=1e-6, segments=8)
     assert caught.value.status == "not_settled"
 
 

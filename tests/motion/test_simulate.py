@@ -87,7 +87,7 @@ def test_memory_of_a_sample_is_that_of_its_stored_arrays(s):
     ("change", "says"),
     [
         (dict(start="spin_up", spin_up=5.0), "longer than the run"),
-        (dict(until=1e308), "run shorter stretches"),
+        (dict(until=1e308), "run shorter segments"),
     ],
 )
 def test_runs_that_cannot_be_are_refused(change, says):

@@ -8,7 +8,7 @@ import pytest
 from scenes import published, scene
 
 import jaxvib as jv
-from jaxvib.motion.plan import plan_stretch
+from jaxvib.motion.plan import plan_segment
 
 
 def test_a_long_run_keeps_its_phase():
@@ -49,8 +49,8 @@ def test_long_runs_are_divided_in_both_directions():
         turning = jv.Scene(scene().machine, exciters=[jv.Exciter(scene().loads, scene().drive, direction=way)])
         with jax.enable_x64(False):
             single = machine32(turning)
-            plan = plan_stretch(single, 3e3, jv.initial_state(single), jv.Tolerance(1e-5), throw=True)
-        assert plan.stretches == 3
+            plan = plan_segment(single, 3e3, jv.initial_state(single), jv.Tolerance(1e-5), throw=True)
+        assert plan.segments == 3
 
 
 def test_an_imbalance_sets_the_unit_where_loads_hardly_shake():

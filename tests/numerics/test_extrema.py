@@ -29,8 +29,8 @@ def test_each_half_has_its_own_and_the_whole_the_better_of_both():
     fine = np.linspace(0.0, s[-1], 2_000_001)
     exact = (1.0 + fine) * np.sin(fine)
     half = fine <= s[99]
-    for k, stretch in enumerate((half, ~half, slice(None))):
-        np.testing.assert_allclose([low[k], high[k]], [exact[stretch].min(), exact[stretch].max()], rtol=1e-9)
+    for k, segment in enumerate((half, ~half, slice(None))):
+        np.testing.assert_allclose([low[k], high[k]], [exact[segment].min(), exact[segment].max()], rtol=1e-9)
     np.testing.assert_array_equal(high[2], jnp.max(high[:2]))
     assert np.all((place >= 0.0) & (place <= 3.0)) and np.all((first >= 0) & (first <= 196))
     x, v = (jnp.asarray(y[np.asarray(first)[..., None] + np.arange(4)]) for y in (growing, slope))

@@ -140,7 +140,7 @@ def test_given_steps_need_no_noting(controller):
 
 @pytest.mark.parametrize("max_steps", [2**17, 2**20])
 def test_states_that_were_not_noted_are_computed_again(right, max_steps):
-    """Only every 2nd and 16th state is recorded; the last stretch is shorter."""
+    """Only every 2nd and 16th state is recorded; the last segment is shorter."""
     reverse = jnp.stack(eqx.filter_jit(jax.jacrev(lambda args: run(args, max_steps=max_steps)))(ARGS))
     np.testing.assert_allclose(reverse, right, atol=1e-12 * float(jnp.max(jnp.abs(right))))
 

@@ -49,7 +49,7 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode near which
     "--drift", type=float, help="Largest drift (relative change) of a settled motion [1e-6, or a change without a trend]."
 )
 @click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-9].")
-@click.option("--stretches", type=int, default=200, show_default=True, help="Largest number of stretches of the run.")
+@click.option("--segments", type=int, default=200, show_default=True, help="Largest number of segments of the run.")
 @SPEED
 @TOLERANCE
 @deck_options
@@ -64,7 +64,7 @@ def settle(
 ) -> None:
     """Integrate the full equations of SCENE until amplitudes and speeds no longer change, or change without a trend.
 
-    The run consists of stretches of 100 periods of the lowest natural frequency; --out saves the last one. With --drift, the
+    The run consists of segments of 100 periods of the lowest natural frequency; --out saves the last one. With --drift, the
     motion must settle to this drift; a motion that is only steady in the mean (changes without a trend) does not suffice.
     """
     loaded = loaded_scene(scene, speed=speed, constant=True)
@@ -127,7 +127,7 @@ def envelope(
 @_MODE
 @SEPARATION
 @SPEED
-@click.option("--stretches", type=int, default=40, show_default=True, help="Number of equal parts of the run, at least 8.")
+@click.option("--segments", type=int, default=40, show_default=True, help="Number of equal parts of the run, at least 8.")
 @shared
 def growth(scene: Path, speed: str | None, output: Output, **options: Any) -> None:
     """Measure the growth of small disturbances of a motion of SCENE.

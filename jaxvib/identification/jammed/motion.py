@@ -2,17 +2,17 @@
 derivatives.
 
 The state is y = (q, q', angles of the loads, their rates, states of high-pass filters). The exact equations of the scene are
-integrated by equal steps of order 8, over J stretches of a record at once. A step also ends where the contact with a stop
-begins or ends, see `jaxvib.identification.supports.contact`. The last state end_j of stretch j has the derivative G_j with
-respect to the first state start_j of the stretch, and H_j with respect to all other unknowns z. A change dz, and a change of
+integrated by equal steps of order 8, over J segments of a record at once. A step also ends where the contact with a stop
+begins or ends, see `jaxvib.identification.supports.contact`. The last state end_j of segment j has the derivative G_j with
+respect to the first state start_j of the segment, and H_j with respect to all other unknowns z. A change dz, and a change of
 the state at the first sample, then change start_j by D_j:
 
     D_1 = d(state at the first sample),      D_{j+1} = G_j D_j + H_j dz + (end_j - start_{j+1})
 
-The last term closes the gaps between the stretches. Without gaps this is the derivative of the whole motion. The motion of
+The last term closes the gaps between the segments. Without gaps this is the derivative of the whole motion. The motion of
 jammed loads or on damped supports is stable; therefore the products of G_j do not grow.
 
-Sizes of arrays: n samples, J stretches of `length` samples, C channels, nd coordinates of the carrier, ns states, p unknowns x
+Sizes of arrays: n samples, J segments of `length` samples, C channels, nd coordinates of the carrier, ns states, p unknowns x
 of the scene and the sensors (see `Unknowns`). `pair` are the two components of the unbalance.
 """
 
@@ -108,13 +108,13 @@ def _rates(samples: Samples, t: Array, y: Array, equations: _Equations) -> tuple
     return rates, readings.at[filtered].add(-slow)
 
 
-def _stretch(
+def _segment(
     unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pair: Array, start: Array, begin: Array, length: int
 ) -> tuple[Array, Array, Array]:
     """Return the readings (length, C) and the states (length, ns) from the sample `begin` on, and the state at the end."""
     equations = _equations(unknowns, samples, scene, x, pair)
     term = diffrax.ODETerm(lambda t, y, args: _rates(samples, jnp.asarray(t), y, args)[0])
-    per_sample, solver, has_stops = samples.stretches[2], LoopDopri8(tangents=True), side_count(equations.dynamics) > 0
+    per_sample, solver, has_stops = samples.segments[2], LoopDopri8(tangents=True), side_count(equations.dynamics) > 0
 
     def step(t: Array, y: Array, h: Array, dynamics: Dynamics) -> Array:
         return solver.step(term, t, t + h, y, equations._replace(dynamics=dynamics), None, False)[0]
@@ -166,33 +166,33 @@ def _recorded(samples: Samples) -> tuple[Array, Array]:
 
 
 @cached
-def stretches(
+def segments(
     unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pair: Array, starts: Array, length: int
 ) -> tuple[Array, Array, Array]:
-    """Return the readings (J, length, C), the states (J, length, ns) and the last states (J, ns) of J stretches.
+    """Return the readings (J, length, C), the states (J, length, ns) and the last states (J, ns) of J segments.
 
     **Arguments**: `x` (p,) and `pair` (2,): unknowns; `starts` (J, ns): first states.
     """
     begins = length * jnp.arange(starts.shape[0])
-    return jax.vmap(lambda start, begin: _stretch(unknowns, samples, scene, x, pair, start, begin, length))(starts, begins)
+    return jax.vmap(lambda start, begin: _segment(unknowns, samples, scene, x, pair, start, begin, length))(starts, begins)
 
 
 @cached
 def _slopes(
     unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pair: Array, starts: Array
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return readings and last states as `stretches`, and their derivatives (..., p + 2 + ns) with respect to x, pair and first
+    """Return readings and last states as `segments`, and their derivatives (..., p + 2 + ns) with respect to x, pair and first
     state."""
-    length, p = samples.stretches[1], x.shape[0]
+    length, p = samples.segments[1], x.shape[0]
 
     def motion(free: Array, begin: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        readings, _, end = _stretch(unknowns, samples, scene, free[:p], free[p : p + 2], free[p + 2 :], begin, length)
+        readings, _, end = _segment(unknowns, samples, scene, free[:p], free[p : p + 2], free[p + 2 :], begin, length)
         return (readings, end), (readings, end)
 
-    def of_stretch(start: Array, begin: Array) -> tuple[Any, Any]:
+    def of_segment(start: Array, begin: Array) -> tuple[Any, Any]:
         return jax.jacfwd(motion, has_aux=True)(jnp.concatenate([x, pair, start]), begin)
 
-    slopes, values = jax.vmap(of_stretch)(starts, length * jnp.arange(starts.shape[0]))
+    slopes, values = jax.vmap(of_segment)(starts, length * jnp.arange(starts.shape[0]))
     return values, slopes
 
 
@@ -201,13 +201,13 @@ class Linearized(NamedTuple):
 
     The f = p + ns + 2 + C unknowns are x, the state at the first sample, `pair` and the offsets of the channels, in this order.
     The last axis of `columns` and `start_changes` has f + 1 entries: the derivatives with respect to the unknowns, and the
-    change that closes the gaps between the stretches.
+    change that closes the gaps between the segments.
 
     **Attributes**
 
     - `model` (n, C): readings of the model after the filter; `columns` (n, C, f + 1): their changes
-    - `start_changes` (J, ns, f + 1): changes of the first states of the stretches
-    - `gaps` (J - 1, ns): last state of each stretch minus the first state of the next one
+    - `start_changes` (J, ns, f + 1): changes of the first states of the segments
+    - `gaps` (J - 1, ns): last state of each segment minus the first state of the next one
     """
 
     model: np.ndarray
@@ -221,7 +221,7 @@ def linearized(
 ) -> Linearized:
     """Return the linearized motion of a run.
 
-    **Arguments**: `x` (p,); `own`: state at the first sample, pair, offsets; `starts` (J, ns): first states of the stretches.
+    **Arguments**: `x` (p,); `own`: state at the first sample, pair, offsets; `starts` (J, ns): first states of the segments.
     """
     p, count = x.size, starts.shape[1]
     values, slopes = _slopes(unknowns, samples, scene, jnp.asarray(x), jnp.asarray(own[count : count + 2]), jnp.asarray(starts))
@@ -268,15 +268,15 @@ def closed_motion(
     unknowns: Unknowns, samples: Samples, scene: Scene, x: np.ndarray, own: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the readings (J x length, C) of a run with offsets, before the filter, and the first states (J, ns) of its
-    stretches.
+    segments.
 
     The motion is integrated from the state at the first sample, without gaps.
 
     **Arguments**: `own`: state at the first sample, pair, offsets.
     """
-    count, (number, length, _) = own.size - 2 - len(samples.channels), samples.stretches
+    count, (number, length, _) = own.size - 2 - len(samples.channels), samples.segments
     pair, start = jnp.asarray(own[count : count + 2]), jnp.asarray(own[None, :count])
-    motion = stretches(unknowns, samples, scene, jnp.asarray(x), pair, start, number * length)
+    motion = segments(unknowns, samples, scene, jnp.asarray(x), pair, start, number * length)
     readings, states = np.asarray(motion[0]), np.asarray(motion[1])
     return readings[0] + own[count + 2 :], states[0, ::length]
 

@@ -2,8 +2,8 @@
 
 The vibration at the speed of the jam gives the angle of the loads up to a constant. This constant follows, together with the
 motion of the machine and the unbalance of the rotor, from a linear fit in which the loads are an unbalance that turns by that
-angle. The motion is then divided into stretches, whose first states are unknowns of a fit with all other unknowns. The gaps
-between the stretches are penalized and vanish. Within a stretch, errors of the first values change the angles of the loads by
+angle. The motion is then divided into segments, whose first states are unknowns of a fit with all other unknowns. The gaps
+between the segments are penalized and vanish. Within a segment, errors of the first values change the angles of the loads by
 less than a radian, whereas over the whole record they would change them by many turns.
 """
 
@@ -60,7 +60,7 @@ the mean, relative to it. The first is for equal loads at one station, which gat
 changes no reading. The second is for all other loads."""
 
 _GAP_SIZE = 0.01
-"""Gap between two stretches, relative to the size of each state (angles: rad), that costs as much as a reading whose residual
+"""Gap between two segments, relative to the size of each state (angles: rad), that costs as much as a reading whose residual
 is one standard deviation."""
 
 _UNEXPLAINED = 0.25
@@ -85,7 +85,7 @@ class _Jam(NamedTuple):
 class _Trial(NamedTuple):
     """Values of all unknowns, with their cost and `equations`.
 
-    **Attributes**: `x`, `linear`; of each run, `starts` (J, ns) of its stretches, and their `start_changes`
+    **Attributes**: `x`, `linear`; of each run, `starts` (J, ns) of its segments, and their `start_changes`
     (J, ns, f + 1), see `Linearized`.
     """
 
@@ -179,12 +179,12 @@ def with_jam(problem: Problem, linear: np.ndarray, state: np.ndarray) -> tuple[P
 
 
 def is_jammed(problem: Problem, linear: np.ndarray) -> bool:
-    """Return True if the loads of the first run turn more slowly than the rotor at the first sample of each stretch."""
+    """Return True if the loads of the first run turn more slowly than the rotor at the first sample of each segment."""
     samples, indices = problem.runs[0], linear_indices(problem)[0]
     _, starts = closed_motion(problem.unknowns, samples, problem.scene, np.zeros(problem.unknowns.count), linear[indices])
     loads = _loads_of(problem.scene).count
     rates = starts[:, 2 * len(problem.scene.machine.structure().coordinates) + loads :][:, :loads]
-    speed = np.abs(np.gradient(problem.angles[0][:, 0], float(samples.step)))[:: samples.stretches[1]]
+    speed = np.abs(np.gradient(problem.angles[0][:, 0], float(samples.step)))[:: samples.segments[1]]
     return bool(np.all(np.abs(rates) < _BELOW_ROTOR * speed[: len(rates), None]))
 
 
@@ -237,7 +237,7 @@ def _jam_of(problem: Problem, r: int) -> _Jam:
 
 
 def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the states (J, ns) at the starts of the stretches of a run, the components of its unbalance, and its offsets, at
+    """Return the states (J, ns) at the starts of the segments of a run, the components of its unbalance, and its offsets, at
     the values `x`."""
     samples = problem.runs[r]
     scene_of_run = samples.scene(problem.unknowns.scene(problem.scene, x))
@@ -250,7 +250,7 @@ def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[
     jammed_scene = Scene(scene_of_run.machine, exciters=exciters, effects=scene_of_run.effects)
     empty, no = jnp.zeros(0), ()
     samples = dataclasses.replace(
-        samples, drives=drives, amounts=empty, changed=no, actions=no, turn=None, errors=(0, 0), stretches=(0, 0, 0)
+        samples, drives=drives, amounts=empty, changed=no, actions=no, turn=None, errors=(0, 0), segments=(0, 0, 0)
     )
     unknowns = Unknowns((), empty, empty, empty, no, 0)
     linear = project(
@@ -260,7 +260,7 @@ def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[
         ),
         np.zeros(0),
     ).linear  # fmt: skip
-    number, length, _ = problem.runs[r].stretches
+    number, length, _ = problem.runs[r].segments
     at = length * np.arange(number)
     pairs, channels = linear[: 2 * len(exciters)], len(samples.channels)
     ordered = np.concatenate([linear[2 * len(exciters) : -channels], pairs, linear[-channels:]])
@@ -273,7 +273,7 @@ def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[
 
 
 def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.ndarray]) -> _Trial:
-    """Return the best motion near the first values `x`, `linear` and `starts`, which leave gaps between the stretches."""
+    """Return the best motion near the first values `x`, `linear` and `starts`, which leave gaps between the segments."""
     p, size, indices_of_runs = x.size, x.size + linear.size, linear_indices(problem)
     whole = np.concatenate(starts)
     scale = np.maximum(np.sqrt(np.mean(whole**2, axis=0)), 1e-9 * np.max(np.abs(whole)))

@@ -60,7 +60,7 @@ def rising_edges(time: np.ndarray, level: np.ndarray, where: str) -> np.ndarray:
 
 
 def _starts(flags: np.ndarray) -> np.ndarray:
-    """Return the indices at which stretches of True begin."""
+    """Return the indices at which segments of True begin."""
     return np.flatnonzero(flags & ~np.concatenate([[False], flags[:-1]]))
 
 

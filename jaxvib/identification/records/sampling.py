@@ -22,8 +22,8 @@ _GAP = 1.5
 """Interval between samples, relative to the step, above which readings are missing."""
 
 _MIN_DROPOUT, _MIN_RATIO = 20, 10
-"""A stretch of equal readings is a dropout if it has at least the first number of readings, and at least the second number
-times the length that 99 % of all stretches do not exceed."""
+"""A segment of equal readings is a dropout if it has at least the first number of readings, and at least the second number
+times the length that 99 % of all segments do not exceed."""
 
 _BINS, _SPIKE, _MIN_CLIPPED = (0.001, 0.003, 0.01), 3.0, 10
 """Limits for clipped readings in a histogram: widths of its last bin, relative to the range of the values; smallest ratio of
@@ -104,9 +104,9 @@ def even_samples(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.nd
         count = int(np.count_nonzero(is_dropout))
         first = f"the first at {time[np.argmax(is_dropout)]:g} s"
         if count > _MAX_MISSING * value.size:
-            share = f"is constant in stretches for {count} of {value.size} readings, {first}"
+            share = f"is constant in segments for {count} of {value.size} readings, {first}"
             raise InputError(where, f"{share}: the sensor or its cable failed; use another part of the record")
-        notes.append(f"{where} is constant in stretches with {count} readings in total (dropouts), {first}; left out")
+        notes.append(f"{where} is constant in segments with {count} readings in total (dropouts), {first}; left out")
         value = np.where(is_dropout, np.nan, value)
     time, value, grid_notes = _on_grid(time, value, where)
     return time, value, notes + grid_notes
@@ -179,7 +179,7 @@ def _resolution(time: np.ndarray) -> float:
 
 
 def dropouts(value: np.ndarray) -> np.ndarray:
-    """Return True for readings in dropouts: long stretches of exactly equal readings that are neither the largest nor the
+    """Return True for readings in dropouts: long segments of exactly equal readings that are neither the largest nor the
     smallest, in a signal that otherwise changes.
 
     >>> x = np.sin(np.arange(400.0))

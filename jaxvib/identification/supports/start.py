@@ -46,7 +46,7 @@ def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     first values of the other unknowns, x.
 
     The linear response to the first record gives the size of the unbalance. The linear responses to the beginnings of all
-    records (their first stretches, see `Samples`) give the first states. If a fit of the linear machine explains the records as
+    records (their first segments, see `Samples`) give the first states. If a fit of the linear machine explains the records as
     well as the fit that begins with the guided motion, no stop is touched.
     """
     noise = [[Noise(np.ones(1), size) for size in of_run] for of_run in channel_sizes(problem)]
@@ -90,9 +90,9 @@ def _with_first_states(problem: Problem, x: np.ndarray, linear: np.ndarray) -> n
 
 
 def _beginning(samples: Samples) -> Samples:
-    """Return the samples with the weight 0 for all samples after the first stretch."""
+    """Return the samples with the weight 0 for all samples after the first segment."""
     index = jnp.arange(samples.weights.shape[0] * samples.weights.shape[1]).reshape(samples.weights.shape[:2])
-    weights = jnp.where(index[:, :, None] < samples.stretches[1], samples.weights, 0.0)
+    weights = jnp.where(index[:, :, None] < samples.segments[1], samples.weights, 0.0)
     return dataclasses.replace(samples, weights=weights)
 
 

@@ -358,8 +358,8 @@ def _away_from_zero(x: Array) -> Array:
 
 
 @cached
-def relative_amplitude(stretch: Trajectory, i: int, j: int) -> Array:
+def relative_amplitude(segment: Trajectory, i: int, j: int) -> Array:
     """Return the amplitude, m zero to peak, of platform `i` relative to platform `j` (from 1) over evenly spaced samples."""
-    x, v = (values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity))
-    (low, high), _, _ = locate_extrema(x, v * _step(stretch.time))
+    x, v = (values[:, i - 1] - values[:, j - 1] for values in (segment.state.displacement, segment.state.velocity))
+    (low, high), _, _ = locate_extrema(x, v * _step(segment.time))
     return (high - low)[2] / 2.0

@@ -164,7 +164,7 @@ class Regime(Result):
 
 
 @validated
-def regime(scene: Scene, stretch: Trajectory) -> Regime:
+def regime(scene: Scene, segment: Trajectory) -> Regime:
     """Return the kind of motion over a part of a run.
 
     - Loads that make less than one turn swing
@@ -179,7 +179,7 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
     **Arguments**
 
     - `scene` of the run
-    - `stretch`: the part of the run, a `Trajectory` such as `run.window`; typical: 20 or more turns
+    - `segment`: the part of the run, a `Trajectory` such as `run.window`; typical: 20 or more turns
 
     **Returns** `Regime`; `jit` and `vmap` are supported. If the motion is not steady, `name` is "unsettled" and no error is
     raised.
@@ -192,17 +192,17 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
     >>> bool(run.regime.name == jv.RegimeName.jammed), int(run.regime.mode)
     (True, 1)
     """
-    return _regime(validate_scene(scene), stretch)
+    return _regime(validate_scene(scene), segment)
 
 
 @cached
-def _regime(scene: Scene, stretch: Trajectory) -> Regime:
-    times, state = stretch.time, stretch.state
+def _regime(scene: Scene, segment: Trajectory) -> Regime:
+    times, state = segment.time, segment.state
     phi, rate = state.azimuth, state.azimuth_rate
     half = times.shape[0] // 2
-    turn = stretch.rotor_angle
+    turn = segment.rotor_angle
 
-    angles, rates = jnp.column_stack([phi, turn]), jnp.column_stack([rate, stretch.rotor_speed])
+    angles, rates = jnp.column_stack([phi, turn]), jnp.column_stack([rate, segment.rotor_speed])
     end = times.shape[0] - 1
     whole, early, late = mean_speeds(times, angles, rates, first=(0, 0, half), last=(end, half - 1, end))
     speed, rotor = whole[:-1], whole[-1]

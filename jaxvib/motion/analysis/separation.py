@@ -83,25 +83,25 @@ def nearly_coincident_pairs(scene: Scene, k: int, angle: np.ndarray) -> list[tup
     return pairs
 
 
-def would_separate(scene: Scene, stretch: Trajectory) -> bool:
+def would_separate(scene: Scene, segment: Trajectory) -> bool:
     """Return True if several loads of a track have nearly one angle, and small differences of their angles grow."""
-    duration = float(np.ptp(np.asarray(stretch.time)))
+    duration = float(np.ptp(np.asarray(segment.time)))
     pairs = [
         (k, pair)
-        for k, exciter in enumerate(stretch.state.exciters)
+        for k, exciter in enumerate(segment.state.exciters)
         if exciter.angle
         for pair in nearly_coincident_pairs(scene, k, np.asarray(exciter.angle[0]))
     ]
-    return any(separation_rate(scene, stretch, k, pair) * duration > MIN_SEPARATION_GROWTH for k, pair in pairs)
+    return any(separation_rate(scene, segment, k, pair) * duration > MIN_SEPARATION_GROWTH for k, pair in pairs)
 
 
-def smallest_distance(scene: Scene, stretch: Trajectory) -> float:
+def smallest_distance(scene: Scene, segment: Trajectory) -> float:
     """Return the smallest distance of the centres of two loads on one track, in diameters; infinite for loads without a size.
 
     Only neighbours by angle are compared, because the nearest loads are neighbours.
     """
     distances = [math.inf]
-    for k, (exciter, state) in enumerate(zip(scene.exciters, stretch.state.exciters, strict=True)):
+    for k, (exciter, state) in enumerate(zip(scene.exciters, segment.state.exciters, strict=True)):
         ball_radius = getattr(exciter.loads, "ball_radius", None)
         if exciter.loads is None or ball_radius is None:
             continue
@@ -116,23 +116,23 @@ def smallest_distance(scene: Scene, stretch: Trajectory) -> float:
     return min(distances)
 
 
-def overlap(scene: Scene, stretch: Trajectory) -> bool:
+def overlap(scene: Scene, segment: Trajectory) -> bool:
     """Return True if the distance of two loads with a size is below 0.9 diameters at some time, which the effect `LoadContact`
     would prevent. Smaller overlaps count as contact."""
-    return not has_term(scene.all_effects, LoadInteraction) and smallest_distance(scene, stretch) < MIN_DISTANCE
+    return not has_term(scene.all_effects, LoadInteraction) and smallest_distance(scene, segment) < MIN_DISTANCE
 
 
-def separation_rate(scene: Scene, stretch: Trajectory, k: int = 0, pair: tuple[int, int] = (0, 1)) -> float:
+def separation_rate(scene: Scene, segment: Trajectory, k: int = 0, pair: tuple[int, int] = (0, 1)) -> float:
     """Return the growth rate, 1/s, of small differences between angles of loads at nearly one angle; negative for decay.
 
-    **Arguments**: `stretch`: an evenly sampled part of a run of `scene`, such as `run.window`; `k`: the number of the exciter
+    **Arguments**: `segment`: an evenly sampled part of a run of `scene`, such as `run.window`; `k`: the number of the exciter
     with the loads, from 0; `pair`: numbers of two of these loads on one track.
     """
-    phi = np.mean(np.asarray(stretch.state.exciters[k].angle[0])[:, pair], axis=1)
+    phi = np.mean(np.asarray(segment.state.exciters[k].angle[0])[:, pair], axis=1)
     turns = np.floor(abs(phi[-1] - phi[0]) / (2.0 * np.pi))
     covered = np.abs(phi[-1] - phi) <= 2.0 * np.pi * turns if turns else np.ones(phi.size, bool)
     first = phi.size - 1 - 2 * (np.count_nonzero(covered[:-1]) // 2)
-    transition, log_scale, duration = _transition(scene, stretch.time, stretch.state, np.asarray(first), np.asarray(pair), k)
+    transition, log_scale, duration = _transition(scene, segment.time, segment.state, np.asarray(first), np.asarray(pair), k)
     radius = float(np.max(np.abs(np.linalg.eigvals(np.asarray(transition)))))
     return float((np.log(max(radius, 1e-300)) + float(log_scale)) / float(duration))
 

@@ -61,7 +61,7 @@ def body_problem():
     run = jv.MeasuredRun.from_arrays(CHANNELS, time, readings, change={"machine.mass": "+5 kg"})
     unknown = ["machine.inertia", "loads.mass", "loads.drag", "exciters[0].unbalance"]
     problem = build_problem(body(), [run], unknown, {})
-    samples = dataclasses.replace(problem.runs[0], stretches=(3, 40, 2))
+    samples = dataclasses.replace(problem.runs[0], segments=(3, 40, 2))
     return with_noise(problem._replace(runs=(samples,)), [[Noise(np.array([1.0, -0.5]), 1.0)] * 3])
 
 

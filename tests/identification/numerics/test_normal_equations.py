@@ -19,7 +19,7 @@ from jaxvib.identification.response import (
 )
 from jaxvib.machine.numbers.named import find_number
 
-STEP, STRETCH, COUNT = 1e-3, 64, 128
+STEP, SEGMENT, COUNT = 1e-3, 64, 128
 BEGIN = 0.3
 TAPS = np.array([[1.0, 1.0, 1.0, 1.0], [-0.5, 0.3, 0.0, 0.1], [0.2, 0.1, -0.4, 0.0]])
 CHANNELS = (
@@ -72,7 +72,7 @@ def problem():
     first = jnp.asarray([9e4, 0.6])
     unknowns = Unknowns(numbers, first, jnp.asarray([9e4, 0.5]), jnp.asarray([True, False]), ("v",), turns=1, errors=3)
     rng = np.random.default_rng(0)
-    shape = (COUNT // STRETCH, STRETCH, len(CHANNELS))
+    shape = (COUNT // SEGMENT, SEGMENT, len(CHANNELS))
     changes = {
         "machine.mass": ("add", 10.0),
         "machine.inertia": ("scale", 1.1),

@@ -45,7 +45,7 @@ def test_readings_are_converted_to_si(unit, factor):
         (T[:9], SIGNAL[:9], "has 9 samples; at least 16 are needed"),
         (T[:-1], SIGNAL, "has 3999 times but 4000 values; each value needs its time"),
         (T, changed(SIGNAL, slice(500, 1000), np.nan), "has 500 of 4000 readings that are not numbers, the first at 0.5 s"),
-        (T, changed(SIGNAL, slice(500, 1000), 0.1), "is constant in stretches for 500 of 4000 readings, the first at 0.5 s"),
+        (T, changed(SIGNAL, slice(500, 1000), 0.1), "is constant in segments for 500 of 4000 readings, the first at 0.5 s"),
         (np.concatenate([T[:100], T[-100:]]), SIGNAL[:200], "has 1 gap in 3.8 of 4 s; the longest is 3.8 s at 0.099 s"),
         (T.reshape(2, -1), SIGNAL, r"has an array of shape (2, 2000); one list of numbers is needed"),
     ],
@@ -75,7 +75,7 @@ def test_nan_is_left_out_and_counted():
 @pytest.mark.parametrize("level", [0.0, 0.123])
 def test_dropouts_are_left_out_and_counted(level):
     found = run(changed(SIGNAL, slice(800, 900), level))
-    assert "is constant in stretches with 100 readings in total (dropouts), the first at 0.8 s; left out" in found.notes[0]
+    assert "is constant in segments with 100 readings in total (dropouts), the first at 0.8 s; left out" in found.notes[0]
     assert np.all(np.isnan(found.values["frame"][800:900])) and not np.any(np.isnan(found.values["frame"][:800]))
 
 

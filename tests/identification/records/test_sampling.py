@@ -138,13 +138,13 @@ def test_a_tenth_of_the_readings_may_be_missing(count, is_refused):
     if not is_refused:
         assert np.count_nonzero(np.isnan(even_samples(T, constant, "a:")[1])) == count
         assert notes_of(T, constant) == [
-            "is constant in stretches with 40 readings in total (dropouts), the first at 3 s; left out"
+            "is constant in segments with 40 readings in total (dropouts), the first at 3 s; left out"
         ]
         assert np.count_nonzero(np.isnan(even_samples(T, value, "a:")[1])) == count
         return
     with pytest.raises(jv.InputError, match="has 41 of 400 readings that are not numbers, the first at 3 s; at most 10% may"):
         even_samples(T, value, "a:")
-    with pytest.raises(jv.InputError, match="is constant in stretches for 41 of 400 readings, the first at 3 s: the sensor"):
+    with pytest.raises(jv.InputError, match="is constant in segments for 41 of 400 readings, the first at 3 s: the sensor"):
         even_samples(T, constant, "a:")
 
 
@@ -152,7 +152,7 @@ def test_a_tenth_of_the_readings_may_be_missing(count, is_refused):
     ("length", "level", "expected"), [(19, 0.1, 0), (20, 0.1, 20), (40, 0.1, 40), (40, 1.5, 0), (40, -1.5, 0)]
 )
 def test_length_and_level_of_dropouts(length, level, expected):
-    """Stretches of fewer than 20 equal readings, and those at the ends of the range, are no dropouts."""
+    """Segments of fewer than 20 equal readings, and those at the ends of the range, are no dropouts."""
     value = WAVE.copy()
     value[100 : 100 + length] = level
     found = dropouts(value)

@@ -18,7 +18,7 @@ TIME = jnp.linspace(0.0, 1.0, 801)
 
 
 def made(phase, speed, *, wobble=0.0, slow=0.0, effects=()):
-    """A made-up stretch of four loads on a rotor at 460 rad/s: phases (4,), speeds, a wobble, a slow change of speed."""
+    """A made-up segment of four loads on a rotor at 460 rad/s: phases (4,), speeds, a wobble, a slow change of speed."""
     s = eqx.tree_at(lambda s: s.drive, published_rotor(variant="uncoupled"), jv.ConstantSpeed(460.0))
     s = jv.Scene(s.machine, s.loads, s.drive, effects)
     speed = jnp.broadcast_to(jnp.asarray(speed, float), (4,))
@@ -174,10 +174,10 @@ def test_stiff_dry_friction_by_an_implicit_solver():
 
 
 def test_regime_under_jit_and_vmap():
-    s, stretch = made([0.0, 0.1, -0.1, 0.05], 170.0)
-    once = jv.regime(s, stretch)
+    s, segment = made([0.0, 0.1, -0.1, 0.05], 170.0)
+    once = jv.regime(s, segment)
     many = eqx.filter_jit(
-        jax.vmap(lambda k: jv.regime(s, eqx.tree_at(lambda x: x.state.rate[0], stretch, k * stretch.state.rate[0])))
+        jax.vmap(lambda k: jv.regime(s, eqx.tree_at(lambda x: x.state.rate[0], segment, k * segment.state.rate[0])))
     )
     found = many(jnp.array([1.0, 2.0]))
     assert np.all(found.name == once.name) and found.load_speed.shape == (2, 4)

@@ -167,14 +167,14 @@ _CHAOTIC_TURNS = 1000
 
 def _exponent(scene: Scene) -> Answer:
     start = state_of(scene, np.array([2.5, 0.0, 0.0, 1.0]))
-    found = growth(scene, _CHAOTIC_TURNS * 2.0 * np.pi, start=start, stretches=_CHAOTIC_TURNS // 5)
+    found = growth(scene, _CHAOTIC_TURNS * 2.0 * np.pi, start=start, segments=_CHAOTIC_TURNS // 5)
     if status_name(found.status) != "chaotic":
         return Answer([], None, status_name(found.status))
     return Answer([found.exponent], 4.0 * found.uncertainty / found.exponent)
 
 
 def _exponent_again(scene: Scene) -> Reference:
-    """Lyapunov exponent by the variational equation of Ueda's oscillator, in stretches of a turn, the first fifth left out."""
+    """Lyapunov exponent by the variational equation of Ueda's oscillator, in segments of a turn, the first fifth left out."""
 
     def field(t: float, y: np.ndarray) -> list[float]:
         x, v, dx, dv = y

@@ -108,7 +108,7 @@ def multipliers(p: ReferenceModel, motion: Callable[[float], np.ndarray], period
 
 
 class Event(NamedTuple, Generic[Mode]):
-    """End of a stretch of motion: `at`(t, y) crosses 0 in the `direction` (1 up, -1 down); and the mode `then`."""
+    """End of a segment of motion: `at`(t, y) crosses 0 in the `direction` (1 up, -1 down); and the mode `then`."""
 
     at: Callable[[float, np.ndarray], float]
     direction: int
