@@ -56,7 +56,7 @@ def on_files(files, config):
         text = text.replace("](jaxvib/ode/README.md)", "](engine.md)").replace("](jaxvib/runtime/README.md)", "](cache.md)")
         text = text.replace("](docs/", "](")
         files.append(File.generated(config, page, content=text))
-    for name, content in _pictures().items():
+    for name, content in _figures().items():
         files.append(File.generated(config, f"made/{name}", content=content))
     for title, names in public_groups().items():
         package = "optimize" if title == OPTIMIZE else "jaxvib"
@@ -67,7 +67,7 @@ def on_files(files, config):
     return files
 
 
-def _pictures():
+def _figures():
     """{name: bytes} of what the examples on the page of figures draw."""
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "figures.md").read_text(encoding="utf-8"), flags=re.S)
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):

@@ -1,7 +1,7 @@
 """Time from a key press that moves a slider of the explorer until its page is updated, in headless Chromium.
 
     pip install selenium                    # and Chromium with ChromeDriver
-    python benchmarks/explore/moves.py two_mass linear_screen --moves 20 --picture out/page.png
+    python benchmarks/explore/moves.py two_mass linear_screen --moves 20 --figure out/page.png
 
 For each template, each slider is moved by the arrow keys. A move ends at the last change of the page (in all shadow trees), if
 half a second without a change follows. Prints median and maximum of each template in seconds.
@@ -64,7 +64,7 @@ def update_time(driver: webdriver.Chrome, quiet: float = 500.0, limit: float = 6
     raise TimeoutError(f"the page still changes after {limit} s")
 
 
-def measure(kind: str, moves: int, port: int, command: str, picture: str) -> list[float]:
+def measure(kind: str, moves: int, port: int, command: str, figure: str) -> list[float]:
     """Return the times of `moves` moves of the sliders of one template."""
     options = webdriver.ChromeOptions()
     for flag in FLAGS.split():
@@ -93,8 +93,8 @@ def measure(kind: str, moves: int, port: int, command: str, picture: str) -> lis
                 key = Keys.ARROW_RIGHT if (k // len(thumbs)) % 2 == 0 else Keys.ARROW_LEFT
                 ActionChains(driver).send_keys(key).perform()
                 took.append(update_time(driver))
-            if picture:
-                driver.save_screenshot(picture)
+            if figure:
+                driver.save_screenshot(figure)
             return took
         finally:
             driver.quit()
@@ -107,8 +107,8 @@ if __name__ == "__main__":
     parser.add_argument("--moves", type=int, default=20)
     parser.add_argument("--port", type=int, default=27300)
     parser.add_argument("--command", default=str(Path(sys.executable).with_name("jaxvib")), help="jaxvib to be measured")
-    parser.add_argument("--picture", default="", help="PNG file for the page after the last move")
+    parser.add_argument("--figure", default="", help="PNG file for the page after the last move")
     given = parser.parse_args()
     for k, kind in enumerate(given.kinds):
-        times = measure(kind, given.moves, given.port + k, given.command, given.picture)
+        times = measure(kind, given.moves, given.port + k, given.command, given.figure)
         print(f"{kind:20} median {np.median(times):.3f} s, maximum {max(times):.3f} s of {len(times)} moves", flush=True)

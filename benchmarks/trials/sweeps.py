@@ -234,8 +234,8 @@ def million(folder: pathlib.Path, out: pathlib.Path) -> None:
         "import time; t = time.perf_counter()\nimport sys, jaxvib as jv\n"
         "found = jv.open_sweep(sys.argv[1]); found.plot().savefig(sys.argv[2])\nprint(f'{time.perf_counter() - t:.1f} s')"
     )
-    picture = str(out / "million.png")
-    told = subprocess.run([sys.executable, "-c", code, found.store, picture], capture_output=True, text=True)
+    figure = str(out / "million.png")
+    told = subprocess.run([sys.executable, "-c", code, found.store, figure], capture_output=True, text=True)
     print("opened and plotted in a fresh process:", told.stdout.strip() or told.stderr[-500:])
 
 

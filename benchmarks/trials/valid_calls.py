@@ -281,10 +281,10 @@ def calls() -> Iterator[Callable[[], Call]]:
     fewer = dict(stepsize_controller=later(lambda: jv.EqualSteps(100)), equations=jv.vector_field)
     yield call("capture", scene=later(torus_scene), speeds=[-0.9, -0.5], **torus, **fewer)
     yield call("threshold_curve", make=lambda x: torus_scene(), values=[1.0], speeds=[-0.5], **torus, equations=jv.vector_field)
-    # Pictures, results
+    # Figures, results
     yield call("sketch", scene=s, ax=None)
-    film = dict(scene=None, begin=1.9, end=1.94, seconds=0.1, fps=5, magnify=None, width=2.0)
-    yield call("animate", motion=later(run), path=None, **film)
+    animation = dict(scene=None, begin=1.9, end=1.94, seconds=0.1, fps=5, magnify=None, width=2.0)
+    yield call("animate", motion=later(run), path=None, **animation)
     modes = later(lambda: jv.jam_modes(scene()))
     yield call("load", path=later(lambda: jv.jam_modes(scene()).save(FOLDER / "modes")))
     yield call("write_csv", result=later(run), axis="time", path=path)

@@ -53,13 +53,13 @@ def animate(
             )
         else:
             motion, scene = jv.jam_orbit(loaded, mode=mode), loaded
-    film = jv.animate(motion, scene=scene, **options)
+    animation = jv.animate(motion, scene=scene, **options)
     for suffix in ("gif", "html"):
         if kind in (suffix, "both"):
-            film.save(output.main_file(f"animation.{suffix}"))
-    first, last = film.figure.axes[1].get_xlim()
-    document = {"frames": film.count, "fps": film.fps, "begin": first, "end": last}
-    output.done(document, lambda: f"{film.count} frames from {first:.6g} to {last:.6g} s", "animate")
+            animation.save(output.main_file(f"animation.{suffix}"))
+    first, last = animation.figure.axes[1].get_xlim()
+    document = {"frames": animation.count, "fps": animation.fps, "begin": first, "end": last}
+    output.done(document, lambda: f"{animation.count} frames from {first:.6g} to {last:.6g} s", "animate")
 
 
 @app.command("sketch")

@@ -98,7 +98,7 @@ def simulate(
         progress_meter=meter,
         **options,
     )
-    output.picture("history.png", lambda: run.plot())
+    output.figure("history.png", lambda: run.plot())
     output.save_result("run.npz", run)
     output.csv(csv, run, "time")
     measures = run_measures(run)

@@ -57,7 +57,7 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
         criterion_chart(axis, speeds, np.asarray(functional), document["balancing"], exact, float(loaded.drive.speed))
         return figure
 
-    output.picture("criterion.png", figure)
+    output.figure("criterion.png", figure)
 
     def text() -> str:
         from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
@@ -117,7 +117,7 @@ def balance(
     states = jv.balanced_states(loaded)
     stabilities = [states.stability(k) for k in range(len(states.angles))]
     stable = [] if ends is None else [states.intervals(*ends, arrangement=k, points=points) for k in range(len(stabilities))]
-    output.picture("balance.png", states.plot)
+    output.figure("balance.png", states.plot)
     document = {
         "rotor_speed": loaded.drive.speed,
         "status": states.message,

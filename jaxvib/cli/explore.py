@@ -19,7 +19,7 @@ def explore(scene: Path, port: int, no_browser: bool) -> None:
 
     The command ends with Ctrl-C. It prints the address of the page, which contains a random token: other computers, and other
     sites in your browser, cannot open the page. Needs: pip install '.[explore]' in the source folder of jaxvib"""
-    from jaxvib.explore.pictures import prepare, prepare_counts
+    from jaxvib.explore.figures import prepare, prepare_counts
     from jaxvib.explore.server import require_free, require_marimo, serve  # slow import
 
     require_marimo()

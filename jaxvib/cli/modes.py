@@ -85,7 +85,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
     from jaxvib.steady.jams.phases import growth_of_free_loads
 
     modes_found = jax.device_get(jv.jam_modes(scene))  # NumPy arrays, because indexing JAX arrays would compile programs
-    output.picture("branches.png", lambda: jv.branches(scene).plot())
+    output.figure("branches.png", lambda: jv.branches(scene).plot())
     if csv is not None:
         output.csv(csv, jv.branches(scene), "point")
     jams = [modes_found.select(k) for k in modes_found.mode_numbers()]
@@ -186,7 +186,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     from jaxvib.steady.jams.phases import degrees
 
     result, limits = jv.phase_jams(scene), jax.device_get(jv.drag_limits(scene, phases=True))
-    output.picture("phases.png", lambda: result.plot())
+    output.figure("phases.png", lambda: result.plot())
     jams = [result.select(k) for k in range(result.omega.shape[0])]
     measures = [measures_of(scene, jam) if jam.stable else None for jam in jams]
     document = {
@@ -250,7 +250,7 @@ def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None
     existing = {k: jam for k, jam in jams.items() if math.isfinite(jam.rotor_speed)}
     measures = {k: measures_of(scene, jam) for k, jam in existing.items() if jam.stable}
     diagram = jv.branches(scene, exact=True)
-    output.picture("branches.png", lambda: diagram.plot())
+    output.figure("branches.png", lambda: diagram.plot())
     output.csv(csv, diagram, "point")
     document = {
         "rotor_speed": scene.drive.speed,

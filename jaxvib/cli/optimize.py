@@ -63,11 +63,11 @@ def optimize(
     if path is not None:
         source = design.parent / read_toml(design)["scene"]
         write_file(path, rewrite_scene(source.read_text(encoding="utf-8"), best.scene))
-    output.picture("before_after.png", best.plot)
-    output.picture("convergence.png", best.plot_convergence)
+    output.figure("before_after.png", best.plot)
+    output.figure("convergence.png", best.plot_convergence)
     _draw_working_regime(output, loaded, best)
     if best.run is not None:
-        output.picture("history.png", best.run.plot)
+        output.figure("history.png", best.run.plot)
         output.save_result("run.npz", best.run)
     ranges = tolerance_ranges(best.scene, _quantities_with_ranges(loaded), list(tolerances)) if tolerances else []
     chosen = [catalogue.chosen(best.scene) for catalogue in loaded.catalogues]
@@ -94,9 +94,9 @@ def _draw_working_regime(output: Output, design: Design, best: Synthesis) -> Non
     regime = None if points is None else jv.working_regime(best.scene, throw=False)
     if regime is None or not bool(regime.stable):
         return
-    output.picture("phases.png", regime.plot)
+    output.figure("phases.png", regime.plot)
     if points:
-        output.picture("deck.png", lambda: jv.sketch(best.scene, deck=regime.deck(points)))
+        output.figure("deck.png", lambda: jv.sketch(best.scene, deck=regime.deck(points)))
 
 
 def _quantities_with_ranges(design: Design) -> list[Quantity | Demand]:

@@ -185,7 +185,7 @@ class Output:
         self.files.append(str(path))
         return path
 
-    def picture(self, name: str, draw: Callable[[], Figure]) -> None:
+    def figure(self, name: str, draw: Callable[[], Figure]) -> None:
         """Draw a figure, and save it to the file `name` (--out) and in the report (--report)."""
         path = self.file(name)
         if path is None and self.report is None:

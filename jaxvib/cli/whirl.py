@@ -40,7 +40,7 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: 
     whirls = [{"speed": float(w), "decay": float(d), "forward": bool(f), "straight": bool(s)} for w, d, f, s in whirl_speeds]
     top = 1.3 * max([rotor_speed, *(entry["speed"] for entry in critical)])
     speeds = np.linspace(0.0, top, 161)
-    output.picture("campbell.png", lambda: jv.whirl(loaded, speeds, loads=loads).plot(at=rotor_speed))
+    output.figure("campbell.png", lambda: jv.whirl(loaded, speeds, loads=loads).plot(at=rotor_speed))
     if csv is not None:
         output.csv(csv, jv.whirl(loaded, speeds, loads=loads), "rotor_speed")
     document = {"rotor_speed": rotor_speed, "loads": loads, "whirl": whirls, "critical": critical}

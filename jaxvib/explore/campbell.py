@@ -1,4 +1,4 @@
-"""Campbell diagram of a rotor as an SVG picture."""
+"""Campbell diagram of a rotor as an SVG figure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Branch diagram with charts of amplitudes and foundation force as an SVG picture."""
+"""Branch diagram with charts of amplitudes and foundation force as an SVG figure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Page of the sliders, a marimo app. It only connects sliders to pictures; `server.py` runs it and selects the scene."""
+"""Page of the sliders, a marimo app. It only connects sliders to figures; `server.py` runs it and selects the scene."""
 
 import marimo
 
@@ -12,12 +12,12 @@ def _():
     import marimo as mo
 
     from jaxvib.errors import InputError
-    from jaxvib.explore import pictures
+    from jaxvib.explore import figures
     from jaxvib.explore.server import served_path
     from jaxvib.explore.sliders import scene_at, sliders_of, typed_value
     from jaxvib.machine.files import load_scene
 
-    return InputError, html, load_scene, mo, pictures, scene_at, served_path, sliders_of, typed_value
+    return InputError, html, load_scene, mo, figures, scene_at, served_path, sliders_of, typed_value
 
 
 @app.cell
@@ -86,19 +86,19 @@ def _(controls, mo):
 
 
 @app.cell
-def _(controls, current, pictures, scene, scene_at):
+def _(controls, current, figures, scene, scene_at):
     current.update(controls.value)
-    machine = pictures.scene_or_problem(lambda: scene_at(scene, controls.value))
+    machine = figures.scene_or_problem(lambda: scene_at(scene, controls.value))
     return (machine,)
 
 
 @app.cell
-def _(machine, mode, pictures, scene):
-    # All pictures are computed before any is sent, because a browser that draws one would slow down the next computation.
-    chart = pictures.image(lambda: pictures.diagram(machine.value, 4.0 / 3.0 * float(scene.top_speed)), machine)
-    numbers = pictures.text(lambda: pictures.readings(machine.value), machine)
-    film = pictures.image(lambda: pictures.machine(machine.value, mode.value), machine)
-    return chart, film, numbers
+def _(machine, mode, figures, scene):
+    # All figures are computed before any is sent, because a browser that draws one would slow down the next computation.
+    chart = figures.image(lambda: figures.diagram(machine.value, 4.0 / 3.0 * float(scene.top_speed)), machine)
+    numbers = figures.text(lambda: figures.readings(machine.value), machine)
+    animation = figures.image(lambda: figures.machine(machine.value, mode.value), machine)
+    return chart, animation, numbers
 
 
 @app.cell
@@ -114,9 +114,9 @@ def _(mo, numbers):
 
 
 @app.cell
-def _(mo, pictures, scene):
+def _(mo, figures, scene):
     # The list has only the existing modes; a machine without jam modes has no list.
-    found = pictures.modes_of(scene)
+    found = figures.modes_of(scene)
     modes = {str(k): k for k in sorted(found)}
     mode = mo.ui.dropdown(
         modes or {"none": None},
@@ -129,22 +129,22 @@ def _(mo, pictures, scene):
 
 
 @app.cell
-def _(film, mo):
-    mo.Html(film)
+def _(animation, mo):
+    mo.Html(animation)
     return
 
 
 @app.cell
-def _(mo, pictures, scene):
-    mo.md(pictures.about(scene))
+def _(mo, figures, scene):
+    mo.md(figures.about(scene))
     return
 
 
 @app.cell
-def _(machine, mo, path, pictures):
+def _(machine, mo, path, figures):
     mo.sidebar(
         mo.download(
-            data=pictures.toml(machine, path).encode(),
+            data=figures.toml(machine, path).encode(),
             filename=f"{path.stem}-explored.toml",
             mimetype="text/plain",
             label="Save this machine as TOML",

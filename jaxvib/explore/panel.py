@@ -1,4 +1,4 @@
-"""Axes, lines and legend of a chart as outlines and texts of an SVG picture, which take a tenth of the time of matplotlib."""
+"""Axes, lines and legend of a chart as outlines and texts of an SVG figure, which take a tenth of the time of matplotlib."""
 
 from __future__ import annotations
 

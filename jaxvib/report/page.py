@@ -150,8 +150,8 @@ def _figure(name: str, figure: Figure) -> str:
     data = io.BytesIO()
     figure.savefig(data, format="png")
     text = base64.b64encode(data.getvalue()).decode("ascii")
-    picture = f'<img alt="{escaped(name)}" src="data:image/png;base64,{text}">'
-    return f"<figure>{picture}<figcaption>{escaped(name)}</figcaption></figure>"
+    image = f'<img alt="{escaped(name)}" src="data:image/png;base64,{text}">'
+    return f"<figure>{image}<figcaption>{escaped(name)}</figcaption></figure>"
 
 
 def _versions() -> str:

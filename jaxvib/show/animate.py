@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
 from jaxvib.boundary import validated
-from jaxvib.draw.machine.film import Film
+from jaxvib.draw.machine.animation import Animation
 from jaxvib.draw.machine.parts import Part, put
 from jaxvib.draw.motion.histories import period_of
 from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, panels
@@ -57,7 +57,7 @@ def animate(
     fps: int = 20,
     magnify: float | None = None,
     width: float = 6.4,
-) -> Film:
+) -> Animation:
     """Return an animation of a run or of an exact jam in slow motion, with a clock.
 
     Platforms, springs, rotor and loads move. Arrows show the forces of the supports on the foundation (black: total force on
@@ -89,8 +89,8 @@ def animate(
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
     ...                  jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
-    >>> film = jv.animate(jv.jam_orbit(scene, mode=1), scene=scene)
-    >>> film.count, film.figure.axes[2].get_xlabel()
+    >>> animation = jv.animate(jv.jam_orbit(scene, mode=1), scene=scene)
+    >>> animation.count, animation.figure.axes[2].get_xlabel()
     (98, 'time, s')
     """
     owner = drawable_scene(_scene_of(motion, scene))
@@ -111,14 +111,14 @@ def animate(
     # An orbit is periodic; the frame after the last frame would be the first frame.
     time = first + (last - first) * np.arange(count) / (count if isinstance(motion, Orbit) else count - 1)
     dense = np.linspace(time[0], time[-1], max(400, count))
-    film_motion, history = (
+    shown_motion, history = (
         motion_of_run(motion, times) if isinstance(motion, Run) else motion_of_orbit(motion, owner, times)
         for times in (time, dense)
     )
-    film = _film(owner, film_motion, history, float(fps), magnify, width)
+    animation = _animation(owner, shown_motion, history, float(fps), magnify, width)
     if path is not None:
-        film.save(path)
-    return film
+        animation.save(path)
+    return animation
 
 
 def _scene_of(motion: object, scene: Scene | None) -> Scene | None:
@@ -156,9 +156,9 @@ def _highest_speed(motion: Run | Orbit, scene: Scene) -> float:
     return float(max(motion.rotor_speed, motion.omega)) if np.isfinite(motion.rotor_speed) else float(scene.drive.speed)
 
 
-def _film(
-    scene: Scene, film_motion: SampledMotion, history: SampledMotion, fps: float, magnify: float | None, width: float
-) -> Film:
+def _animation(
+    scene: Scene, shown_motion: SampledMotion, history: SampledMotion, fps: float, magnify: float | None, width: float
+) -> Animation:
     if not _MIN_WIDTH <= width <= _MAX_WIDTH:
         raise InputError("width", f"is {width:g} inches; it must be from {_MIN_WIDTH:g} to {_MAX_WIDTH:g}")
     view = view_of(scene)
@@ -171,24 +171,24 @@ def _film(
     figure.set_dpi(100.0)
     fit(stage, view.limits)
     magnify_given = None if magnify is None else float(number(magnify, "", "magnify", low=0.0, open_low=True))
-    magnification = view.magnified(film_motion.displacement) if magnify_given is None else magnify_given
+    magnification = view.magnified(shown_motion.displacement) if magnify_given is None else magnify_given
     reach = magnification * view.scale
-    farthest = float(np.max(np.abs(film_motion.displacement), initial=0.0)) * view.scale
+    farthest = float(np.max(np.abs(shown_motion.displacement), initial=0.0)) * view.scale
     if magnification * farthest > (most_seen := _MAX_DRAWN_HEIGHTS * (top - bottom)):
         raise InputError(
             "magnify", f"is {magnification:g}, which moves the machine out of the figure; at most {most_seen / farthest:.3g}"
         )
-    poses = list(map(film_motion.pose, range(film_motion.time.size)))
+    poses = list(map(shown_motion.pose, range(shown_motion.time.size)))
     forces = np.array([view.support_forces(pose) for pose in poses])
-    largest_force = max(float(np.max(np.abs(forces), initial=0.0)), float(np.max(np.abs(film_motion.force))), 1e-300)
+    largest_force = max(float(np.max(np.abs(forces), initial=0.0)), float(np.max(np.abs(shown_motion.force))), 1e-300)
     per_newton = 0.7 / largest_force
 
     def parts(k: int) -> list[Part]:
-        return [*view.parts(poses[k], reach), *view.arrows(poses[k], film_motion.force[k], per_newton)]
+        return [*view.parts(poses[k], reach), *view.arrows(poses[k], shown_motion.force[k], per_newton)]
 
     artists = [put(stage, part) for part in parts(0)]
     clock = stage.set_title("t", loc="left", family="monospace", fontsize="medium")
-    slower = (film_motion.time.size / fps) / (film_motion.time[-1] - film_motion.time[0])
+    slower = (shown_motion.time.size / fps) / (shown_motion.time[-1] - shown_motion.time[0])
     note = f"slowed down {slower:.3g} x, displacements drawn {magnification:.3g} x as large\n{ARROWS_NOTE}"
     stage.text(1.0, 0.0, note, transform=stage.transAxes, ha="right", va="top", fontsize="x-small", color="#555555")
     # Texts that are wider than the frame must not reduce the size of the drawing.
@@ -202,14 +202,14 @@ def _film(
     def update(k: int) -> None:
         for artist, part in zip(artists, parts(k), strict=True):
             _move_artist(artist, part.points)
-        total = ", ".join(f"{name}{force:7.0f} N" for name, force in zip(directions, film_motion.force[k], strict=True))
-        clock.set_text(f"t = {film_motion.time[k]:7.3f} s{heading}{total}")
+        total = ", ".join(f"{name}{force:7.0f} N" for name, force in zip(directions, shown_motion.force[k], strict=True))
+        clock.set_text(f"t = {shown_motion.time[k]:7.3f} s{heading}{total}")
         for cursor in cursors:
-            cursor.set_xdata([film_motion.time[k]] * 2)
+            cursor.set_xdata([shown_motion.time[k]] * 2)
 
     update(0)
     moving: list[Artist] = [*artists, clock, *cursors]
-    return Film(figure, update, moving, film_motion.time.size, fps)
+    return Animation(figure, update, moving, shown_motion.time.size, fps)
 
 
 def _move_artist(artist: Line2D | Polygon, points: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""SVG pictures of a machine: at rest, or moving in a jam of light loads or in a synchronous regime."""
+"""SVG figures of a machine: at rest, or moving in a jam of light loads or in a synchronous regime."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FRAMES_PER_PERIOD = 20
 """Number of frames in a period. Browsers interpolate linearly between them; circular paths are accurate to about 1 %."""
 
 _PERIOD_SECONDS = 1.6
-"""Duration of a period of the vibration in the picture, s."""
+"""Duration of a period of the vibration in the figure, s."""
 
 _THETA = 2.0 * np.pi * np.arange(_FRAMES_PER_PERIOD) / _FRAMES_PER_PERIOD
 """Phase of each frame, rad."""

@@ -47,12 +47,12 @@ def test_modes_json_has_the_promised_keys(typed):
         np.testing.assert_allclose(m["amplitude"], modes.select(m["mode"]).amplitude, rtol=1e-12)
 
 
-def test_modes_writes_table_and_picture(typed, tmp_path):
-    code, out, _ = typed("modes", "machine.toml", "--out", "pictures")
+def test_modes_writes_table_and_figure(typed, tmp_path):
+    code, out, _ = typed("modes", "machine.toml", "--out", "figures")
     assert code == 0 and "mode" in out and "stable" in out and "wrote" in out
     assert " yes " in out and " no " in out and "no: the loads spread" in out and max(map(len, out.splitlines())) <= 110
-    assert (tmp_path / "pictures" / "branches.png").stat().st_size > 10_000
-    assert json.loads((tmp_path / "pictures" / "modes.json").read_text())["rotor_speed"] == 150.0
+    assert (tmp_path / "figures" / "branches.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "figures" / "modes.json").read_text())["rotor_speed"] == 150.0
 
 
 def test_modes_name_a_resonance_without_a_peak(typed, tmp_path):
@@ -243,8 +243,8 @@ def test_optimize_json_has_the_promised_keys(typed, tmp_path):
     found = jv.load_scene(tmp_path / "o" / "found.toml")
     np.testing.assert_allclose(found.machine.stiffness, document["after"]["machine.stiffness"], rtol=1e-7)
     assert "# was" in (tmp_path / "o" / "found.toml").read_text()
-    for picture in ("before_after.png", "convergence.png", "history.png"):
-        assert (tmp_path / "o" / picture).stat().st_size > 5_000
+    for figure in ("before_after.png", "convergence.png", "history.png"):
+        assert (tmp_path / "o" / figure).stat().st_size > 5_000
     assert document["status"] == "done" and document["table"][0]["what"] == "stiffness of support 1"
     code, out, _ = typed("optimize", "design.toml", "--resume", "o/search.npz", "--no-verify")
     assert (
@@ -412,7 +412,7 @@ def test_import_changes_no_settings_of_jax():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120, env=clean)
 
 
-def test_animate_and_sketch_write_a_film_and_a_drawing(typed, tmp_path):
+def test_animate_and_sketch_write_an_animation_and_a_drawing(typed, tmp_path):
     code, out, err = typed("sketch", "machine.toml")
     assert code == 0 and (tmp_path / "sketch.png").stat().st_size > 10_000 and out.endswith("wrote sketch.png\n"), err
     small = ["--seconds", "0.5", "--width", "3", "--end", "0.05s"]
@@ -430,7 +430,7 @@ def test_animate_and_sketch_write_a_film_and_a_drawing(typed, tmp_path):
         (["animate", "missing.npz", "--out", "a"], "there is no such file"),
     ],
 )
-def test_films_that_cannot_be_made(typed, words, says):
+def test_animations_that_cannot_be_made(typed, words, says):
     code, _, err = typed(*words)
     assert code == 2 and says in err
 

@@ -24,7 +24,7 @@ def test_a_full_disk_leaves_the_old_files_whole(tmp_path, monkeypatch, name):
     output = Output(True, None if name == "report.html" else tmp_path, tmp_path / name if name == "report.html" else None)
     with click.Context(click.Command("jam"), obj=["jam"]), pytest.raises(jv.InputError, match=r"No space left on device"):
         if name == "figure.png":
-            output.picture(name, Figure)
+            output.figure(name, Figure)
         output.done({"a": 1.0}, lambda: "text", "jam")
     assert (tmp_path / name).read_bytes() == b"old" and [file.name for file in tmp_path.iterdir()] == [name]
 

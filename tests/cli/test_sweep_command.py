@@ -38,9 +38,9 @@ def typed(type_, tmp_path, monkeypatch):
 
 
 def test_a_study_is_run_resumed_and_shown(typed, tmp_path):
-    code, out, err = typed("sweep", "study.toml", "--out", "pictures")
+    code, out, err = typed("sweep", "study.toml", "--out", "figures")
     assert code == 0 and "every case was computed: 10 cases in study.zarr" in out and "100 %" in out and err == ""
-    assert (tmp_path / "pictures" / "sweep.png").stat().st_size > 5_000
+    assert (tmp_path / "figures" / "sweep.png").stat().st_size > 5_000
     data = jv.open_sweep("study.zarr").data
     assert data.heaviness.shape == (5, 2) and abs(float(data.heaviness[0, 0]) - 50.0 * 20.943951) < 1e-3
     code, out, _ = typed("sweep", "study.toml", "--json")

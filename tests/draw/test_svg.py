@@ -35,9 +35,9 @@ def test_lines_and_areas_have_their_colours_and_strokes():
     ends, gap = [[1.0, 0.0], [2.0, 1.0]], [[np.nan, np.nan]]
     line = Part(np.array(ends + gap + ends), {"color": (1.0, 0.0, 0.0), "lw": 2.0, "ls": "--", "alpha": 0.5})
     area = Part(np.array(ends), {"fc": "0.5", "ec": "none"}, filled=True)
-    picture = drawing([[line, area, Part(np.array(ends), {"zorder": 0.5})]])
-    assert picture.get("viewBox") == "0 0 124 62"
-    plain, filled, dashed = (path.attrib for path in picture.iter(f"{NAME}path"))
+    figure = drawing([[line, area, Part(np.array(ends), {"zorder": 0.5})]])
+    assert figure.get("viewBox") == "0 0 124 62"
+    plain, filled, dashed = (path.attrib for path in figure.iter(f"{NAME}path"))
     assert plain == {"d": "M0.0 62.0L62.0 0.0", "fill": "none", "stroke": "#000000", "stroke-width": "1.39"}
     assert filled == {"d": "M0.0 62.0L62.0 0.0Z", "fill": "#808080", "stroke": "none", "stroke-width": "1.39"}
     look = {"fill": "none", "stroke": "#ff0000", "stroke-width": "2.78", "stroke-dasharray": "4 2", "opacity": "0.5"}
@@ -69,16 +69,16 @@ def test_a_part_of_the_rotor_turns_about_its_axis(direction, end):
 
 def test_a_head_stands_above_the_drawing():
     line = 1.35 * 8.3 * 100.0 / 72.0
-    picture = drawing(
+    figure = drawing(
         [[Part(np.array([[1.0, 1.0], [3.0, 1.0]]), {})]], [[Text(2.0, 1.0, "a & b", {"ha": "center"})]], "one\ntwo"
     )
-    assert picture.get("viewBox") == f"0 0 124 {62.0 + 2.0 * line:.0f}"
-    assert picture.find(f"{NAME}path").get("d") == f"M0.0 {2.0 * line:.1f}L124.0 {2.0 * line:.1f}"
-    places = [(span.text, float(span.get("x")), float(span.get("y"))) for span in picture.iter(f"{NAME}tspan")]
+    assert figure.get("viewBox") == f"0 0 124 {62.0 + 2.0 * line:.0f}"
+    assert figure.find(f"{NAME}path").get("d") == f"M0.0 {2.0 * line:.1f}L124.0 {2.0 * line:.1f}"
+    places = [(span.text, float(span.get("x")), float(span.get("y"))) for span in figure.iter(f"{NAME}tspan")]
     middle = 0.35 * 8.3 * 100.0 / 72.0  # from the middle of a line to its base
     expected = [("a & b", 62.0, 2.0 * line + middle), ("one", 0.0, 0.5 * line + middle), ("two", 0.0, 1.5 * line + middle)]
     assert [(text, x, pytest.approx(y, abs=0.06)) for text, x, y in expected] == places
-    anchors = [text.get("text-anchor") for text in picture.iter(f"{NAME}text")]
+    anchors = [text.get("text-anchor") for text in figure.iter(f"{NAME}text")]
     assert anchors == ["middle", "start", "start"]
 
 

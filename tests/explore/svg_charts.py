@@ -8,7 +8,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 def texts(drawn):
-    """The texts of a picture: where each stands, what it says, its element."""
+    """The texts of a figure: where each stands, what it says, its element."""
     return [(float(t.get("x")), float(t.get("y")), t.text, e) for e in drawn.iter(f"{SVG}text") for t in e.iter(f"{SVG}tspan")]
 
 

@@ -1,4 +1,4 @@
-"""The explorer: sliders, pictures, file, and the page that wires them, without a browser."""
+"""The explorer: sliders, figures, file, and the page that wires them, without a browser."""
 
 import base64
 import re
@@ -16,10 +16,10 @@ import jaxvib as jv
 from jaxvib.cli.app import run
 from jaxvib.draw import whirl
 from jaxvib.draw.style import COLORS
-from jaxvib.explore import pictures, server
+from jaxvib.explore import figures, server
 from jaxvib.explore.campbell import _SENSE_STYLES
+from jaxvib.explore.figures import SceneOrProblem, scene_or_problem
 from jaxvib.explore.panel import TALL, WIDE, Panel
-from jaxvib.explore.pictures import SceneOrProblem, scene_or_problem
 from jaxvib.explore.sliders import COUNT, scene_at, sliders_of, typed_value
 from jaxvib.machine.files import SCREENS, TEMPLATES
 from jaxvib.show.moving import moving_svg
@@ -136,22 +136,22 @@ def test_a_large_machine_has_a_slider_for_all_springs():
 
 def test_a_rotor_has_a_campbell_diagram_with_an_explanation():
     scene = jv.scene_from_toml(TEMPLATES["planar_rotor"])
-    assert "no branch diagram" in pictures.heading(scene) and "critical speed" in pictures.readings(scene)
+    assert "no branch diagram" in figures.heading(scene) and "critical speed" in figures.readings(scene)
 
 
 def test_missing_panels_state_a_reason(one_mass):
     stop = jv.Stop(platform=1, stiffness=1e6, gap=1e-3)
     bent = jv.Scene(one_mass.machine, one_mass.loads, one_mass.drive, (stop,))
-    said = pictures.image(lambda: pictures.diagram(bent, 100.0), SceneOrProblem(bent, ""))
+    said = figures.image(lambda: figures.diagram(bent, 100.0), SceneOrProblem(bent, ""))
     assert "<b>No figure:</b> effects.stop" in said
     no_room = scene_or_problem(lambda: jv.Scene(one_mass.machine, jv.balls(count=0, mass=1, radius=1, drag=1), one_mass.drive))
-    assert pictures.toml(no_room) == "" and "loads.count" in pictures.text(lambda: "", no_room)
+    assert figures.toml(no_room) == "" and "loads.count" in figures.text(lambda: "", no_room)
 
 
-def _drawn_lines(picture: str) -> list[list[str]]:
+def _drawn_lines(figure: str) -> list[list[str]]:
     """The outlines in an SVG file, each the list of its points."""
     return [
-        re.findall(r"[ML] ?[-.0-9]+ [-.0-9]+", path.get("d", "")) for path in ElementTree.fromstring(picture).iter(f"{SVG}path")
+        re.findall(r"[ML] ?[-.0-9]+ [-.0-9]+", path.get("d", "")) for path in ElementTree.fromstring(figure).iter(f"{SVG}path")
     ]
 
 
@@ -187,10 +187,10 @@ def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
     before, after = jv.jam_modes(one_mass), jv.jam_modes(moved)
     assert float(after.resonances[0] / before.resonances[0]) == pytest.approx(2.0, rel=1e-12)
     resonance = f"{30.0 / np.pi * float(after.resonances[0]):.5g} rpm"
-    assert resonance in pictures.text(lambda: pictures.readings(moved), SceneOrProblem(moved, ""))
-    drawn = pictures.diagram(moved, 4.0 / 3.0 * float(one_mass.drive.speed))
+    assert resonance in figures.text(lambda: figures.readings(moved), SceneOrProblem(moved, ""))
+    drawn = figures.diagram(moved, 4.0 / 3.0 * float(one_mass.drive.speed))
     assert max(map(len, _drawn_lines(diagram))) > 40 and _drawn_lines(drawn) != _drawn_lines(diagram)
-    again = jv.scene_from_toml(pictures.toml(SceneOrProblem(moved, "")))
+    again = jv.scene_from_toml(figures.toml(SceneOrProblem(moved, "")))
     assert float(again.machine.stiffness[0]) == 2e5
 
 
@@ -217,11 +217,11 @@ def test_the_middle_of_the_limits_is_that_of_a_panel():
 
 @pytest.mark.parametrize("kind", ["two_mass", "network"])
 def test_the_charts_lines_are_the_branches(kind):
-    """Read back by the numbers at the ticks, every point of the picture's lines lies on a branch, and every jam is marked."""
+    """Read back by the numbers at the ticks, every point of the figure's lines lies on a branch, and every jam is marked."""
     scene = jv.scene_from_toml(TEMPLATES[kind])
     most = 1.4 * float(scene.drive.speed)
     found = jax.device_get(jv.branches(scene, most=most))
-    drawn = ElementTree.fromstring(pictures.diagram(scene, most))
+    drawn = ElementTree.fromstring(figures.diagram(scene, most))
     spans = svg_charts.texts(drawn)
     wide, tall = float(drawn.get("width")), float(drawn.get("height"))
     assert all(0.0 <= x < wide and 0.0 < y < tall for x, y, _, _ in spans)  # the legend too
@@ -274,7 +274,7 @@ def test_many_platforms_share_one_curve_of_amplitudes():
         exciter=n,
     )
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(150.0))
-    assert "largest of 9" in pictures.diagram(scene, 200.0)
+    assert "largest of 9" in figures.diagram(scene, 200.0)
 
 
 @pytest.mark.parametrize("kind", ["rotor", "planar_rotor"])
@@ -282,8 +282,8 @@ def test_the_campbell_diagram_is_the_rotors_whirl(kind):
     """Read back by the numbers at the ticks, lines are the whirls of each sense, and every critical speed is written."""
     scene = jv.scene_from_toml(TEMPLATES[kind])
     most = 1.4 * float(scene.drive.speed)
-    found = jax.device_get(jv.whirl(scene, np.linspace(0.0, most, pictures._CAMPBELL_SPEEDS)))
-    drawn = ElementTree.fromstring(pictures.diagram(scene, most))
+    found = jax.device_get(jv.whirl(scene, np.linspace(0.0, most, figures._CAMPBELL_SPEEDS)))
+    drawn = ElementTree.fromstring(figures.diagram(scene, most))
     across, up = svg_charts.axes(svg_charts.texts(drawn))
     for color, dashes, own in (("#004488", None, found.forward), ("#d55e00", "4 2", ~found.forward)):
         whirls = np.sort(RPM * np.where(own, found.speed, np.inf), axis=1)
@@ -312,7 +312,7 @@ def test_both_charts_are_as_wide_as_the_page():
     widths = set()
     for kind in ("one_mass", "planar_rotor"):
         scene = jv.scene_from_toml(TEMPLATES[kind])
-        drawn = ElementTree.fromstring(pictures.diagram(scene, 1.4 * float(scene.drive.speed)))
+        drawn = ElementTree.fromstring(figures.diagram(scene, 1.4 * float(scene.drive.speed)))
         widths.add(float(drawn.get("width")))
     assert len(widths) == 1
 
@@ -324,7 +324,7 @@ def test_colours_of_whirls_are_those_of_figures():
 
 
 def test_the_machine_moves_as_its_jam_says(two_platforms):
-    """The picture's motion, read from its file, is the jam's: stroke and phase of platforms, loads and force arrows."""
+    """The figure's motion, read from its file, is the jam's: stroke and phase of platforms, loads and force arrows."""
     jam = jax.device_get(jv.jam_modes(two_platforms)).select(3)
     drawn = ElementTree.fromstring(moving_svg(two_platforms, jam))
 
@@ -348,11 +348,11 @@ def test_the_machine_moves_as_its_jam_says(two_platforms):
 
 
 @pytest.mark.parametrize("kind", TEMPLATES)
-def test_every_template_has_a_picture_and_modes_to_choose(kind):
+def test_every_template_has_a_figure_and_modes_to_choose(kind):
     scene = jv.scene_from_toml(TEMPLATES[kind])
-    modes = pictures.modes_of(scene)
-    assert modes == [] if not pictures.has_branches(scene) else modes[0] in jv.jam_modes(scene).mode_numbers()
-    shown = pictures.image(lambda: pictures.machine(scene, next(iter(modes), None)), SceneOrProblem(scene, ""))
+    modes = figures.modes_of(scene)
+    assert modes == [] if not figures.has_branches(scene) else modes[0] in jv.jam_modes(scene).mode_numbers()
+    shown = figures.image(lambda: figures.machine(scene, next(iter(modes), None)), SceneOrProblem(scene, ""))
     data = shown.split("base64,")[1].split('"')[0]
     assert ElementTree.fromstring(base64.b64decode(data)).tag.endswith("svg")
 
@@ -365,12 +365,12 @@ def test_the_command_serves_the_page_to_this_computer_alone(one_mass, tmp_path, 
     served = {}
     monkeypatch.setattr(uvicorn, "run", lambda page, **options: served.update(options, page=page))
     counted = threading.Event()
-    monkeypatch.setattr(pictures, "prepare", lambda scene: None)
-    monkeypatch.setattr(pictures, "prepare_counts", lambda scene: counted.set())
+    monkeypatch.setattr(figures, "prepare", lambda scene: None)
+    monkeypatch.setattr(figures, "prepare_counts", lambda scene: counted.set())
     monkeypatch.setattr(server, "leave", lambda: None)
     assert run(["explore", str(path), "--port", "27180", "--no-browser"]) == 0
     assert callable(served["page"]) and (served["host"], served["port"]) == ("127.0.0.1", 27180)
-    assert served["log_level"] == "warning"  # no line on the terminal for each picture
+    assert served["log_level"] == "warning"  # no line on the terminal for each figure
     address = re.search(r"the page is at (http://127.0.0.1:27180/[-\w]{43}/);", capsys.readouterr().out)
     assert address and server.served_path() == path.resolve()
     assert counted.wait(10.0)  # beside the page, the next numbers of loads are compiled
@@ -378,11 +378,11 @@ def test_the_command_serves_the_page_to_this_computer_alone(one_mass, tmp_path, 
 
 def test_the_next_numbers_of_loads_are_prepared_first(one_mass, monkeypatch):
     drawn = []
-    monkeypatch.setattr(pictures, "_draw_all", lambda scene: drawn.append(scene.loads.count))
-    pictures.prepare_counts(one_mass)
+    monkeypatch.setattr(figures, "_draw_all", lambda scene: drawn.append(scene.loads.count))
+    figures.prepare_counts(one_mass)
     assert one_mass.loads.count == 3 and drawn == [4, 2, 5, 1, 6, 7, 8]
     drawn.clear()
-    pictures.prepare_counts(jv.scene_from_toml(TEMPLATES["rotor"]))
+    figures.prepare_counts(jv.scene_from_toml(TEMPLATES["rotor"]))
     assert drawn == []  # its loads have stations of their own
 
 

@@ -12,8 +12,8 @@ import svg_charts
 
 import jaxvib as jv
 from jaxvib.draw.style import COLORS
-from jaxvib.explore import pictures, regimes
-from jaxvib.explore.pictures import SceneOrProblem
+from jaxvib.explore import figures, regimes
+from jaxvib.explore.figures import SceneOrProblem
 from jaxvib.explore.regimes import deck_points, regime_chart, regimes_of
 from jaxvib.explore.sliders import scene_at, sliders_of, typed_value
 from jaxvib.machine.files import SCREENS
@@ -103,7 +103,7 @@ def test_the_chart_of_one_exciter_shows_the_force(circular):
 
 
 def test_the_readings_are_regimes_and_motion_of_the_deck(linear):
-    text = pictures.readings(linear)
+    text = figures.readings(linear)
     regimes = jv.synchronous_regimes(linear)
     first = regimes.select(0)
     assert text.startswith(regimes.summary())
@@ -147,9 +147,9 @@ def test_many_exciters_show_the_working_regime_alone(linear, count):
     exciters = [jv.Exciter(drive=motor, unbalance=2.0, at=at) for at in places[:count]]
     scene = jv.Scene(linear.machine, exciters=exciters)
     (regime,) = regimes_of(scene)
-    assert float(regime.growth) < 0.0 and "jaxvib regimes lists all" in pictures.readings(scene)
+    assert float(regime.growth) < 0.0 and "jaxvib regimes lists all" in figures.readings(scene)
     if count == 4:
-        shown = pictures.image(lambda: pictures.diagram(scene, 100.0), SceneOrProblem(scene, ""))
+        shown = figures.image(lambda: figures.diagram(scene, 100.0), SceneOrProblem(scene, ""))
         assert "<b>No figure:</b> exciters are 4; the chart over the motor speed is drawn for at most 3" in shown
 
 
@@ -166,9 +166,9 @@ def loaded():
 def test_the_page_of_loads_shows_regimes_and_their_course(loaded):
     first = regimes_of(loaded)[0]
     assert bool(first.stable) and max(np.ptp(first.phases[:2]), np.ptp(first.phases[2:])) < 1e-9
-    text = pictures.readings(loaded)
+    text = figures.readings(loaded)
     assert text.startswith(first.summary()) and "spread over the deck" in text and "e-1" not in text
-    drawn = ElementTree.fromstring(pictures.diagram(loaded, 126.0))
+    drawn = ElementTree.fromstring(figures.diagram(loaded, 126.0))
     spans = svg_charts.texts(drawn)
     starts = [x for x, _, text, _ in spans if re.match(r"load speed, rpm|amplitude, mm|phase, deg", text or "")]
     assert len(starts) == 3 and "unstable" in [text for _, _, text, _ in spans]
@@ -180,8 +180,8 @@ def test_the_page_of_loads_shows_regimes_and_their_course(loaded):
     for regime in regimes_of(loaded)[:4]:  # each line passes through the speed of its regime
         nearest = points[np.abs(points[:, 0] - at) < 40.0, 1]
         assert np.min(np.abs(nearest - RPM * float(regime.speed))) < 15.0
-    film = pictures.machine(loaded, None)
-    assert f"stable regime, {RPM * float(first.speed):.5g} rpm" in film and "animate" in film
+    animation = figures.machine(loaded, None)
+    assert f"stable regime, {RPM * float(first.speed):.5g} rpm" in animation and "animate" in animation
 
 
 def test_sliders_of_loads_change_one_exciter(loaded):
@@ -197,10 +197,10 @@ def test_sliders_of_loads_change_one_exciter(loaded):
 def test_scenes_that_the_explorer_lacks_name_a_command(linear, loaded):
     three = jv.Scene(loaded.machine, exciters=[*loaded.exciters, linear.exciters[0]])
     with pytest.raises(jv.InputError, match=r"exciters are 3; regimes of loads are listed for at most 2.* use jaxvib regimes"):
-        pictures.readings(three)
+        figures.readings(three)
     table = jv.TorqueTable(speeds=(0.0, 90.0, 100.0), torques=(50.0, 60.0, 0.0), inertia=0.6)
     tabled = jv.Scene(linear.machine, exciters=[jv.Exciter(drive=table, unbalance=2.0, at=(0.0, 0.8))])
-    shown = pictures.image(lambda: pictures.diagram(tabled, 100.0), SceneOrProblem(tabled, ""))
+    shown = figures.image(lambda: figures.diagram(tabled, 100.0), SceneOrProblem(tabled, ""))
     assert "drive is &#x27;torque_table&#x27;, whose speed follows from other numbers" in shown
 
 
@@ -217,14 +217,14 @@ def test_the_page_of_a_screen_follows_its_sliders(linear, tmp_path, monkeypatch)
     assert found["controls"].value == {each.name: each.start for each in sliders_of(linear)}
     moved = scene_at(linear, {**found["controls"].value, "exciters[1].unbalance": 2.28})
     assert float(regimes_of(moved)[0].amplitude[1]) < 0.8 * float(regimes_of(linear)[0].amplitude[1])
-    assert pictures.toml(SceneOrProblem(moved, "")) != pictures.toml(SceneOrProblem(linear, ""))
+    assert figures.toml(SceneOrProblem(moved, "")) != figures.toml(SceneOrProblem(linear, ""))
 
 
 def test_text_and_sketch_of_a_page_share_one_search(circular, monkeypatch):
     scene, calls = scene_at(circular, {"exciters[0].unbalance": sliders_of(circular)[1].steps[3]}), []
     monkeypatch.setattr(regimes, "synchronous_regimes", lambda each: calls.append(each) or jv.synchronous_regimes(each))
-    pictures.readings(scene)
-    pictures.machine(scene, None)
+    figures.readings(scene)
+    figures.machine(scene, None)
     assert len(calls) == 1 and calls[0] is scene
-    pictures.readings(circular)
+    figures.readings(circular)
     assert len(calls) == 2

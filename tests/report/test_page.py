@@ -105,7 +105,7 @@ def test_the_machine_is_that_of_the_run_or_of_the_argument(tmp_path):
     assert f"<h3>machine: {run.scene.machine.kind.replace('_', ' ')}</h3>" in own and "<h3>machine: network</h3>" in given
 
 
-def test_pictures_are_png_whatever_matplotlib_saves_by_default():
+def test_figures_are_png_whatever_matplotlib_saves_by_default():
     with matplotlib.rc_context({"savefig.format": "svg"}):
         text = Report("x", {}, figures=[("a", Figure(figsize=(1.0, 1.0)))]).html()
     assert base64.b64decode(checked(text).links[0].split(",")[1]).startswith(b"\x89PNG")

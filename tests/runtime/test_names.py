@@ -11,7 +11,7 @@ import jaxvib as jv
 
 
 def test_names_load_little():
-    """The package alone needs nothing; a jam mode needs neither pictures nor the time integrator. A user who draws nothing does
+    """The package alone needs nothing; a jam mode needs neither figures nor the time integrator. A user who draws nothing does
     not wait for matplotlib: only the names that draw load it."""
     names = sorted(set(jv.__all__) - {"animate", "sketch"})
     code = f"""

@@ -1,4 +1,4 @@
-"""Drawings and films of bodies in a plane: outline, springs, exciters, ellipses, forces."""
+"""Drawings and animations of bodies in a plane: outline, springs, exciters, ellipses, forces."""
 
 import numpy as np
 import pytest
@@ -115,14 +115,14 @@ def test_path_of_a_point_is_its_motion():
     np.testing.assert_allclose(path[:, 1], 0.1 + 3e-3 * np.sin(phase), atol=1e-12)
 
 
-def test_film_shows_each_rotor_at_its_angle(run, tmp_path):
+def test_animation_shows_each_rotor_at_its_angle(run, tmp_path):
     kept = run.trajectory
     found = motion_of_run(run, np.asarray(kept.time)[3000:3010])
     for rotor, angle in zip(found.rotors, kept.rotor_angles, strict=True):
         np.testing.assert_allclose(np.exp(1j * rotor.turn), np.exp(1j * np.asarray(angle[3000:3010])), atol=1e-9)
     assert [len(rotor.angle) for rotor in found.rotors] == [1, 0]
-    film = jv.animate(run, tmp_path / "a.gif", begin=2.97, seconds=0.2)
-    assert film.count > 3 and (tmp_path / "a.gif").stat().st_size > 1000
+    animation = jv.animate(run, tmp_path / "a.gif", begin=2.97, seconds=0.2)
+    assert animation.count > 3 and (tmp_path / "a.gif").stat().st_size > 1000
 
 
 def test_histories_have_a_line_for_each_rotor(run):

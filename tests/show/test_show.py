@@ -1,4 +1,4 @@
-"""Sketches of every machine, films of runs and exact jams."""
+"""Sketches of every machine, animations of runs and exact jams."""
 
 import re
 
@@ -49,7 +49,7 @@ def test_every_machine_has_a_sketch_with_its_numbers(kind):
     assert f"{first:.4g} kg" in told and "rpm" in told and f"{scene.loads.count} {scene.loads.kind.replace('_', ' ')}s" in told
     stiffness = float(np.max(np.asarray(scene.machine.stiffness)))
     assert f"{stiffness / 1e3:.4g} N/mm" in told
-    # A circle for each load, and nothing outside of the picture.
+    # A circle for each load, and nothing outside of the figure.
     left, right, bottom, top = view_of(scene).limits
     assert all(left <= text.x <= right and bottom <= text.y <= top for text in view_of(scene).texts(at_rest(scene), 0.0))
     points = np.concatenate([part.points for part in view_of(scene).parts(at_rest(scene), 0.0)])
@@ -120,23 +120,23 @@ def test_an_orbit_agrees_with_a_settled_run(orbit):
 
 def test_a_film_is_a_gif_and_a_page_without_requests(run, orbit, tmp_path):
     short = dict(begin=1.5, end=1.6, seconds=0.4, width=3.0)
-    film = jv.animate(run, tmp_path / "a.gif", **short)
+    animation = jv.animate(run, tmp_path / "a.gif", **short)
     left, right, bottom, top = view_of(SCENE).limits
     height = 0.8 * 3.0 * (top - bottom) / (right - left) + 2.9  # inches, with the strips below
     jv.animate(run, tmp_path / "b.gif", **short)
     assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
-    with Image.open(tmp_path / "a.gif") as picture:
-        assert picture.n_frames == film.count == 8 and picture.size == (300, int(100.0 * height))
-        first = np.asarray(picture.convert("RGB"))
-        picture.seek(4)
-        assert np.any(np.asarray(picture.convert("RGB")) != first) and first[0, 0].tolist() == [255, 255, 255]
-    film.save(tmp_path / "a<b>.html")
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == animation.count == 8 and image.size == (300, int(100.0 * height))
+        first = np.asarray(image.convert("RGB"))
+        image.seek(4)
+        assert np.any(np.asarray(image.convert("RGB")) != first) and first[0, 0].tolist() == [255, 255, 255]
+    animation.save(tmp_path / "a<b>.html")
     page = (tmp_path / "a<b>.html").read_text()
     assert not re.search(r"https?:|src=[\"']?//|<link|@import", page) and page.count("iVBOR") == 8
     assert "<title>a&lt;b&gt;</title>" in page
-    clock = film.figure.axes[0].get_title(loc="left")
+    clock = animation.figure.axes[0].get_title(loc="left")
     assert re.match(r"t =\s+1\.[56]\d\d s\s+foundation force\s+-?\d+ N", clock)
-    assert "slowed down 4 x" in film.figure.axes[0].texts[0].get_text()
+    assert "slowed down 4 x" in animation.figure.axes[0].texts[0].get_text()
     assert jv.animate(orbit, scene=SCENE, width=3.0).count > 50
 
 
@@ -216,8 +216,8 @@ def test_mode_shapes_against_the_eigenproblem():
 def test_forces_on_a_rotors_bed_differ_by_colour_and_stroke():
     rotor = jv.Scene(jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0), SCENE.loads, SCENE.drive)
     short = jv.simulate(rotor, 0.4, samples=256, estimate=False)
-    film = jv.animate(short, begin=0.3, end=0.4, seconds=0.4, width=2.0)
-    forces = [line for line in film.figure.axes[2].lines if line.get_label().startswith("foundation force")]
+    animation = jv.animate(short, begin=0.3, end=0.4, seconds=0.4, width=2.0)
+    forces = [line for line in animation.figure.axes[2].lines if line.get_label().startswith("foundation force")]
     assert len({line.get_color() for line in forces}) == len({line.get_linestyle() for line in forces}) == 2
 
 
@@ -258,7 +258,7 @@ def test_loads_of_a_sketch_are_spread_evenly():
     np.testing.assert_allclose(turns[1:] / turns[:-1], np.exp(0.4j * np.pi), rtol=1e-12)
 
 
-def test_velocities_of_a_moving_picture_are_those_of_its_motion(monkeypatch):
+def test_velocities_of_a_moving_figure_are_those_of_its_motion(monkeypatch):
     poses = []
     monkeypatch.setattr(moving, "Pose", lambda *given: poses.append(given) or Pose(*given))
     jam = jv.jam_modes(SCENE).select(1)

@@ -47,7 +47,7 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
     if tolerances and not any(regime.stable for regime in selected):
         raise InputError("--tolerance", "is for stable regimes; this scene has none; leave it out")
     ranges = ranges_within(loaded, None, tolerances)
-    output.picture("regimes.png", result.plot)
+    output.figure("regimes.png", result.plot)
     output.csv(csv, result, "regime")
     frequencies = sorted(map(float, jv.natural_frequencies(loaded)))
     document = {

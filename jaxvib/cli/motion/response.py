@@ -46,7 +46,7 @@ def response(
     loaded = loaded_scene(scene, without)
     angles, origin = _phases(loaded, phases)
     result = jax.device_get(jv.response(loaded, phases=angles, points=points, most=most))
-    output.picture("response.png", result.plot)
+    output.figure("response.png", result.plot)
     output.csv(csv, result, "speed")
     operating = np.flatnonzero(result.operating.exists).tolist()
     folds = np.flatnonzero(result.folds.exists).tolist()

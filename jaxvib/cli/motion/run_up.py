@@ -28,7 +28,7 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
 
     --out adds the figure. For scenes with loads (balls, pendulums) use `run-up-map`."""
     found = jv.run_up(loaded_scene(scene, without), until, least=least)
-    output.picture("run_up.png", found.plot)
+    output.figure("run_up.png", found.plot)
     output.csv(csv, found.run, "trajectory_time")
     names = ("resonances", "speed", "caught_at", "peak_amplitude", "peak_force", "weight_error")
     optional_fields = {"least_torque": found.least_torque} if least else {}
@@ -55,7 +55,7 @@ def run_up_map(scene: Path, drags: tuple[str, ...], tolerance: float | None, out
     if all(exciter.loads is None for exciter in loaded.exciters):
         raise InputError("scene", "has no loads (balls, pendulums); for motors with unbalances use `jaxvib run-up`")
     found = jv.run_up_map(loaded, drag=drag_values, stepsize_controller=chosen_steps(tolerance), **options)
-    output.picture("run_up_map.png", found.plot)
+    output.figure("run_up_map.png", found.plot)
     output.save_result("run_up_map.npz", found)
     kinds = sorted(set(found.kind.ravel().tolist()))
     rows = [

@@ -71,7 +71,7 @@ def settle(
     require_tolerances(loaded, tolerances)
     require_deck_options(loaded)
     run = jv.settle(loaded, stepsize_controller=chosen_steps(tolerance), **options)
-    output.picture("history.png", run.plot)
+    output.figure("history.png", run.plot)
     output.save_result("run.npz", run)
     measures = run_measures(run)
     ranges = ranges_within(run.scene, _modes_of(run) if tolerances else [], tolerances)
@@ -112,7 +112,7 @@ def envelope(
     """Integrate the averaged equations of SCENE, with steps of many turns, for long run-ups; --out saves envelope.npz."""
     loaded = loaded_scene(scene, without)
     run = jv.envelope(loaded, stepsize_controller=chosen_steps(tolerance), **_with_start(options))
-    output.picture("envelope.png", run.plot)
+    output.figure("envelope.png", run.plot)
     output.save_result("envelope.npz", run)
     output.csv(csv, run, "trajectory_time")
     measures = run_measures(run)
@@ -135,7 +135,7 @@ def growth(scene: Path, speed: str | None, output: Output, **options: Any) -> No
     The growth shows whether the motion is regular, unstable, chaotic or undecided. It also determines the time after which
     derivatives are meaningless."""
     result = jv.growth(loaded_scene(scene, speed=speed, constant=True), **_with_start(options))
-    output.picture("growth.png", result.plot)
+    output.figure("growth.png", result.plot)
     output.done(result.as_dict(), result.summary, "growth", result)
 
 

@@ -58,7 +58,7 @@ def stability_map(
     x = [read(value, "--value") for value in values]
     result = jv.stability_map(make, x, omega=_speed_range(omega), points=points)
     words = ", ".join(filter(None, _words_and_unit(loaded, vary)))
-    output.picture("stability_map.png", lambda: result.plot(label=words))
+    output.figure("stability_map.png", lambda: result.plot(label=words))
     rows = [
         {
             "value": float(value),

@@ -72,7 +72,7 @@ def audit(
     with output.progress() as progress:
         result = jv.audit(loaded, accuracy=share, possible=None if add_missing else (), progress=progress, **options)
     if result.effects:
-        output.picture("audit.png", result.plot)
+        output.figure("audit.png", result.plot)
     output.done(result.as_dict(), lambda: audit_text(result), "audit", result)
 
 

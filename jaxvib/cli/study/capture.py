@@ -74,7 +74,7 @@ def capture(
     result = jv.capture(
         loaded, np.linspace(low, high, speeds), turns=turns, starts=starts, resolution=resolution, rotation=rotation
     )
-    output.picture("capture.png", result.plot)
+    output.figure("capture.png", result.plot)
 
     def paths() -> Figure:
         from jaxvib.draw.capture import torus_paths
@@ -92,7 +92,7 @@ def capture(
         rate = np.asarray(trajectory.state.azimuth_rate) / np.asarray(trajectory.rotor_speed)[:, None] - 1.0
         return torus_paths(relative_angle, np.asarray(trajectory.state.angle[1]), rate, np.asarray(trajectory.time))
 
-    output.picture("paths.png", paths)
+    output.figure("paths.png", paths)
 
     def text() -> str:
         rows = [

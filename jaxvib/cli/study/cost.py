@@ -52,7 +52,7 @@ def cost(
     loaded = loaded_scene(scene, speed=speed)
     with output.progress() as progress:
         result = jv.work_precision(loaded, quantity, progress=progress, **options)
-    output.picture("cost.png", result.plot)
+    output.figure("cost.png", result.plot)
     output.done(cost_document(result), lambda: cost_table(result), "cost", result)
 
 

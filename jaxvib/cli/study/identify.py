@@ -83,7 +83,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
         return
     pendulum, swing, options = measurement_from_tables(_with_options(tables, given), record.parent)
     found = identify_bearing(pendulum, swing, **options)
-    output.picture("record.png", found.plot)
+    output.figure("record.png", found.plot)
     columns = {"time (s)": swing.time, "angle (rad)": swing.angle, "fit (rad)": found.fitted}
     output.table("fit.csv", {head: np.asarray(values) for head, values in columns.items()})
     decrement = found.decrement
@@ -135,7 +135,7 @@ def _identify_machine(tables: Tables, folder: Path, output: Output, options: lis
     fit = fit_from_tables(tables, folder)
     found = jv.identify(fit.scene, fit.runs, unknown=fit.unknown, known=fit.known)
     assert isinstance(found, jv.MachineFit)
-    output.picture("fit.png", found.plot)
+    output.figure("fit.png", found.plot)
     output.save_result("fit.npz", found)
     path = output.file("found.toml")
     if path is not None:

@@ -38,7 +38,7 @@ def plan(identification: Path, fit: Path | None, output: Output) -> None:
     if not isinstance(machine_fit, jv.MachineFit):
         raise InputError("--fit", f"is a file of {type(machine_fit).__name__}; it must be a fit.npz of jaxvib identify")
     plan = jv.plan_runs(machine_fit, fit_input.candidates, fit_input.limits)
-    output.picture("plan.png", plan.plot)
+    output.figure("plan.png", plan.plot)
     output.save_result("plan.npz", plan)
     profile = plan.profile
     document = {"status": plan.status_name, "message": plan.message}

@@ -47,7 +47,7 @@ def record(recording: Path, pulses: str | None, per_turn: int, speed: str | None
         for channel in channels
         if channel.time is not None
     ]
-    output.picture("recording.png", lambda: recording_chart(signals, curve))
+    output.figure("recording.png", lambda: recording_chart(signals, curve))
     document = {
         "file": str(recording),
         "channels": [{k: v for k, v in overview._asdict().items() if k != "notes"} for overview in overviews],

@@ -50,7 +50,7 @@ def sweep(
     except KeyboardInterrupt:
         click.echo(f"stopped: finished cases are saved in {path}; run the same command again to continue", err=True)
         raise
-    output.picture("sweep.png", result.plot)
+    output.figure("sweep.png", result.plot)
     _print_result(result, output, "sweep")
 
 
@@ -71,7 +71,7 @@ def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory:
 
         x, y = over or (None, None)
         for name, figure in figures(store, measure, x=x, y=y, theory=theory):
-            output.picture(f"{name}.png", lambda drawn=figure: drawn)
+            output.figure(f"{name}.png", lambda drawn=figure: drawn)
     _print_result(result, output, "show")
 
 

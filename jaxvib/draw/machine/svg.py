@@ -29,7 +29,7 @@ def svg(
     seconds: float,
     turns: float,
 ) -> str:
-    """Return an animated picture that repeats periodically, or a still picture if there is only one frame.
+    """Return an animated image that repeats periodically, or a still image if there is only one frame.
 
     **Arguments**
 

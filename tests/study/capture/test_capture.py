@@ -221,7 +221,7 @@ def test_invalid_arguments_raise_clear_errors(ask, says):
         ask(published_torus(2.5))
 
 
-def test_the_command_prints_shares_and_writes_pictures(tmp_path, capsys, monkeypatch):
+def test_the_command_prints_shares_and_writes_figures(tmp_path, capsys, monkeypatch):
     drawn = []
 
     def paths(*arrays):

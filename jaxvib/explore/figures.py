@@ -62,7 +62,7 @@ def scene_or_problem(build: Callable[[], Scene]) -> SceneOrProblem:
 
 
 def image(draw: Callable[[], str], scene: SceneOrProblem) -> str:
-    """Return an SVG picture as an HTML image with embedded data, or the message of the error."""
+    """Return an SVG figure as an HTML image with embedded data, or the message of the error."""
 
     def embed() -> str:
         data = base64.b64encode(draw().encode()).decode()
@@ -102,7 +102,7 @@ def prepare(scene: Scene) -> None:
     for _ in range(2):
         _draw_all(scene)
     gc.collect()
-    gc.freeze()  # a garbage collection of all programs and modules would take longer than a picture
+    gc.freeze()  # a garbage collection of all programs and modules would take longer than a figure
 
 
 def prepare_counts(scene: Scene) -> None:
@@ -134,7 +134,7 @@ def has_branches(scene: Scene) -> bool:
 
 
 def about(scene: Scene) -> str:
-    """Return the text below the pictures, as Markdown."""
+    """Return the text below the figures, as Markdown."""
     theory = _ABOUT_LOADS if scene.is_plain else _ABOUT_COLLECTED if scene.has_loads else _ABOUT_UNBALANCES
     return f"{heading(scene)}\n\n{_ABOUT_SLIDERS} {theory}"
 
@@ -224,7 +224,7 @@ def modes_of(scene: Scene) -> list[int]:
 
 
 def machine(scene: Scene, mode: int | None) -> str:
-    """Return the machine as an SVG picture: moving in the jam mode with that number; if `mode` is None, moving in the first
+    """Return the machine as an SVG figure: moving in the jam mode with that number; if `mode` is None, moving in the first
     regime of its exciters with unbalances, or at rest if there is none."""
     from jaxvib.explore.regimes import deck_points, regimes_of
     from jaxvib.show.moving import moving_svg, regime_svg, sketch_svg  # slow import

@@ -29,17 +29,17 @@ _PAGE = """<!doctype html>
 <title>{title}</title>
 <style>body{{font-family:sans-serif;margin:1em auto;max-width:{width}px;padding:0 .5em}}img{{width:100%;height:auto}}
 .bar{{display:flex;gap:.6em;align-items:center}}input{{flex:1}}button{{min-width:5em}}</style></head>
-<body><img id="picture" alt="{title}"><div class="bar"><button id="run">Pause</button>
+<body><img id="image" alt="{title}"><div class="bar"><button id="run">Pause</button>
 <input id="place" type="range" min="0" max="{last}" value="0" aria-label="frame">
 <label>speed <select id="speed"><option value="0.25">1/4</option><option value="0.5">1/2</option>
 <option value="1" selected>1</option><option value="2">2</option></select></label></div>
 <script>
-const pictures = [{pictures}].map(data => "data:image/png;base64," + data);
-const picture = document.getElementById("picture"), place = document.getElementById("place");
+const frames = [{frames}].map(data => "data:image/png;base64," + data);
+const image = document.getElementById("image"), place = document.getElementById("place");
 const run = document.getElementById("run"), speed = document.getElementById("speed");
 let running = true, timer = null;
-function show(k) {{ place.value = k; picture.src = pictures[k]; }}
-function step() {{ show((+place.value + 1) % pictures.length); timer = setTimeout(step, {pause} / +speed.value); }}
+function show(k) {{ place.value = k; image.src = frames[k]; }}
+function step() {{ show((+place.value + 1) % frames.length); timer = setTimeout(step, {pause} / +speed.value); }}
 run.onclick = () => {{ running = !running; run.textContent = running ? "Pause" : "Play";
   if (running) step(); else clearTimeout(timer); }};
 place.oninput = () => {{ if (running) run.onclick(); show(+place.value); }};
@@ -48,7 +48,7 @@ show(0); timer = setTimeout(step, {pause});
 """
 
 
-class Film(FuncAnimation):
+class Animation(FuncAnimation):
     """Animation of matplotlib in which only some artists move; its method `save` draws the other artists only once.
 
     **Arguments**: `figure`; `update`: function that moves the artists to their positions in frame k; `moving`: these artists;
@@ -130,4 +130,4 @@ class Film(FuncAnimation):
                 coded.append('"' + base64.b64encode(memory.getvalue()).decode("ascii") + '"')
         width = int(self.figure.bbox.width)
         settings = {"title": html.escape(title, quote=True), "width": width, "last": self.count - 1}
-        return _PAGE.format(pictures=",".join(coded), pause=round(1000.0 / self.fps), **settings)
+        return _PAGE.format(frames=",".join(coded), pause=round(1000.0 / self.fps), **settings)
