@@ -383,3 +383,15 @@ def test_values_are_shown_in_si_on_request():
     finally:
         jv.display_units()
     assert shown_unit("m", 0.02) == ("mm", 1e3)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "force", "value"),
+    [("280 kg/mm", "N/m", "280 kgf/mm", 2745862.0), ("5 kg", "N", "5 kgf", 49.03325)],
+)
+def test_kilograms_as_a_force_are_refused_with_kgf(text, unit, force, value):
+    with pytest.raises(jv.InputError, match=f"field is '{text}'; a kilogram is a mass; for the force write '{force}', or N"):
+        number(text, unit, "field")
+    assert float(number(force, unit, "field")) == pytest.approx(value, rel=1e-12)
+    with pytest.raises(jv.InputError, match="field is '3 kg', which is not in N/m"):
+        number("3 kg", "N/m", "field")

@@ -82,6 +82,8 @@ _JOINED_PATTERN = re.compile(rf"(?<![^\W\d_])({'|'.join(_JOINED)})((?:\^|\*\*)\d
 _PLAIN_POWER = re.compile(r"(?<=[^\W\d_])([23])(?!\w)")
 """Power of a unit without a sign, as in "kg m2"."""
 
+_KILOGRAM = re.compile(r"(?<![^\W\d])kg(?!\w)")
+
 _AMBIGUOUS = (
     (re.compile(r"(?<![^\W\d_])grad(?![^\W\d_])", re.IGNORECASE), "degrees or gon; write deg or gon"),
     (re.compile(r"(?<![^\W\d])tons?(?!\w)"), "1000 kg or 907 kg; write t or short_ton"),
@@ -187,6 +189,14 @@ def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
     for pattern, meanings in _AMBIGUOUS:
         if pattern.search(value):
             return InputError(field, f"is {quoted(value)}, which can mean {meanings}")
+    as_force = _KILOGRAM.sub("kgf", value)
+    if unit and as_force != value:
+        try:
+            to_float(as_force, unit, field)
+        except InputError:
+            pass
+        else:
+            return InputError(field, f"is {quoted(value)}; a kilogram is a mass; for the force write {quoted(as_force)}, or N")
     wanted = "not a number with a unit" if unit is None else f"not in {unit}" if unit else "not a plain number"
     return InputError(
         field, f"is {quoted(value)}, which is {wanted}; write for example {_example('m' if unit is None else unit)}"
