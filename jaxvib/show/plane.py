@@ -28,6 +28,11 @@ _STEEP_SPRING_SINE = np.sin(np.radians(40.0))
 """Sine of the angle to the horizontal above which a spring is drawn downward; a flatter spring is drawn sideways."""
 
 
+_ARROW_MARGIN = 0.19
+"""Distance between the circle of an exciter's loads and the middle between the exciter and its nearest neighbour, in units of
+the drawing. The arrow above a rotor then does not cover its neighbour."""
+
+
 class _Strut(NamedTuple):
     """Spring with its damper, from the body to the foundation.
 
@@ -59,7 +64,7 @@ class PlaneView(View):
         self.scale = _WIDTH / max(float(span[0]), 1.6 * float(span[1]), 1e-9)
         distances = [float(np.hypot(*(first - second))) for k, first in enumerate(self._axes) for second in self._axes[:k]]
         nearest = self.scale * min((x for x in distances if x > 0.0), default=1.0)
-        self.wheels = [Wheel(exciter, float(np.clip(0.33 * nearest, 0.12, 0.3))) for exciter in scene.exciters]
+        self.wheels = [Wheel(exciter, float(np.clip(0.5 * nearest - _ARROW_MARGIN, 0.12, 0.3))) for exciter in scene.exciters]
         self.struts = [strut for k in range(len(self._supports)) for strut in self._struts(k, points)]
         radii = (
             [_OUTLINE_MARGIN] * len(self._supports) + [_OUTLINE_MARGIN + wheel.rim for wheel in self.wheels] + [_OUTLINE_MARGIN]

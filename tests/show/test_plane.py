@@ -136,3 +136,14 @@ def test_deck_on_platforms_raises_a_clear_error(run):
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
     with pytest.raises(jv.InputError, match="deck needs a body in a plane, not a machine of kind 'one_mass'"):
         jv.sketch(scene, deck=run.deck([(0.0, 0.0), (1.0, 0.0)]))
+
+
+@pytest.mark.parametrize("distance", [0.55, 0.7, 1.5])
+def test_arrow_of_an_exciter_does_not_cover_its_neighbour(distance):
+    """Supports 4 m apart are drawn 6 units apart."""
+    springs = [jv.support(at=(x, -0.5), stiffness=(1e6, 2e6), damping=(5e3, 7e3)) for x in (-2.0, 2.0)]
+    machine = jv.plane_body(mass=6000.0, inertia=12000.0, supports=springs)
+    motor = jv.DCMotor(100.0, stall_torque=100.0, inertia=1.0)
+    view = view_of(jv.Scene(machine, exciters=[jv.Exciter(drive=motor, unbalance=7.5, at=(x, 0.5)) for x in (0.0, distance)]))
+    first, second = view.wheels
+    assert first.rim + second.rim + 0.13 < view.scale * distance
