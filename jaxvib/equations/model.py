@@ -105,7 +105,8 @@ class Model(eqx.Module):
         return force if self.scene.machine.has_foundation else jnp.full_like(force, jnp.nan)
 
     def vibration_force(self, displacement: Array, omega: Array) -> Array:
-        """Return the complex amplitudes of the force on the foundation without effects, N, as results state them.
+        """Return the complex amplitudes of the force of the carrier's supports on the foundation, N; NaN if the foundation is
+        unknown. The forces of effects are not included.
 
         **Arguments**: `displacement` (nd,) or (nd, K): complex amplitudes; `omega`: their frequency, or one for each column.
         """

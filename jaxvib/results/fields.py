@@ -28,7 +28,7 @@ Plain: TypeAlias = "bool | int | float | str | list[Plain] | dict[str, Plain] | 
 """Values that JSON can represent."""
 
 Labels: TypeAlias = Mapping[str, Sequence[str]]
-"""Labels of the points on each axis by the name of the axis; the entry "unit" contains the units of the coordinates."""
+"""Mapping from the name of each axis to the labels of its points; the entry "unit" contains the units of the coordinates."""
 
 Column: TypeAlias = tuple[str, tuple[str, ...], np.ndarray, str]
 """Name of an array, names of its axes, values and unit."""
@@ -99,8 +99,8 @@ def as_text(write: Callable[[T], str], read: Callable[[str], T], labels: Callabl
 
 
 def names_along(axis: str) -> Names:
-    """Return the metadata of a field that contains the labels of the points on an axis; "unit" stands for the units of the
-    coordinates."""
+    """Return the metadata of a field that contains the labels of the points on an `axis`; with the axis "unit", the labels are
+    the units of the coordinates."""
     return {"labels": lambda names: {axis: names}}
 
 
@@ -182,7 +182,7 @@ def columns(result: eqx.Module) -> Iterator[Column]:
 
 
 def is_single(result: eqx.Module) -> bool:
-    """Return True if the numbers of a result have values and no axis of an outer `vmap`."""
+    """Return True if the numbers of a result are not traced and have no axis of an outer `vmap`."""
     try:
         return all(value.ndim == len(axes) for _, axes, value, _ in columns(result))
     except jax.errors.TracerArrayConversionError:
@@ -190,7 +190,7 @@ def is_single(result: eqx.Module) -> bool:
 
 
 def labels_of(result: eqx.Module) -> Labels:
-    """Return the labels of the points on each axis by the name of the axis; the entry "unit" contains the units of the
+    """Return a mapping from the name of each axis to the labels of its points; the entry "unit" contains the units of the
     coordinates."""
     labels: dict[str, Sequence[str]] = {}
     for field in dataclasses.fields(result):

@@ -64,7 +64,8 @@ def regime_svg(scene: Scene, regime: SynchronousRegime, points: Sequence[tuple[f
     """Return the sketch of a scene that moves in a synchronous regime, with the forces on the foundation as arrows, and with
     the ellipses on which points of the body move.
 
-    If no exciter has an unbalance, the rotors turn at the ratio of their speed to that of the loads in the first exciter.
+    If an exciter has an unbalance, the rotors are drawn with one turn per period of the vibration. If all exciters have loads,
+    the number of turns per period is the rotor speed divided by the load speed in the first exciter.
 
     **Arguments**: `scene`, whose exciters have an unbalance or loads; a `regime` of it; `points` (x, y) of a body in a plane,
     m.

@@ -55,9 +55,9 @@ _MIN_TURNS = 8
 """Smallest number of turns of jammed loads in a record."""
 
 _COINCIDENT_SPREAD, _FREE_SPREAD = 1e-3, 0.2
-"""Standard deviations of the angles of the loads of a run at the first sample about their mean, rad, and of their speeds about
-the mean, relative to it. The first is for equal loads at one station, which gather in a jam: a small difference of their angles
-changes no reading. The second is for all other loads."""
+"""Standard deviations for equal loads at one station, and for all other loads: of the angles of the loads of a run at the first
+sample about their mean, rad, and of their speeds about the mean speed, relative to it. Equal loads at one station gather in a
+jam, and a small difference of their angles changes no reading."""
 
 _GAP_SIZE = 0.01
 """Gap between two segments, relative to the size of each state (angles: rad), that costs as much as a reading whose residual

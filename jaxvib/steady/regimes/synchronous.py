@@ -72,8 +72,8 @@ class RegimeStatus(eqx.Enumeration):
         "one of a family: phases can change without a change of torques, so that even the smallest disturbance changes them"
     )
     no_vibration = (
-        "the forces of the rotating masses cancel: the machine does not vibrate; equal masses that turn in one direction about "
-        "one axis do so in antiphase"
+        "the forces of the rotating masses cancel, and the machine does not vibrate; an example is two equal masses that turn "
+        "in antiphase in one direction about one axis"
     )
     not_converged = "no regime was found from this start"
     none_stable = (
@@ -236,8 +236,8 @@ class SynchronousRegimes(AbstractSynchronousRegime):
         """Plot the torques of the motors over the speed with all regimes, and the phases of each regime on a circle.
 
         Circles begin with the stable regimes; without `ax` there are at most 7. The torques that the vibration needs are those
-        at the phases of the first regime. There is no panel of torques for regimes of some of the masses, and without motors
-        and loads.
+        at the phases of the first regime. The panel of torques is omitted if the regimes are those of only some of the masses,
+        or if all torques are those of ideal drives.
 
         **Returns** a matplotlib figure, or the given `ax`, which must contain one axes object for each panel.
         """
@@ -325,8 +325,8 @@ def synchronous_regimes(
     - `scene`, with gravity as its only effect or without effects; exciters have an unbalance, or loads and an ideal drive;
       typical: 2 to 32 rotating masses
     - `masses`: numbers, from 0, of the rotating masses that turn at the common speed; the result contains only these and their
-      exciters. The others turn at different speeds; only their mass affects the result and, in a machine with a gyroscopic
-      matrix, the working speeds of their drives, as parts of n. Default: all
+      exciters. The others turn at different speeds and affect the result by their mass only. If the machine has a gyroscopic
+      matrix, their rotors also affect n, with the working speeds of their drives. Default: all
     - `near`: (speed, phases), rad/s and (mass,) rad, from which Newton's method finds one regime. The function can then be used
       under `jit`, `vmap` and `grad`. Derivatives are those of the implicit function theorem; `growth`, `quasi_static`
       and `stable` have none
@@ -347,8 +347,8 @@ def synchronous_regimes(
     >>> phases, found.stable.tolist()    # stable: half a turn apart, the body moves along a vertical line
     ([3.1416, 0.0], [True, False])
 
-    Source: I. I. Blekhman, Synchronization in Science and Technology, 1988; the Jacobian of the slow motion in place of his
-    integral criterion.
+    Source: I. I. Blekhman, Synchronization in Science and Technology, 1988; the eigenvalues of the linearized averaged
+    equations in place of his integral criterion.
     """
     scene = validate_scene(scene)
     require_rotating_masses(scene)
