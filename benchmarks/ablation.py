@@ -2,7 +2,7 @@
 
     python benchmarks/ablation.py [--quick] [--only WORD ...]
 
-Every trick is switched off alone, in one process; times are of the processor, second call, compile time apart. The tricks and
+Every trick is switched off alone, in one process; times are CPU times, second call, compile time apart. The tricks and
 the reasons for them stand in jaxvib/ode/README.md. Scenes: the two-mass machine of the antiphase paper with one load (6
 numbers in a state) and, for what is looped over stages, a two-mass machine with three balls (10 numbers).
 """

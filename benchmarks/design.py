@@ -75,7 +75,7 @@ def speed() -> None:
     middle = time.process_time()
     synthesize(space, FORCE, starts=1000, iterations=500, polishing=0, verify=False)
     busy = time.process_time() - middle
-    print(f"1000 starts x 500 steps, leading order: first {first:.1f} s, again {again:.2f} s ({busy:.1f} s of processor)")
+    print(f"1000 starts x 500 steps, leading order: first {first:.1f} s, again {again:.2f} s ({busy:.1f} s of CPU time)")
 
 
 def rule() -> None:

@@ -3,7 +3,7 @@
     python benchmarks/scan.py [--quick] [--only WORD ...]
 
 Scenes are chosen so that every pair of a machine, a load, an effect and a drive stands in one of them. For each: the numbers
-that one evaluation of the field computes, and microseconds of the processor (second call, compiled) for a step of a run and
+that one evaluation of the field computes, and microseconds of CPU time (second call, compiled) for a step of a run and
 for a sample of the window that is measured, in all and for a thousand of those numbers. Last come the scenes more than 3
 times above the median: such a scene has met something that the compiler does badly. --only takes the scenes in whose name one
 of the words stands.
@@ -85,7 +85,7 @@ DRIVES = {
 
 
 class Cost(NamedTuple):
-    """Cost of a scene: operations of its field, seconds of the processor a step and a sample."""
+    """Cost of a scene: operations of its field, CPU seconds a step and a sample."""
 
     operations: int
     step: float

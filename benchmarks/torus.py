@@ -4,9 +4,9 @@
     python benchmarks/torus.py [--starts 1000] [--turns 2000] [--share 8] [--tables derived printed "gap lever" contact]
 
 The native loop (parts/native_torus.py) and the engine take the same steps from the same starts; how far apart they end is
-printed. Times are the processor's, of the whole process, since other programs may be running: divide by the number of cores.
+printed. Times are CPU times, of the whole process, since other programs may be running: divide by the number of cores.
 The ratio is measured with a share of the turns. --tables prints the paper's tables by these models, by steps that are doubled
---doublings times at most (some ten minutes of the processor each).
+--doublings times at most (some ten minutes of CPU time each).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def touching(speed: jax.Array) -> tuple[jv.Scene, jv.State]:
 
 
 def spent(call: Callable[[], Any], rounds: int = 2) -> float:
-    """Seconds of the processor, the least of so many calls after one that compiles."""
+    """CPU seconds, the least of so many calls after one that compiles."""
     jax.block_until_ready(call())
     found = []
     for _ in range(rounds):
@@ -92,7 +92,7 @@ def main() -> None:
         whole = seconds * options.share
         print(
             f"{name:9s} {seconds / base:6.2f} times the native loop (free); {speeds.size} starts of {options.turns} turns: "
-            f"{whole:.0f} s of the processor"
+            f"{whole:.0f} s of CPU time"
         )
     if options.tables:
         print(published_tables(options.tables, doublings=options.doublings).summary())

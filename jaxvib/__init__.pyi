@@ -2,7 +2,7 @@
 
 __version__: str
 
-# Errors, and the processor
+# Errors, and the CPU
 from jaxvib.errors import InputError as InputError, ComputationError as ComputationError
 from jaxvib.runtime.cpu import prepare_cpu as prepare_cpu
 from jaxvib.display import display_units as display_units

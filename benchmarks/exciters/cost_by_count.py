@@ -2,7 +2,7 @@
 
     python benchmarks/exciters/cost_by_count.py
 
-Times are those of the processor. The first call includes tracing and compilation.
+Times are CPU times. The first call includes tracing and compilation.
 """
 
 from __future__ import annotations

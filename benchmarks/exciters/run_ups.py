@@ -2,7 +2,7 @@
 
     python benchmarks/exciters/run_ups.py --runs 4096
 
-The machine is that of docs/exciters.md. Times are those of the processor; the first call includes tracing and compilation. They
+The machine is that of docs/exciters.md. Times are CPU times; the first call includes tracing and compilation. They
 are stated as ratios to one run by the same function.
 """
 
@@ -61,7 +61,7 @@ def main(runs: int, seconds: float) -> None:
     error = np.sqrt(share.value * (1.0 - share.value) / runs)
     print(f"{runs} run-ups of {seconds:g} s, {int(found.steps)} steps each: {share.text}; standard error {100.0 * error:.2g} %")
     print(f"one run {one:.3g} s; {runs} runs: first call {first / one:.4g} times, second call {again / one:.4g} times one run")
-    print(f"processor time per run in the second call: {again / runs / one:.3g} times that of one run")
+    print(f"CPU time per run in the second call: {again / runs / one:.3g} times that of one run")
 
 
 if __name__ == "__main__":

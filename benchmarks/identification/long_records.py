@@ -1,4 +1,4 @@
-"""Processor time and memory of the identification of long records, in a new process and again in the same one.
+"""CPU time and memory of the identification of long records, in a new process and again in the same one.
 
     python benchmarks/identification/long_records.py
 
@@ -57,7 +57,7 @@ def write_record(path: pathlib.Path, duration: float, rate: float) -> None:
 
 
 def measure(path: str) -> None:
-    """Identify the machine from a record twice, and print the processor time and the largest memory."""
+    """Identify the machine from a record twice, and print the CPU time and the largest memory."""
     import jax
 
     jax.config.update("jax_enable_x64", True)

@@ -56,7 +56,7 @@ def best(call: Callable[[], Any], runs: int = 7) -> float:
 
 
 def busy(call: Callable[[], Any], runs: int = 5) -> float:
-    """Seconds of the processor that a call takes, the least of so many measurements; the first call is not counted.
+    """CPU seconds that a call takes, the least of so many measurements; the first call is not counted.
 
     A measurement repeats the call for 50 ms: systems count a process's time in ticks that may be milliseconds long.
     """

@@ -77,7 +77,7 @@ def chain(free: int) -> tuple[DesignSpace, Quantity]:
 
 
 def gradient_cost(free: int, repeat: int = 200) -> tuple[float, float]:
-    """Seconds of processor of one value, and of one with its gradient: one design, followed from the jam it is at."""
+    """CPU seconds of one value, and of one with its gradient: one design, followed from the jam it is at."""
     space, wish = chain(free)
     problem = problem_of(space, wish, ())
     z = np.asarray(space.where(space.scene))

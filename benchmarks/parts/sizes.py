@@ -1,6 +1,6 @@
 """Cost by size of the machine, and time of first answers: rows of the table of engine.py.
 
-Run by engine.py: platforms and equal loads in seconds of the processor, first answers in seconds of the clock, in processes of
+Run by engine.py: platforms and equal loads in CPU seconds, first answers in seconds of the clock, in processes of
 their own. `trials/large_machines.py` measures more sizes and compares with a dense solution.
 """
 
@@ -24,7 +24,7 @@ FIRST_ANSWERS = ("jam_modes", "jam_orbit", "simulate, 5 s", "simulate, gradient 
 
 
 def seconds(function: Callable[[], Any], repeats: int = 5) -> tuple[float, float]:
-    """Time of the processor of a first call, and the least of several later ones."""
+    """CPU time of a first call, and the least of several later ones."""
     found = []
     for _ in range(repeats + 1):
         begun = time.process_time()

@@ -6,7 +6,7 @@ The work is 1e6 runs with full equations (`ensemble`, 200 s each), a sweep of 65
 designs with gradient, 1e5 exact orbits, and 1e4 exact orbits with their multipliers. A process on two cores computes every
 hundredth run and every tenth orbit; its time is scaled up. The difference is the largest one between results of both, relative
 to the largest result. --quick computes a thousandth, to see that it runs. Where JAX finds no accelerator both columns are of
-the processor.
+the CPU.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ WORK: dict[str, tuple[Callable[..., Call], int, int, int, int]] = {
         10_000,
     ),
 }
-"""Work: function, number, part that the processor computes (1/part), batch on the processor and on an accelerator."""
+"""Work: function, number, part that the CPU computes (1/part), batch on the CPU and on an accelerator."""
 
 
 def measured(scale: int, shared: bool) -> list[dict[str, Any]]:
@@ -125,7 +125,7 @@ def measured(scale: int, shared: bool) -> list[dict[str, Any]]:
 
 
 def on_two_cores(scale: int) -> list[dict[str, Any]]:
-    """Return `measured` of a process on two cores of the processor."""
+    """Return `measured` of a process on two cores of the CPU."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "found.json"
         own = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""}
@@ -149,7 +149,7 @@ def main() -> None:
     device = jax.devices()[0].device_kind
     print(f"{device}; {cpu_name()}; {versions()}")
     large = measured(scale, False)
-    print("two cores of the processor, scaled up:")
+    print("two cores of the CPU, scaled up:")
     small = on_two_cores(scale)
     lines = [f"| work | {device} | two cores | ratio | difference |", "|---|---|---|---|---|"]
     for a, b in zip(large, small, strict=True):

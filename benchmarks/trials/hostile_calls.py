@@ -9,7 +9,7 @@ each hostile value, the other arguments valid, and once for each number and scen
 - refused: `InputError` or `ComputationError`, or Python's `TypeError` for a missing argument
 - answered: with a result whose numbers are finite or whose status says why they are not
 - raw: in any other error, or in a warning
-- hang: after more than `PATIENCE` seconds of the processor
+- hang: after more than `PATIENCE` CPU seconds
 - silent: with numbers that are not finite and no status, or with a Boolean, a complex number, a date, bytes or masked values
   taken for a number
 
@@ -53,7 +53,7 @@ import optimize as op
 from jaxvib.errors import quoted
 
 PATIENCE = 20.0
-"""Seconds that no call may take, of the processor: others who use it do not count."""
+"""CPU seconds that no call may take, without those of other programs."""
 
 MEMORY = 8 * 2**30
 """Bytes that the trial may take; a call that needs more ends in a `MemoryError`, not in that of the whole machine."""
@@ -184,7 +184,7 @@ class Hanging(Exception):
 
 @contextlib.contextmanager
 def patience(seconds: float) -> Iterator[None]:
-    """Raise `Hanging` after so many seconds of the processor."""
+    """Raise `Hanging` after so many CPU seconds."""
 
     def stop(*_: Any) -> None:
         raise Hanging

@@ -2,7 +2,7 @@
 
     python benchmarks/trials/large_machines.py [2 5 10 20 50 100 200]
 
-Milliseconds of the processor: the least of several calls and, in brackets, the first call, which compiles. A step of `simulate`
+CPU time in ms: the least of several calls and, in brackets, the first call, which compiles. A step of `simulate`
 follows from two runs of different length; the rest of a run is the time beyond its steps. The error is the largest relative
 difference of the amplitudes of all jam modes from a solution with the full matrices.
 """

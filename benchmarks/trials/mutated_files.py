@@ -10,7 +10,7 @@
 Each case is drawn by its seed, from `--first` on, and judged by `tests/helpers/mutations.py`. A study, scene, design or
 measurement file is read; of a store one to three files are changed, then it is read, computed on and read again; a saved result
 is changed byte by byte, or prepared anew with odd parts and the right digest. Printed are the failures with their seeds and the
-counts; the exit code is 1 if there is a failure: a raw error, more than 60 s of the processor, a number that is not the right
+counts; the exit code is 1 if there is a failure: a raw error, more than 60 s of CPU time, a number that is not the right
 one.
 """
 

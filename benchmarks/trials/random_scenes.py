@@ -49,13 +49,13 @@ from hard_cases.shared import away, compared_state, end_of_run, light_force_slop
 jv.prepare_cpu()
 
 PATIENCE = 60.0
-"""Seconds that no answer may take, of the processor: others who use it do not count, nor do references."""
+"""CPU seconds that no answer may take, without those of other programs and of references."""
 
 reference_seconds = 0.0
 
 
 def not_counted(function: Callable) -> Callable:
-    """Return a reference whose seconds of the processor are added to `reference_seconds`."""
+    """Return a reference whose CPU seconds are added to `reference_seconds`."""
 
     @functools.wraps(function)
     def reference(*args: object, **keywords: object) -> object:

@@ -7,7 +7,7 @@
     python benchmarks/trials/sweeps.py memory
 
 The machine is the two-mass one of the antiphase paper in its dimensionless numbers with one load, eps = 0.05. Seconds are those
-of the clock, and of the processor, which does not depend on what else runs.
+of the clock, and CPU time, which does not depend on what else runs.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def clocks() -> tuple[float, float]:
 
 def since(begun: tuple[float, float]) -> str:
     now = clocks()
-    return f"{now[0] - begun[0]:.1f} s, {now[1] - begun[1]:.1f} s of the processor"
+    return f"{now[0] - begun[0]:.1f} s, {now[1] - begun[1]:.1f} s of CPU time"
 
 
 def same(one: pathlib.Path, other: pathlib.Path) -> bool:
@@ -166,7 +166,7 @@ def killed(folder: pathlib.Path, out: pathlib.Path) -> None:
 
 
 def watched(told: str):
-    """Computation of a chunk by a worker, with a line in a file for each: the process, begin, end, processor time."""
+    """Computation of a chunk by a worker, with a line in a file for each: the process, begin, end, CPU time."""
     real = jaxvib.sweeps.cluster._compute_remotely
 
     def remote(*given):
@@ -181,7 +181,7 @@ def watched(told: str):
 
 def cluster(folder: pathlib.Path, out: pathlib.Path) -> None:
     """Workers beside this process, in turns. On a busy machine the clock tells little: so also how long workers have nothing
-    to do between two chunks, and what all processes take of the processor."""
+    to do between two chunks, and the CPU time of all processes."""
     import threading
 
     import psutil  # distributed has it
@@ -203,13 +203,13 @@ def cluster(folder: pathlib.Path, out: pathlib.Path) -> None:
             begun = clocks()
             capture(store, size, **options, **more, report=lambda now, t=times: t.append((time.perf_counter(), busy())))
             clock, spent = np.subtract(times[-1], times[5]) / (len(times) - 6)  # by the sixth every worker has its program
-            each = f"from chunk to chunk {clock:.3f} s, {spent:.3f} s of the processor"
+            each = f"from chunk to chunk {clock:.3f} s, {spent:.3f} s of CPU time"
             print(f"{turn} {name}: {since(begun)}; {each}; load {os.getloadavg()[0]:.1f}", flush=True)
         rows = np.loadtxt(told)
         for worker in np.unique(rows[:, 0]):
             mine = rows[rows[:, 0] == worker][2:]  # the first is compiled
             gap, computing = np.mean(mine[1:, 1] - mine[:-1, 2]), np.mean(mine[:, 2] - mine[:, 1])
-            share = f"{computing:.3f} s a chunk ({np.mean(mine[:, 3]):.3f} s of the processor), {1e3 * gap:.1f} ms between two"
+            share = f"{computing:.3f} s a chunk ({np.mean(mine[:, 3]):.3f} s of CPU time), {1e3 * gap:.1f} ms between two"
             print(f"  worker {worker:.0f}: {share}, {100.0 * gap / computing:.1f} %", flush=True)
     jaxvib.sweeps.cluster._compute_remotely = plain
     print("two workers, bit for bit the same:", same(here, there), flush=True)

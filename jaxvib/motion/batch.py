@@ -24,7 +24,7 @@ from jaxvib.numerics.extrema import NODES
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.types import Y as IntegratorState
 from jaxvib.runtime.compat import fast_diffrax_loop_end
-from jaxvib.runtime.devices import is_processor
+from jaxvib.runtime.devices import is_cpu
 
 BATCH_SIZE = 64
 """Number of runs in a batch on a core: enough to fill the vector registers, and few enough to fit into the cache."""
@@ -99,7 +99,7 @@ def pack_batch(scene: Scene, field: Callable[[Array, State], State], state: Stat
 
 def batch_size() -> int:
     """Return the number of runs that advance together on the default device of JAX."""
-    return BATCH_SIZE if is_processor() else _ACCELERATOR_BATCH_SIZE
+    return BATCH_SIZE if is_cpu() else _ACCELERATOR_BATCH_SIZE
 
 
 class BatchPlan(NamedTuple):

@@ -249,7 +249,7 @@ def ensemble(
       time is proportional to n
     - `estimate`: True to estimate errors by a second run with half as many steps, which takes half the time of the first. The
       estimate requires more than 4 steps
-    - `batch`: number of runs that advance together; typical: the default, 64 on a processor and 262,144 on an accelerator. The
+    - `batch`: number of runs that advance together; typical: the default, 64 on a CPU and 262,144 on an accelerator. The
       memory is proportional to it
     - `equations`: a function of a scene that returns its equations of motion, as `vector_field` (the default) does; with
       another function, for example, the equations of a paper can be compared with those of the scene

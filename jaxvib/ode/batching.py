@@ -18,7 +18,7 @@ from jaxtyping import PyTree
 from jaxvib.ode.types import Batched, Tangents
 
 VECTOR = 8
-"""Number of values in a vector register of a processor. The number of tangents is padded to a multiple of this number."""
+"""Number of values in a vector register of a CPU. The number of tangents is padded to a multiple of this number."""
 
 X = TypeVar("X")
 Out = TypeVar("Out")

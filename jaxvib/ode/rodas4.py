@@ -152,7 +152,7 @@ def _dense_linearization(terms: Terms, t: RealScalarLike, y: Array, args: Args) 
 def _jacobian(terms: Terms, t: RealScalarLike, y: Array, args: Args) -> tuple[Array, Array]:
     """Return df/dy (n, n) and df/dt (n,), by forward mode with the tangents along a last axis.
 
-    This axis is padded to a multiple of the processor's vector width.
+    This axis is padded to a multiple of the CPU's vector width.
     """
     n = y.shape[0]
     directions = jnp.eye(n + 1, -(-(n + 1) // VECTOR) * VECTOR, dtype=y.dtype)

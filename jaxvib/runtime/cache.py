@@ -26,7 +26,7 @@ def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bo
     - There are two caches: jaxvib's own cache of traced programs in `folder/programs`, and JAX's compilation cache of compiled
       programs in `folder` itself (`jax_compilation_cache_dir` is not changed if it is already set)
     - jaxvib calls this function with the default folder, unless JAXVIB_AUTOMATIC=off in the environment
-    - Programs that differ in shapes, in options, in a version of jaxvib or JAX, or in the processor have different keys. The
+    - Programs that differ in shapes, in options, in a version of jaxvib or JAX, or in the CPU have different keys. The
       folder may be deleted at any time
     - A program that calls back into Python, such as one with a progress bar, cannot be stored
     - No program is stored or read while a function or a constant of the package is replaced (by a mock, for example), or after

@@ -166,7 +166,7 @@ def accepted_flags(flags: list[str]) -> list[str]:
 def loops_need_a_flag() -> bool:
     """Return True for jaxlib before 0.12, which without a flag runs the body of a time loop as a chain of small functions.
 
-    Measured ratio of the processor time of a run without the flag to that with it: 7 to 10 with jaxlib 0.10.2. The ratio of the
+    Measured ratio of the CPU time of a run without the flag to that with it: 7 to 10 with jaxlib 0.10.2. The ratio of the
     times with jaxlib 0.12.0 is 0.9 to 1.1.
     """
     return _jaxlib() < (0, 12)

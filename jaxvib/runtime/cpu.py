@@ -34,7 +34,7 @@ def prepare_cpu(devices: int | None = 1) -> str:
 
     - `xla_cpu_small_while_loop_byte_threshold=1000000000`, jax before 0.12: compiles a whole time loop into one function
     - `--xla_cpu_use_fusion_emitters=false`, jax before 0.11: a code generator that needs two thirds of the compile time
-    - `--xla_cpu_prefer_vector_width=512` on processors with AVX-512, except with jax 0.11: batches of runs take 0.9 of the time
+    - `--xla_cpu_prefer_vector_width=512` on CPUs with AVX-512, except with jax 0.11: batches of runs take 0.9 of the time
     - `--xla_force_host_platform_device_count` for several `devices`, for use in your own programs; jaxvib itself uses all
       cores without this flag
 
@@ -92,7 +92,7 @@ def limit_blas_threads() -> None:
     """Limit the linear algebra of JAX, which is SciPy's OpenBLAS, to one thread, unless OPENBLAS_NUM_THREADS is set.
 
     The threads of OpenBLAS wait for work in a busy loop and take the cores from all other computations: the solution of 50
-    equations needs 14 ms of processor time instead of 0.3 ms. If SciPy's linear algebra was imported before, this function has
+    equations needs 14 ms of CPU time instead of 0.3 ms. If SciPy's linear algebra was imported before, this function has
     no effect.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -41,8 +41,8 @@ def shared_devices() -> list[object]:
     return list(devices) if chosen is None and len(devices) > 1 and devices[0].platform != "cpu" else [None]
 
 
-def is_processor() -> bool:
-    """Return True if JAX computes on the processor at present, False on an accelerator."""
+def is_cpu() -> bool:
+    """Return True if JAX computes on the CPU at present, False on an accelerator."""
     chosen = jax_option("jax_default_device")
     return (chosen if isinstance(chosen, str) else (chosen or jax.local_devices()[0]).platform) == "cpu"
 

@@ -69,7 +69,7 @@ class StoredFunction(Generic[T]):
     """Compiled function of trees of arrays and hashable values, whose programs are stored on disk.
 
     The key of a stored program contains everything on which the program depends: the shapes and types of arrays, the static
-    parts of the arguments, JAX's options, the versions of packages, the sources, and the processor. If the programs in memory
+    parts of the arguments, JAX's options, the versions of packages, the sources, and the CPU. If the programs in memory
     exceed `MAX_PROGRAMS_IN_MEMORY` or `MAX_PROGRAM_MEMORY`, the least recently used ones are freed and later read or traced
     again.
 
@@ -361,7 +361,7 @@ def _sources() -> str:
 
 @functools.cache
 def _machine() -> str:
-    """Identify the devices, the compiler flags and the processor."""
+    """Identify the devices, the compiler flags and the CPU."""
     return f"{jax.devices()} {os.environ.get('XLA_FLAGS')} {processor()}"
 
 

@@ -42,7 +42,7 @@ def test_notebook_runs_and_shows_what_it_showed(path):
     shared["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.0"
     nbclient.NotebookClient(fresh, timeout=900, kernel_name="python3").execute(env=shared)
     assert figures(fresh) == figures(kept) > 0
-    # Words must be the same; numbers may differ in the digits that another processor rounds otherwise, and cells with the tag
+    # Words must be the same; numbers may differ in the digits that another CPU rounds otherwise, and cells with the tag
     # "varies" print times and counts.
     assert NUMBER.sub("#", printed(fresh)) == NUMBER.sub("#", printed(kept))
     settled, before = (numbers(printed(shown, but=["varies"])) for shown in (fresh, kept))

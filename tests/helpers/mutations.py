@@ -25,7 +25,7 @@ from jaxvib.sweeps.study import load_study
 from jaxvib.sweeps.sweep import run_study
 
 PATIENCE = 60
-"""Seconds of the processor that no input may take."""
+"""CPU seconds that no input may take."""
 
 WORDS = [
     "nan", "inf", "-1", "0", "1e400", "1" * 400, "1" * 5000, "true", '""', '"x"', "[]", "[2]", '["a"]', "[[1, 2], 3]", "{}",
@@ -35,7 +35,7 @@ WORDS = [
 
 
 class Hang(BaseException):
-    """Raised after `PATIENCE` seconds of the processor."""
+    """Raised after `PATIENCE` CPU seconds."""
 
 
 @contextlib.contextmanager

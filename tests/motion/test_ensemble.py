@@ -238,14 +238,14 @@ def test_ensembles_that_cannot_be(change, says):
     assert says in str(caught.value)
 
 
-@pytest.mark.parametrize("processor", [True, False])
-def test_default_batch_follows_from_the_device(monkeypatch, processor):
-    monkeypatch.setattr("jaxvib.motion.batch.is_processor", lambda: processor)
+@pytest.mark.parametrize("cpu", [True, False])
+def test_default_batch_follows_from_the_device(monkeypatch, cpu):
+    monkeypatch.setattr("jaxvib.motion.batch.is_cpu", lambda: cpu)
     seen = []
     monkeypatch.setattr("jaxvib.motion.ensemble.plan_ensemble", lambda *_, batch, **__: seen.append(batch) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         jv.ensemble(make, values(), 5.0)
-    assert seen == [64 if processor else 2**18]
+    assert seen == [64 if cpu else 2**18]
 
 
 @pytest.mark.parametrize(("batch", "together"), [(2, 2), (64, 3)])

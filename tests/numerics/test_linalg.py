@@ -58,7 +58,7 @@ def test_errors_of_eigenvalues_are_those_of_rayleighs_quotient():
 
 
 def _called(function):
-    """The dimensions of what the processor's library calls are given in a program."""
+    """The dimensions of what the CPU's library calls are given in a program."""
     first = re.findall(r"@lapack_\w+\(.*: \(tensor<([^>]+)>", jax.jit(function).lower(1.1).as_text())
     return {len(shape.split("x")) - 1 for shape in first}
 

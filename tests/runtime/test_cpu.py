@@ -1,4 +1,4 @@
-"""The processor's flags."""
+"""The CPU's flags."""
 
 import subprocess
 import sys

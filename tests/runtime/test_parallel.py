@@ -165,7 +165,7 @@ def test_chunks_within_a_transformation():
 
 
 def test_all_accelerators_are_used_and_their_programs_stored(tmp_path):
-    """Three devices that XLA makes of the processor stand for them."""
+    """Three devices that XLA makes of the CPU stand for them."""
     code = f"""
 import jaxvib as jv
 jv.prepare_cpu(3)
@@ -173,7 +173,7 @@ jv.use_cache({str(tmp_path)!r})
 import jax, jax.numpy as jnp
 from jaxvib import code_changes
 from jaxvib.runtime import cache, parallel, programs
-assert parallel.shared_devices() == [None]  # processors are one, however they are divided
+assert parallel.shared_devices() == [None]  # CPUs are one, however they are divided
 parallel.shared_devices = jax.local_devices
 code_changes._code.differences = list  # as `unwatched`
 
@@ -200,7 +200,7 @@ sys.stdin.read()
 
 
 def test_workers_of_a_machine_have_a_device_each(tmp_path):
-    """Two devices that XLA makes of the processor stand for accelerators; who comes in place of a dead worker has its own."""
+    """Two devices that XLA makes of the CPU stand for accelerators; who comes in place of a dead worker has its own."""
     more = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "TMPDIR": str(tmp_path)}
 
     def worker():

@@ -30,7 +30,7 @@ def asked(before="", **variables):
     return subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
 
 
-def test_first_public_name_prepares_processor_and_cache(tmp_path):
+def test_first_public_name_prepares_cpu_and_cache(tmp_path):
     done = asked(XDG_CACHE_HOME=str(tmp_path))
     assert done.stdout.split() == [*FLAGS, str(tmp_path / "jaxvib")] and not done.stderr
     assert (tmp_path / "jaxvib" / "programs").is_dir()

@@ -1,4 +1,4 @@
-"""Work shared by several devices: two that XLA makes of the processor, in a process of its own."""
+"""Work shared by several devices: two that XLA makes of the CPU, in a process of its own."""
 
 import os
 import subprocess

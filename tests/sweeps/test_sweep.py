@@ -67,22 +67,22 @@ def test_every_case_has_the_numbers_of_its_scene(whole):
 
 @pytest.mark.parametrize(("chunk", "together", "size"), [(None, 15808, 15808), (200, 256, 256), (300_000, 2**18, 2**19)])
 def test_batches_on_accelerators_are_multiples_of_ensembles(monkeypatch, chunk, together, size):
-    """The processor stands in for the accelerator. The identity of a study does not depend on the device."""
+    """The CPU stands in for the accelerator. The identity of a study does not depend on the device."""
 
     def asked():
         return study(SCENE, {"drive.speed": {"from": 10.0, "to": 90.0}}, MEASURE, samples=300_000, chunk=chunk)
 
-    on_processor = asked()
-    assert on_processor.batch == 64 and on_processor.size % 64 == 0
-    monkeypatch.setattr(batch, "is_processor", lambda: False)
-    assert (asked().batch, asked().size, asked().key) == (together, size, on_processor.key)
+    on_cpu = asked()
+    assert on_cpu.batch == 64 and on_cpu.size % 64 == 0
+    monkeypatch.setattr(batch, "is_cpu", lambda: False)
+    assert (asked().batch, asked().size, asked().key) == (together, size, on_cpu.key)
 
 
 def test_one_batch_for_a_chunk_gives_the_same_numbers(monkeypatch, tmp_path):
     asked = study(SCENE, AXES, MEASURE, chunk=200)
     small = run_study(asked, tmp_path / "small.zarr")
     monkeypatch.setattr(batch, "_ACCELERATOR_BATCH_SIZE", 256)
-    monkeypatch.setattr(batch, "is_processor", lambda: False)
+    monkeypatch.setattr(batch, "is_cpu", lambda: False)
     large = run_study(asked, tmp_path / "large.zarr")
     for name in ("power", "beyond"):
         np.testing.assert_allclose(large.data[name], small.data[name], rtol=1e-14)

@@ -251,7 +251,7 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 def _extrema(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array, Array]:
     """Return extrema of each output, their first samples and positions, (2, 3, outputs) each, see `locate_extrema`."""
-    # One output after the other fits the processor's cache.
+    # One output after the other fits the CPU's cache.
     values_and_places = jax.lax.map(lambda pair: locate_extrema(*pair), _sampled_outputs(model, field, times, states))
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), values_and_places)
 

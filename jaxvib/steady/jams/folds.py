@@ -33,7 +33,7 @@ _SLOWEST = 1e-3
 0 only."""
 
 _BLOCK_SIZE = 1024
-"""Number of load speeds whose sums over the poles fit into the processor's first cache."""
+"""Number of load speeds whose sums over the poles fit into the CPU's first cache."""
 
 
 class Folds(Readable):

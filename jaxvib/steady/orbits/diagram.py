@@ -33,7 +33,7 @@ from jaxvib.steady.orbits.stability import Floquet, is_stiff, steps_for
 from jaxvib.units import Number, count, number, validate_tolerance
 
 _ORBITS_PER_BATCH = 32
-"""Number of orbits in a batch: enough to fill vector registers, few enough for the processor's cache memory."""
+"""Number of orbits in a batch: enough to fill vector registers, few enough for the CPU's cache memory."""
 
 _COLLOCATION_POINTS = (16, 32, 64)
 

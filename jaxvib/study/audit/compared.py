@@ -45,7 +45,7 @@ class EffectRow(NamedTuple):
       unknown
     - `uncertainty` of these changes
     - cost of the effect (value with the effect minus value without it): `operations` of the equations of motion; `seconds` of a
-      run of 100 turns; `compile`: processor time to trace and compile that run, s; NaN without timings. Small differences of
+      run of 100 turns; `compile`: CPU time to trace and compile that run, s; NaN without timings. Small differences of
       times are timing noise
     - `advice`: "needed", "perhaps needed", "negligible" or "cannot tell"; `note`: the reason
     """
@@ -115,7 +115,7 @@ def _times(scene: Scene, start: State, repeats: int) -> tuple[float, float]:
         return eqx.filter(inspect.unwrap(integrate)(*eqx.combine(numbers, choices)), eqx.is_array)
 
     with compiled_anew():
-        begun = time.process_time()  # processor time, because other processes hardly influence it
+        begun = time.process_time()  # CPU time, because other processes hardly influence it
         program = program_of_run.lower(numbers).compile()
         compiling = time.process_time() - begun
     _, seconds, _ = timed(lambda: program(numbers).omega, repeats)

@@ -24,7 +24,7 @@ def main(count: int, names: list[str]) -> None:
         found = repeated(count, **(CASES | JAMMED_CASES | SUPPORT_CASES)[name])
         print(f"| {name} | {found.row} |", flush=True)
         counts = zip(*np.unique(found.statuses, return_counts=True), strict=True)
-        print(f"  {time.process_time() - begin:.0f} s of the processor; {', '.join(f'{n} {name}' for name, n in counts)}")
+        print(f"  {time.process_time() - begin:.0f} s of CPU time; {', '.join(f'{n} {name}' for name, n in counts)}")
         print(f"  held {found.held.round(3).tolist()}, ratio {found.ratio.round(2).tolist()}")
 
 

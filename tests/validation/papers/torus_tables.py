@@ -187,7 +187,7 @@ def published_tables(
     For each point 19 speeds from -1 to -0.1 are tried, then twice four speeds between the least captured one and the next lower
     one, and below the speed from which on all are captured. The scan is repeated with twice the steps until both borders move
     by 0.011 at most; points that have converged drop out. Last come `starts` perturbed starts at the paper's own speed. All
-    points advance together, sorted by the steps they need: about 5000 runs a model, some ten minutes of the processor.
+    points advance together, sorted by the steps they need: about 5000 runs a model, some ten minutes of CPU time.
 
     **Arguments**: `models` names of `MODELS`; `rows` of `TABLES`; `turns` of the rotor that each run takes; `starts`, all but
     the first moved along the ring, each ball by itself, by up to `spread` rad, by `seed`; `doublings` of the steps at most.
