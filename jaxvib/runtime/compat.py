@@ -95,7 +95,8 @@ def inner_value(tracer: object) -> object | None:
 
 
 def value_of(number: object) -> object:
-    """Return the primal value of a number. A number without one, as under `jit` or `vmap`, is returned unchanged."""
+    """Return the value of a number that is being differentiated, without its tangent (the primal value). Other numbers, such as
+    those under `jit` or `vmap`, are returned unchanged."""
     while type(number).__name__ in ("JVPTracer", "LinearizeTracer") and hasattr(number, "primal"):
         number = number.primal  # pyright: ignore[reportAttributeAccessIssue]
     return number
