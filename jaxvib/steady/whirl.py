@@ -368,8 +368,8 @@ def _sense_matrix(mount: Mount) -> Array:
 
 
 def _sense(mount: Mount, shapes: Array) -> Array:
-    """Return twice the area that shapes (nd, k) sweep in a turn, at the rotor and by its tilts; positive in the direction of
-    the rotor."""
+    """Return the area of the ellipses of shapes (nd, k), divided by pi: the sum over the displacement and the tilts of the
+    axis, positive in the direction of the rotor."""
     moved = jnp.stack(mount.rows).astype(shapes.dtype) @ shapes
     return jnp.sum(jnp.imag(moved[:, 0] * jnp.conj(moved[:, 1])), axis=0)
 

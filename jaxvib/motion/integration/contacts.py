@@ -1,10 +1,11 @@
 """Derivatives of steps in which a contact with a damper begins.
 
 The force c p' of a damper jumps when a contact begins, at the time at which the penetration p becomes positive. A variation dp
-of the penetration at this time shifts it by -dp / p', and changes the momentum of the machine by -c dp (the gradient of p). The
-derivatives of a step of a method of integration do not contain this change, however short the step is. It is added here.
+of the penetration at this time shifts the time by -dp / p'. It changes the momentum of the machine by -c dp grad p
+(grad p: the gradient of p with respect to the positions). The derivatives of a step of a method of integration do not contain
+this change, however short the step is. It is added here.
 
-The change is the difference between the forces that a velocity w with (gradient of p) w = dp causes within the contact and
+The change is the difference between the forces that a velocity w with (grad p) w = dp causes within the contact and
 outside it. It does not depend on p', and several contacts may begin in one step.
 
 Source: the saltation matrix of a jump of the equations, as in R. I. Leine and H. Nijmeijer, Dynamics and Bifurcations of
@@ -34,7 +35,8 @@ from jaxvib.ode.batching import flat_tangents
 from jaxvib.ode.types import Args, BoolScalarLike, RealScalarLike, StepResult, Tangents, Terms
 
 _MARGIN = 0.05
-"""Distance of the states outside and within a contact from its beginning, relative to the part of the step on their side."""
+"""The forces outside and within a contact are computed shortly before and after its beginning: at this distance from it, as a
+share of the part of the step before or after it."""
 
 
 class Contacts(eqx.Module):
@@ -127,7 +129,10 @@ class ContactSolver(diffrax.AbstractWrappedSolver):
         solver_state: Any,
         made_jump: BoolScalarLike,
     ) -> StepResult:
-        """Compute a step of the method, without rates of the previous step, whose derivatives lack the shifts."""
+        """Compute a step of the method.
+
+        It does not reuse rates from the end of the previous step, because their derivatives lack the shifts.
+        """
         end, *rest = self.solver.step(terms, t0, t1, y0, args, solver_state, True)
         span = jax.lax.stop_gradient((t0, t1))
         return _with_shifts(end, y0, args, span=span, system=self.system), *rest  # pyright: ignore[reportReturnType]
@@ -205,12 +210,12 @@ class _Step(NamedTuple):
         velocity = self.velocity(within, begins, shift)
         outer, inner = (self.rates_along(at, velocity) for at in ((1.0 - _MARGIN) * first, within))
         jump = jax.tree.map(jnp.subtract, inner, outer)
-        # The rest of the step changes the jump in first order of its length.
+        # The rest of the step changes the jump; this change is included to the first order of the length of the rest.
         rest = (1.0 - 0.5 * (first + last)) * (self.t1 - self.t0)
         return jax.tree.map(lambda jump, rate: jump + rest * rate, jump, self.rates_along(1.0, jump))
 
     def velocity(self, share: Array, begins: Array, shift: Array) -> IntegratorState:
-        """Return the smallest velocity w with (gradient of p) w = `shift` (n,), for the contacts that begin."""
+        """Return the smallest velocity w with (grad p) w = `shift` (n,), for the contacts that begin."""
         state = self.system.state(self.at(share))
         positions, unravel = ravel_pytree((state.displacement, [exciter.angle for exciter in state.exciters]))
 
@@ -221,7 +226,7 @@ class _Step(NamedTuple):
 
         gradients = jnp.where(begins[:, None], jax.jacrev(penetrations)(positions), 0.0)
         gram = gradients @ gradients.T
-        # Equal contacts begin together and have equal gradients; the addition gives them the mean of their shifts.
+        # Equal contacts begin together and have equal gradients; `size` on the diagonal gives them the mean of their shifts.
         size = jnp.where(begins, jnp.sqrt(jnp.finfo(gram.dtype).eps) * jnp.max(jnp.diagonal(gram)), 1.0)
         displacement, angles = unravel(gradients.T @ jnp.linalg.solve(gram + jnp.diag(size), shift))
         rates = [displacement, *(angle for each in angles for angle in each)]

@@ -31,9 +31,11 @@ def _search_grid(scene: Scene) -> tuple[Array, Array]:
 
 
 def exact_mode_speeds(scene: Scene) -> dict[int, float]:
-    """Return approximate load speeds (rad/s) of the exact jams at the scene's rotor speed, by mode.
+    """Return starting values of the load speeds (rad/s) of the exact jams at the scene's rotor speed, by mode.
 
-    The exact branch n(Omega) is computed point by point and cut at its folds; its pieces are numbered as in `jam_modes`.
+    The exact branch n(Omega) is computed point by point and cut at its folds; its pieces are numbered as in `jam_modes`. The
+    load speeds are interpolated between these points. The
+    load speeds are interpolated between these points.
     """
     grid, resonances = _search_grid(scene)
     grid, resonances, target = np.asarray(grid), np.asarray(resonances), float(scene.drive.speed)
@@ -42,9 +44,9 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
     known = np.isfinite(speed)
     omega, speed = _interpolated(omega[known], speed[known], slope[known])
-    turn, ends, modes = sampled_modes(omega, speed, resonances)
+    folds, ends, modes = sampled_modes(omega, speed, resonances)
     crossed = (speed[1:] - target) * (speed[:-1] - target) <= 0.0
-    near = turn[np.abs(speed[turn] - target) < _NEAR_FOLD_DISTANCE * target]
+    near = folds[np.abs(speed[folds] - target) < _NEAR_FOLD_DISTANCE * target]
     close = []
     for k in near:
         around = np.clip([k - _PARTS_PER_INTERVAL, k + _PARTS_PER_INTERVAL], 0, omega.size - 1)
@@ -67,21 +69,21 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
 def _ends_before(scene: Scene, low: float, high: float, target: float, refinements: int = 2) -> bool:
     """Return True if the exact branch has a fold between two load speeds, before it reaches the rotor speed `target`.
 
-    The fold is bracketed `refinements` times in smaller and smaller intervals; the zero of the slope then locates it to
-    rounding.
+    The fold is bracketed `refinements` times in smaller and smaller intervals. The rotor speed of the
+    fold is the largest or smallest one of the interpolated cubic in the last interval, with an error of the size of rounding.
     """
     omega = np.linspace(low, high, _BRANCH_POINTS)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
-    (turns,) = np.nonzero(slope[1:] * slope[:-1] <= 0.0)
-    if turns.size != 1:
+    (folds,) = np.nonzero(slope[1:] * slope[:-1] <= 0.0)
+    if folds.size != 1:
         return False
-    ends = slice(turns[0], turns[0] + 2)
+    ends = slice(folds[0], folds[0] + 2)
     if refinements > 1:
         low, high = (float(w) for w in omega[ends])
         return _ends_before(scene, low, high, target, refinements - 1)
     rounding = 4096.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
     fold = _interpolated(omega[ends], speed[ends], slope[ends])[1]
-    return bool(np.max(fold) < target * (1.0 - rounding) if slope[turns[0]] > 0.0 else np.min(fold) > target * (1.0 + rounding))
+    return bool(np.max(fold) < target * (1.0 - rounding) if slope[folds[0]] > 0.0 else np.min(fold) > target * (1.0 + rounding))
 
 
 def _interpolated(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

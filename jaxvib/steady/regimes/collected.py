@@ -29,7 +29,7 @@ from jaxvib.steady.regimes.synchronous import (
 )
 
 POINTS = 31
-"""Number of speeds on each side of the speed of the scene, at which a regime is followed."""
+"""Number of speeds at which a regime is followed to each side, including the speed of the scene."""
 
 
 def collected_regimes(scene: Scene) -> SynchronousRegimes:
@@ -37,7 +37,7 @@ def collected_regimes(scene: Scene) -> SynchronousRegimes:
 
     The search is that of `synchronous_regimes` for a scene in which one load has the mass and the drag of all loads of its
     exciter. The result contains all loads, and its stability includes the separation of loads. Regimes with separated loads are
-    not found. Scenes with unequal loads, or with loads at several stations, have the regimes of `synchronous_regimes`.
+    not found. For scenes with unequal loads, or with loads at several stations, the result is that of `synchronous_regimes`.
 
     **Raises** `InputError` in the cases of `synchronous_regimes`.
     """
@@ -70,8 +70,9 @@ def _one_load(loads: Loads) -> Loads:
 
 
 class FollowedRegimes(NamedTuple):
-    """Regimes over the speed of the drives: `factor` (n,) of all speeds; `speed` (r, n), rad/s; `phases` (r, n, mass), rad;
-    `amplitude` (r, n, nd); `foundation_force` (r, n), N; `stable` (r, n). Values beyond the end of a regime are NaN."""
+    """r regimes at n factors of the speeds of all drives: `factor` (n,); `speed` (r, n), rad/s; `phases` (r, n, rotating
+    masses), rad; `amplitude` (r, n, nd); `foundation_force` (r, n), N; `stable` (r, n). Values beyond the end of a regime are
+    NaN."""
 
     factor: Array
     speed: Array
@@ -87,9 +88,10 @@ def follow_regimes(
 ) -> FollowedRegimes:
     """Follow regimes while all drives change their speed by a common factor, from `low` below 1 to `high` above 1.
 
-    At each factor Newton's method starts from the regime at the previous factor. A regime ends where it does not converge.
+    At each factor Newton's method starts from the regime at the previous factor. A regime ends at the factor at which
+    Newton's method does not converge.
 
-    **Arguments**: `speed` (r,), rad/s, and `phases` (r, mass), rad, of the regimes at the factor 1.
+    **Arguments**: `speed` (r,), rad/s, and `phases` (r, rotating masses), rad, of the regimes at the factor 1.
     """
 
     def at(factor: Array, start: tuple[Array, Array]) -> tuple[tuple[Array, Array], FollowedRegimes]:
