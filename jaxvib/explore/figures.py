@@ -36,8 +36,8 @@ _ABOUT_UNBALANCES = """Amplitudes and forces are zero to peak. The page shows mo
 save the machine and run `jaxvib simulate`; `jaxvib run-up` computes the motion from rest."""
 
 _ABOUT_COLLECTED = """Amplitudes and forces are zero to peak. The page shows motions averaged over a turn, in which all loads
-of an exciter are at one angle; their separation counts in the stability. For other motions use `jaxvib regimes`, for exact
-results save the machine and run `jaxvib simulate`."""
+of an exciter are at one angle; a regime in which they would separate is unstable. For other motions use `jaxvib regimes`, for
+exact results save the machine and run `jaxvib simulate`."""
 
 _CAMPBELL_SPEEDS = 81
 """Number of rotor speeds of a Campbell diagram."""
@@ -68,22 +68,26 @@ def image(draw: Callable[[], str], scene: SceneOrProblem) -> str:
         data = base64.b64encode(draw().encode()).decode()
         return f'<img style="max-width:100%" src="data:image/svg+xml;base64,{data}">'
 
-    return _html_or_problem(embed, scene)
+    return _html_or_problem(embed, scene, "No figure")
 
 
 def text(read: Callable[[], str], scene: SceneOrProblem) -> str:
     """Return preformatted text as HTML, or the message of the error."""
-    return _html_or_problem(lambda: f'<pre style="white-space:pre-wrap;font-size:0.8rem">{html.escape(read())}</pre>', scene)
+
+    def preformatted() -> str:
+        return f'<pre style="white-space:pre-wrap;font-size:0.8rem">{html.escape(read())}</pre>'
+
+    return _html_or_problem(preformatted, scene, "No results")
 
 
-def _html_or_problem(render: Callable[[], str], scene: SceneOrProblem) -> str:
+def _html_or_problem(render: Callable[[], str], scene: SceneOrProblem, title: str) -> str:
     problem = scene.problem
     if not problem:
         try:
             return render()
         except (InputError, ComputationError) as error:
             problem = str(error)
-    return f"<p><b>No figure:</b> {html.escape(problem)}</p>"
+    return f"<p><b>{title}:</b> {html.escape(problem)}</p>"
 
 
 def toml(scene: SceneOrProblem, source: Path | None = None) -> str:
@@ -143,10 +147,11 @@ def heading(scene: Scene) -> str:
     """Return the description of `diagram` for this scene, with a reference to other results."""
     if not scene.is_plain and scene.has_loads:
         return (
-            "Synchronous regimes: all loads and unbalances turn at one speed, the loads of an exciter at one angle. The speed, "
-            "the amplitudes and the phases of the exciters (of one exciter the foundation force) of the first four regimes of "
-            "the list, over the speed of the drives, which all change by one factor. Dashed lines: unstable. A line ends where "
-            "its regime ends. The sketch shows the first regime of the list; ellipses are the paths of points of the body."
+            "Synchronous regimes: all loads and unbalances turn at one speed, the loads of an exciter at one angle. The "
+            "diagram shows the first four regimes of the list over the no-load speed of the drives: their speeds, amplitudes "
+            "and the phases of the exciters (for one exciter: the foundation force). All drive speeds change by one factor. "
+            "Dashed lines: unstable. A line ends where its regime ends. The sketch shows the first regime of the list; "
+            "ellipses are the paths of points of the body."
         )
     if not scene.is_plain:
         return (

@@ -162,7 +162,7 @@ def growth(
     state = start_state(scene, start, mode, separation)
     segment, unit = whole_turns(scene, end / segments), natural_units(scene)
     double = state.displacement.dtype.itemsize >= 8
-    separation, steps = (1e-6, Tolerance(1e-10)) if double else (1e-2, Tolerance(1e-5))
+    initial_distance, steps = (1e-6, Tolerance(1e-10)) if double else (1e-2, Tolerance(1e-5))
 
     plan = plan_segment(scene, segment, state, steps, throw=False)
 
@@ -177,7 +177,7 @@ def growth(
         if neighbour is None:  # a random direction, because disturbances along the motion do not grow
             scale = error_scale(jax.tree.map(lambda x: x[None], state), unit)
             noise = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), state)
-            neighbour = _at_distance(state, jax.tree.map(jnp.add, state, noise), scale, separation)
+            neighbour = _at_distance(state, jax.tree.map(jnp.add, state, noise), scale, initial_distance)
         if k in (segments // 2, 3 * segments // 4):
             quarters.append(state)
         first, second = run_on(state), run_on(neighbour)
@@ -185,9 +185,9 @@ def growth(
         ours, neighbour_end = (jax.tree.map(lambda x: x[-1], run.window.state) for run in (first, second))
         if angle_wrapping(scene, ours.displacement.dtype)[0]:
             neighbour_end = with_nearest_turns(neighbour_end, ours)
-        rates.append(math.log(max(_distance(ours, neighbour_end, scale), 1e-300) / separation) / segment)
+        rates.append(math.log(max(_distance(ours, neighbour_end, scale), 1e-300) / initial_distance) / segment)
         state, difference = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, neighbour_end)
-        neighbour = _at_distance(state, jax.tree.map(jnp.add, state, difference), scale, separation)
+        neighbour = _at_distance(state, jax.tree.map(jnp.add, state, difference), scale, initial_distance)
     late = np.array(rates[segments // 2 :])
     exponent, uncertainty = float(np.mean(late)), _uncertainty(late, segment)
     name = _classify_growth(late * segment)
@@ -274,10 +274,10 @@ def _distance(a: State, b: State, scale: State) -> float:
     return math.sqrt(float(sum(parts)))
 
 
-def _at_distance(a: State, b: State, scale: State, separation: float) -> State:
-    """Return the state at the distance `separation` from `a` in the direction of `b`; if `a` and `b` are equal, the
-    displacements of `a` are changed."""
-    distance = _distance(a, b, scale)
-    if distance == 0.0:
-        return eqx.tree_at(lambda s: s.displacement, a, a.displacement + separation * scale.displacement)
-    return jax.tree.map(lambda x, y: x + (y - x) * (separation / distance), a, b)
+def _at_distance(a: State, b: State, scale: State, distance: float) -> State:
+    """Return the state at the `distance` from `a` in the direction of `b`; if `a` and `b` are equal, the displacements of `a`
+    are changed."""
+    present = _distance(a, b, scale)
+    if present == 0.0:
+        return eqx.tree_at(lambda s: s.displacement, a, a.displacement + distance * scale.displacement)
+    return jax.tree.map(lambda x, y: x + (y - x) * (distance / present), a, b)

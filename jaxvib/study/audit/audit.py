@@ -122,9 +122,9 @@ def audit(
 
     - Each effect of the scene is removed. Each effect that the scene lacks and could have is added, with typical values
       (`Effect.typical`). The same quantities of both scenes are compared
-    - For a scene that jams at a constant rotor speed the jam is compared. It is computed by the exact orbit, or by the full
-      equations until they settle if the theory of exact orbits does not support the scene. For other scenes the end of a run
-      is compared. Transients are not compared
+    - For a scene that jams at a constant rotor speed the jam is compared. It is computed by the exact orbit. If the
+      theory of exact orbits does not support the scene, it is computed by the full equations, which are integrated until the
+      motion has settled. For other scenes the end of a run is compared. Transients are not compared
     - The gyroscopic coupling of a rotor's tilts and the limited power of a motor are removed in the same way
     - Your own effects are audited in the same way as those of the package
 
@@ -143,9 +143,9 @@ def audit(
       timings, which saves a compilation for each effect
     - `progress`: a function that is called with the name of each step and the finished share of all steps (0 to 1)
 
-    **Returns** `Audit`. **Raises** `InputError` for an accuracy that is not between 0 and 1, and for a possible effect that the
-    scene has already, `ComputationError` (status "absent") for a mode that does not exist, and the errors of `jam_modes` and
-    `simulate`.
+    **Returns** `Audit`. **Raises** `InputError` for an accuracy that is not between 0 and 1, for a possible effect that the
+    scene has already and can have only once, `ComputationError` (status "absent") for a mode that does not exist, and the
+    errors of `jam_modes` and `simulate`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -173,7 +173,7 @@ def audit(
     report("the scene", 0.0)
     values = repeated.values(scene, repeated.tier(scene))
     until = comparison.until if isinstance(comparison, RunComparison) else None
-    # The scale of a machine that almost does not move is the unbalance radius of its loads.
+    # For a machine that hardly moves, the typical effects are chosen for an amplitude of the unbalance radius of its loads.
     amplitude = [a * (values.magnified / MIN_AMPLITUDE_SHARE if values.magnified > 1.0 else 1.0) for a in values.amplitude]
     variants = [*present_variants(scene, until), *possible_variants(scene, amplitude, possible)]
     finite_status = "done" if values.uncertainty <= 0.5 * accuracy else "unsettled"
@@ -232,5 +232,6 @@ def _comparison(
                 raise
     _ = scene.loads  # refuses exciters without loads
     run = RunComparison.of_arguments(scene, until, start)
-    name = "a state" if isinstance(run.start, State) else run.start
-    return run, f"the motion {run.until:.4g} s after {name}"
+    names = {"rest": "from rest", "turning": "with turning loads"}
+    name = "from a given state" if isinstance(run.start, State) else names[run.start]
+    return run, f"the motion {run.until:.4g} s after a start {name}"
