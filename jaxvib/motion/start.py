@@ -25,7 +25,7 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.jam import jam_modes, jams_of, require_mode_number
+from jaxvib.steady.jams.jam import jam_modes, jams_of, require_mode_of
 from jaxvib.units import Number, Numbers, known_number, numbers
 from jaxvib.units.known import require_if_known, when_known
 
@@ -135,7 +135,7 @@ def must_compile_jams(scene: Scene, mode: int | None) -> bool:
     """
     if mode is None or not scene.is_plain:
         return False
-    require_mode_number(mode, 2 * scene.machine.structure().mass.shape[0] + 1)
+    require_mode_of(scene, mode)
     return not jams_of.is_ready(scene)
 
 

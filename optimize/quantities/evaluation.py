@@ -19,7 +19,7 @@ from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate
 from jaxvib.runtime.devices import known, numpy_of
 from jaxvib.steady.jams.follow import follow_fold, follow_jam
-from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes, require_mode_number
+from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes, require_mode_of
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.synchronous import SynchronousOrbit, synchronous_orbit
@@ -115,7 +115,7 @@ class Evaluation:
 
     def jam(self, mode: int) -> Jam:
         """Return the jam of the mode with this number, with NaN values if it does not exist."""
-        require_mode_number(mode, 2 * self.scene.machine.structure().mass.shape[0] + 1)
+        require_mode_of(self.scene, mode)
         key: Key = (self.path, ("jam", mode))
         if key not in self._jams:
             jam = (

@@ -217,6 +217,11 @@ def require_mode_number(mode: object, count: int) -> None:
         raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {count}")
 
 
+def require_mode_of(scene: Scene, mode: object) -> None:
+    """Raise `InputError` unless `mode` is the number of a jam mode of a `scene`, which has 2 nd + 1."""
+    require_mode_number(mode, 2 * len(scene.machine.structure().coordinates) + 1)
+
+
 def modes_table(jams: JamModes, growth: Mapping[int, float]) -> list[list[str]]:
     """Return the headers and the rows of the table of all jam modes that exist.
 
