@@ -71,9 +71,9 @@ class AbstractResponse(Readable):
       and an equal part of the difference between `torque` and `motor_torque` of the exciters with motors
     - `torque_share`: the sum of `torque` divided by that of `motor_torque`; inf above the no-load speed, where the motors brake
 
-    At an undamped resonance the values other than `speed`, `exciter_force` and `motor_torque` are infinite. Values at speed 0
-    are the limits at low speeds: the transmissibility of a machine on springs is 1, and the amplitude of one without supports
-    is S/M.
+    At an undamped resonance the values other than `speed`, `exciter_force` and the `motor_torque` of motors are infinite.
+    Values at speed 0 are the limits at low speeds: the transmissibility of a machine on springs is 1, and the amplitude of one
+    without supports is S/M.
     """
 
     speed: Array = eqx.field(metadata=in_unit("rad/s", "*"))
@@ -180,7 +180,8 @@ class Response(AbstractResponse, Result):
             return f"{speed_text(of.speed[k])}: {moves}, foundation force {quantity_text(of.foundation_force[k], 'N', 4)}"
 
         for k in np.flatnonzero(np.asarray(self.operating.exists)).tolist():
-            stable = "stable" if bool(self.operating.stable[k]) else "unstable"
+            is_bounded = np.all(np.isfinite(self.operating.amplitude[k]))
+            stable = "stable" if bool(self.operating.stable[k]) else "unstable" if is_bounded else "at an undamped resonance"
             share = f"{float(np.sum(self.operating.torque[k])):.4g} N m"
             lines.append(f"operating point, {stable}, {share}, at {motion(self.operating, k)}")
         lines += [f"peak of the force at {motion(self, k)}" for k in self.peaks()]
@@ -376,6 +377,8 @@ def motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dic
         "power": omega * torque,
     }
     finite = {name: jnp.where(bounded, value, jnp.inf) for name, value in fields.items()}
+    if model.highest_speed is None:
+        motor = jnp.where(bounded | ~model.balance.is_prescribed, motor, jnp.inf)
     status = ResponseStatus.where(bounded, ResponseStatus.done, ResponseStatus.unbounded)
     return status, {**finite, "speed": omega, "exciter_force": exciter, "motor_torque": motor}
 

@@ -269,6 +269,15 @@ def test_response_of_several_exciters_lists_each_torque(typed, tmp_path):
     assert code == 2 and err.strip() == "jaxvib: --phases has 1 values; 2 are needed"
 
 
+def test_response_at_an_undamped_resonance_is_unbounded(typed, tmp_path):
+    resonance = (800e3 / 200.0) ** 0.5
+    drive = f'{{ kind = "constant_speed", speed = {resonance!r} }}'
+    lines = [f"drive = {drive}" if line.startswith("drive") else line for line in UNBALANCED.splitlines()]
+    (tmp_path / "table.toml").write_text("\n".join(lines).replace("damping = 600.0", "damping = 0.0"))
+    out = typed("response", "table.toml", "--points", "100")[1]
+    assert " unbounded " in out and " inf " in out
+
+
 def test_response_lists_operating_points_peaks_and_folds(typed, tmp_path):
     (tmp_path / "table.toml").write_text(UNBALANCED)
     code, out, err = typed("response", "table.toml", "--points", "300", "--csv", "curve.csv")

@@ -351,6 +351,18 @@ def test_an_undamped_resonance_is_named_without_nan():
     assert np.isfinite(jax.grad(total)(MASS))
 
 
+def test_drive_at_an_undamped_resonance_has_unbounded_torque():
+    """An ideal drive supplies the torque that the vibration needs, and a motor that of its curve, which is finite."""
+    at = float(np.sqrt(SPRING / MASS))
+    ideal = jv.response(one_mass(damping=0.0, drive=jv.ConstantSpeed(at)), [0.9 * at, at])
+    np.testing.assert_array_equal(ideal.motor_torque, ideal.torque)
+    assert np.isinf(ideal.torque[1, 0]) and np.isinf(ideal.operating.motor_torque[0, 0])
+    assert "operating point, at an undamped resonance, inf N m" in ideal.summary()
+    driven = jv.response(one_mass(damping=0.0, drive=motor()), [at])
+    assert np.isinf(driven.torque[0, 0])
+    np.testing.assert_allclose(driven.motor_torque[0, 0], motor().torque(at), rtol=1e-12)
+
+
 def test_an_undamped_machine_lets_its_motor_idle():
     found = jv.response(one_mass(damping=0.0, drive=motor()))
     assert not np.any(found.folds.exists) and found.operating.exists.sum() == 1
