@@ -14,6 +14,7 @@ from jaxvib.identification.problem import (
     Known,
     Problem,
     _delay_taps,
+    _require_included,
     build_problem,
     damped_modes,
     read_known,
@@ -409,3 +410,12 @@ def test_natural_modes_of_the_damped_machine():
 def test_identification_in_single_precision_is_refused():
     with jax.enable_x64(False), pytest.raises(jv.InputError, match="single precision; an identification needs double"):
         build_problem(scene_of(), [], ["machine.stiffness"], {})
+
+
+def test_loads_on_one_of_several_exciters_are_refused():
+    scene = scene_of(2)
+    with_balls = jv.Exciter(jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed(60.0), at=1)
+    mixed = jv.Scene(scene.machine, exciters=[with_balls, scene.exciters[1]])
+    _require_included(scene, [])
+    with pytest.raises(jv.InputError, match=r"^scene has 2 exciters, one of them with loads; identify needs loads"):
+        _require_included(mixed, [])
