@@ -73,6 +73,7 @@ EFFECTS: dict[str, tuple[jv.Effect, ...]] = {
     "run-up friction": (jv.DryFriction(0.15, diameter=0.02, reaction="run_up"),),
     "contact": (jv.LoadContact(stiffness=1e5, damping=20.0),),
     "cubic support": (jv.CubicSupport(3e9),),
+    "friction support": (jv.FrictionSupport(40.0),),
     "stop": (jv.Stop(4e5, gap=5e-4, damping=90.0),),
 }
 DRIVES = {

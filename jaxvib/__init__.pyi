@@ -43,7 +43,7 @@ from jaxvib.machine.effects.friction import DryFriction as DryFriction
 from jaxvib.machine.effects.rolling import RollingFriction as RollingFriction
 from jaxvib.machine.effects.sliding import FreeSpin as FreeSpin, Sliding as Sliding
 from jaxvib.machine.effects.base import StaticImbalance as StaticImbalance, MomentImbalance as MomentImbalance
-from jaxvib.machine.effects.supports import CubicSupport as CubicSupport, Stop as Stop
+from jaxvib.machine.effects.supports import CubicSupport as CubicSupport, FrictionSupport as FrictionSupport, Stop as Stop
 from jaxvib.machine.effects.contact import LoadContact as LoadContact
 
 # Scenes, and their files

@@ -181,6 +181,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("MomentImbalance", moment=0.01, angle=0.0)
     yield call("CubicSupport", stiffness=1e6, platform=1, position=None)
     yield call("Stop", stiffness=1e6, gap=0.01, damping=0.0, side="both", platform=1, position=None)
+    yield call("FrictionSupport", force=50.0, width=0.01, platform=2, position=None, to=1)
     yield call("LoadContact", stiffness=1e6, damping=0.0, restitution=None)
     parts = {name: later(lambda name=name: getattr(scene(), name)) for name in ("machine", "loads", "drive")}
     yield call("Scene", **parts, effects=(jv.Gravity(),))

@@ -53,7 +53,7 @@ def foundation_force(scene: Scene, state: State) -> Array:
 
     **Arguments**
 
-    - `scene`: supports of the machine and effects that are supports (`CubicSupport`, `Stop`) are included
+    - `scene`: supports of the machine and effects that are supports (`CubicSupport`, `Stop`, `FrictionSupport`) are included
     - `state` of the scene; typical: displacements of 0.1 to 10 mm
 
     **Returns** an array, N: one entry (up) for platforms, two (horizontal, up) for rotors and bodies in a plane.

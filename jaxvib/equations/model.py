@@ -97,7 +97,8 @@ class Model(eqx.Module):
         """Return the force of all supports on the foundation, gravity excluded, N, one entry for each direction."""
         force = self.carrier.foundation_force(displacement, velocity)
         for term, rows in zip(terms_of(self.scene.all_effects, SupportForce), self.supports, strict=True):
-            force = force + term.force(rows @ displacement, rows @ velocity)
+            if not term.is_link:
+                force = force + term.force(rows @ displacement, rows @ velocity)
         return force
 
     def known_force(self, force: Array) -> Array:

@@ -212,7 +212,8 @@ def _rest_matrices(scene: Scene, speed: Array) -> tuple[Array, Array, Array, Arr
     for term, rows in zip(terms_of(scene.effects, SupportForce), model.supports, strict=True):
         slopes = [slope @ rows for slope in jax.jacfwd(term.force, (0, 1))(rows @ rest, rows @ rest)]
         stiffness, damping = stiffness + rows.T @ slopes[0], damping + rows.T @ slopes[1]
-        foundation = [matrix + slope for matrix, slope in zip(foundation, slopes, strict=True)]
+        if not term.is_link:
+            foundation = [matrix + slope for matrix, slope in zip(foundation, slopes, strict=True)]
     forces = jnp.concatenate([jnp.eye(nd, dtype=model.mass.dtype), *(mount.rows[0].T for mount in model.mounts)], axis=1)
     solved = jnp.linalg.solve(model.mass, jnp.concatenate([-stiffness, -damping, forces], axis=1))
     zero, identity = jnp.zeros_like(model.mass), jnp.eye(nd, dtype=model.mass.dtype)

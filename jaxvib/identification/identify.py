@@ -193,8 +193,8 @@ def identify(
       intervals follow from the Fisher information with the estimated noise
     - The loads of a scene with one exciter (balls, rollers, pendulums) must be jammed throughout the runs; their motion is that
       of `vector_field`, and their angles and speeds at the first sample are unknowns
-    - A scene with one exciter without loads can have nonlinear supports, `CubicSupport` and `Stop`. The parameters of a stop
-      that is not touched in the runs are not determined
+    - A scene with one exciter without loads can have nonlinear supports: `CubicSupport`, `FrictionSupport` and `Stop`. The
+      parameters of a stop that is not touched in the runs are not determined
     - Parameters of a motor, such as "drive.inertia" and "drive.stall_torque", can be unknown if a channel gives the angle or
       the speed of its rotor. The torque balance of the rotor, with the torque of the vibration, is then a part of the fit
 

@@ -16,19 +16,18 @@ from jax import Array
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.angle import RotorAngle, rotor_angles
+from jaxvib.identification.jammed.segments import divide
 from jaxvib.identification.records.agreement import ROTOR_KINDS, turn_speed
 from jaxvib.identification.records.channel import Channel, gain_errors
 from jaxvib.identification.records.decimation import MIN_SAMPLES, decimated
 from jaxvib.identification.response import BLOCK, SEGMENT, Samples, Unknowns, rows_of_channel, state_count
 from jaxvib.identification.run import MeasuredRun
-from jaxvib.machine.effects.base import has_term
-from jaxvib.machine.effects.supports import Stop
+from jaxvib.machine.effects.base import has_term, terms_of
+from jaxvib.machine.effects.supports import FrictionSupport, Stop
 from jaxvib.machine.effects.terms import GravityField, SupportForce
 from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import require_double
-from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.integration.stiffness import equal_step_length, machine_decay
 from jaxvib.numerics.linalg import poles_of
 from jaxvib.numerics.noise import Noise, bounded, limited
 from jaxvib.runtime.programs import cached
@@ -52,13 +51,6 @@ _FILTER_LENGTHS = (1, 9, 49, 129, 513)
 _FREQUENCY_MARGIN, _SPEED_TIMES = 1.5, 64
 """Factor on the highest natural frequency, and number of times at which the speed of a drive is evaluated, for the choice of a
 sampling rate."""
-
-_SEGMENT_ANGLE, _MAX_SEGMENTS = 25.0, 64
-"""Length of a segment of a nonlinear motion, rad of the slowest vibration, and largest number of segments. With the first
-values of the unknowns, the phase error within a segment must be less than a radian."""
-
-_STEPS_PER_RADIAN = 1.0
-"""Number of steps of order 8 per radian of the fastest motion, with errors of about 2e-7 in a turn."""
 
 DELAY_MARGIN = 2
 """Number of steps by which both readings and model are delayed, so that the interpolation has samples on both sides."""
@@ -269,10 +261,10 @@ def _with_reduced_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
     """Return the run with the sampling rate that its highest frequency needs if it is long, otherwise the same run.
 
     The natural frequencies are increased by a margin, because they are computed with the first values of the unknowns. Contacts
-    with a stop change accelerations faster than this frequency.
+    with a stop and friction at a support change accelerations faster than this frequency.
     """
-    has_stops = any(isinstance(effect, Stop) for effect in scene.effects)
-    if has_stops or max(time.size for time in run.times.values()) < MIN_SAMPLES:
+    is_smooth = all(term.is_smooth for term in terms_of(scene.effects, SupportForce))
+    if not is_smooth or max(time.size for time in run.times.values()) < MIN_SAMPLES:
         return run
     if channel := run.rotor_channel:
         speeds = turn_speed(channel, run.times[channel.name], run.values[channel.name])[1]
@@ -319,19 +311,20 @@ def _require_included(scene: Scene, runs: Sequence[MeasuredRun]) -> None:
             raise InputError("scene.loads", problem)
     for effect in scene.all_effects:
         kind, terms = f"effects.{effect.kind}", effect.terms()
-        is_support = isinstance(effect, Stop) or all(isinstance(term, SupportForce) and term.is_smooth for term in terms)
+        is_smooth = all(isinstance(term, SupportForce) and term.is_smooth for term in terms)
+        is_support = is_smooth or isinstance(effect, (Stop, FrictionSupport))
         if is_support and (has_loads(scene) or not is_alone):
             raise InputError(kind, "is a nonlinear support; identify includes it only in scenes with one exciter without loads")
         if is_support and any(run.of_kind("force") for run in runs):
             raise InputError(
                 kind,
-                "presses on the foundation, and a channel of kind 'force' does not contain its force; leave out the channel",
+                "is a nonlinear support, whose force a channel of kind 'force' does not contain; leave out the channel",
             )
         if not is_support and not has_term([effect], GravityField):
             raise InputError(
                 kind,
-                "is not included in identify, which needs viscous drag of loads, and supports that are linear, cubic or stops; "
-                "remove the effect",
+                "is not included in identify, which needs viscous drag of loads, and supports that are linear, cubic, stops or "
+                "with dry friction; remove the effect",
             )
     if any(scene.machine.mounting(exciter.place).gyroscopic is not None for exciter in scene.exciters):
         raise InputError(
@@ -439,6 +432,7 @@ def _samples(
     time = origin + step * (first + np.arange(count))
     raw, mask, bounds = _on_grid(run, channels, time)
     numbers, actions, amounts = _changes(scene, run)
+    largest = _largest_readings(channels, raw, mask)
     samples = Samples(
         drives=tuple(angle.without_errors() for angle in angles),
         begin=jnp.asarray(time[0]),
@@ -452,10 +446,18 @@ def _samples(
         changed=tuple(numbers),
         actions=tuple(actions),
         turn=turn,
-        segments=_segments(_changed(scene, run), count, step) if is_nonlinear(scene) else (0, 0, 0),
+        segments=divide(_changed(scene, run), count, step, largest) if is_nonlinear(scene) else (0, 0, 0),
         guide=jnp.zeros((state_count(scene, channels), len(channels))) if has_supports(scene) else None,
     )
     return samples, mask, raw, bounds, time, np.stack([angle.at(time) for angle in angles], axis=1)
+
+
+def _largest_readings(channels: Sequence[Channel], raw: np.ndarray, mask: np.ndarray) -> dict[str, float]:
+    """Return half the range of the readings of each kind, in SI."""
+    ranges: dict[str, float] = {}
+    for channel, values, used in zip(channels, raw.T, mask.T, strict=True):
+        ranges[channel.kind] = max(ranges.get(channel.kind, 0.0), 0.5 * float(np.ptp(values[used])))
+    return ranges
 
 
 def _on_grid(run: MeasuredRun, channels: Sequence[Channel], time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -481,35 +483,6 @@ def _on_grid(run: MeasuredRun, channels: Sequence[Channel], time: np.ndarray) ->
         bounded_by = index[used & clipped]
         bounds[bounded_by, k] = np.sign(raw[bounded_by, k] - np.median(values[used]))
     return raw, mask, bounds
-
-
-def _segments(scene: Scene, count: int, step: float) -> tuple[int, int, int]:
-    """Return the number of the segments of a nonlinear motion, the samples of each, and the steps per sample.
-
-    **Arguments**: `count` of the samples, and their `step`, s.
-    """
-    fastest, slowest = (float(each) for each in frequency_bounds(scene))
-    fastest = max(fastest, _stop_frequency(scene))
-    longest, is_stiff = equal_step_length(fastest, float(machine_decay(scene)), _STEPS_PER_RADIAN)
-    if is_stiff:
-        raise InputError(
-            "scene",
-            "has loads whose drag makes their speeds settle much faster than the vibration; reduce loads.drag or loads.radius",
-        )
-    number = max(1, min(_MAX_SEGMENTS, round(count * step * slowest / _SEGMENT_ANGLE)))
-    return number, -(-count // number), max(1, math.ceil(step / longest))
-
-
-def _stop_frequency(scene: Scene) -> float:
-    """Return the highest natural frequency while all stops are in contact, rad/s; 0 without stops."""
-    model = linear_model(scene)
-    stiffness = np.array(model.carrier.stiffness)
-    stops = [effect for effect in scene.effects if isinstance(effect, Stop)]
-    for stop in stops:
-        rows = np.asarray(stop.rows(scene.machine))
-        stiffness += float(stop.stiffness) * rows.T @ rows
-    squares = np.linalg.eigvals(np.linalg.solve(np.asarray(model.mass), stiffness)).real
-    return math.sqrt(float(np.max(squares))) if stops else 0.0
 
 
 def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: Sequence[np.ndarray] | None = None) -> Problem:

@@ -205,8 +205,8 @@ class Scene(Part):
       `from_matrices`
     - `loads` from `balls`, `rollers`, `pendulums` or `torus_balls`; typical: 0.1 % to 5 % of the machine's mass
     - `drive` such as `ConstantSpeed`; typical: 600 to 3000 rpm
-    - `effects` such as `Gravity`, each kind at most once, except `CubicSupport` and `Stop`, which may occur once for
-      each support; typical: none
+    - `effects` such as `Gravity`, each kind at most once, except `CubicSupport`, `Stop` and `FrictionSupport`, which may occur
+      once for each support; typical: none
     - `exciters`: instead of `loads` and `drive`, a list of `Exciter`
 
     **Attributes**: `machine`; `exciters`; `effects` that act on the whole machine. Effects on a rotor and its loads are in

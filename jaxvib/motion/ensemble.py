@@ -244,9 +244,9 @@ def ensemble(
     - `values`: an array with a leading axis over the runs, or a tree of such arrays; typical: 64 to 100,000 runs
     - `until`: end time of all runs, s or text; typical: 5 to 60
     - `stepsize_controller`: `EqualSteps(n)`, the number of steps of each run, rounded up to a multiple of 4. The default is 4
-      for each radian of the fastest motion, or more to resolve a faster decay, by the drag of the loads or the damping of the
-      carrier. If a decay is at least 100 times as fast as the motion, all runs take implicit steps, 32 for each radian. The
-      time is proportional to n
+      for each radian of the fastest motion, or more to resolve a faster decay, by the drag of the loads, the damping of the
+      carrier or friction at a support. If a decay is at least 100 times as fast as the motion, all runs take implicit steps,
+      32 for each radian. The time is proportional to n
     - `estimate`: True to estimate errors by a second run with half as many steps, which takes half the time of the first. The
       estimate requires more than 4 steps
     - `batch`: number of runs that advance together; typical: the default, 64 on a CPU and 262,144 on an accelerator. The

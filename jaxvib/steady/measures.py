@@ -162,7 +162,7 @@ class VibrationMeasures(Readable):
       supports cannot carry the weight, and if the directions of the coordinates are unknown
     - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on a support.
       They are NaN, as is `foundation_load` in two directions, for a scene with supports that are effects (`CubicSupport`,
-      `Stop`), and for matrices without a foundation
+      `Stop`, `FrictionSupport`), and for matrices without a foundation
     - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive; `power` is the mean of torque times
       speed, which differs from the product of the means if both vary within a turn
     - `point` (2,) of a body in a plane, its `point_stroke`, m peak to peak along the long axis of its path, its

@@ -130,6 +130,13 @@ def residual(s, t, state, field):
             force = force.at[2].add(-polar * v[3]).at[3].add(polar * v[2])
         force -= jax.grad(dampers)(v) if not isinstance(dampers(v), float) else 0.0
         for e in s.all_effects:
+            if e.kind == "friction_support":
+                place = (lambda y, e=e: y[e.platform - 1 : e.platform]) if vertical else (lambda y, e=e: centre(y, e.position))
+                if e.to:
+                    place = lambda y, e=e: y[e.platform - 1 : e.platform] - y[e.to - 1 : e.to]  # noqa: E731
+                sliding = jax.jvp(place, (x,), (v,))[1]
+                speed = jnp.sqrt(jnp.sum(sliding**2))
+                force -= jax.vjp(place, x)[1](e.force * jnp.tanh(speed / e.width) * sliding / speed)[0]
             if e.kind == "stop":
                 radius = (
                     (lambda y, e=e: (-1.0 if e.side == "below" else 1.0) * y[e.platform - 1])

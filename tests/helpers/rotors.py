@@ -76,6 +76,7 @@ CASES = {
             jv.CubicSupport(3e11, position=0.165),
             jv.Stop(4e6, gap=5e-4, damping=900.0, position=-0.155),
             jv.CubicSupport(1e11, position=-0.1),
+            jv.FrictionSupport(3e3, width=0.3, position=-0.155),
         ),
     ),
     "platforms": lambda: (
@@ -87,6 +88,8 @@ CASES = {
             jv.CubicSupport(2e9, platform=1),
             jv.Stop(1e6, gap=1e-4, damping=500.0, side="above", platform=2),
             jv.Stop(2e6, gap=2e-4, damping=300.0, side="below", platform=1),
+            jv.FrictionSupport(500.0, width=0.1, platform=2),
+            jv.FrictionSupport(900.0, width=0.2, platform=1, to=2),
         ),
     ),
     "contact": lambda: (machine(0.0), "dc", (jv.Gravity(), jv.LoadContact(stiffness=1e5, damping=20.0))),

@@ -69,6 +69,7 @@ UNITS = {
         "rolling_friction": {"coefficient": "m", "width": "m/s"},
         "cubic_support": {"stiffness": "N/m^3", "position": "m"},
         "stop": {"stiffness": "N/m", "gap": "m", "damping": "N s/m", "position": "m"},
+        "friction_support": {"force": "N", "width": "m/s", "position": "m"},
         "load_contact": {"stiffness": "N/m", "damping": "N s/m"},
         "free_spin": {},
         "sliding": {"width": "m/s"},

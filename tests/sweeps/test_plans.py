@@ -104,6 +104,18 @@ def test_the_stiffest_stop_sets_the_steps():
     assert plan.each == np.ceil(part * rate) and plan.each > 10 * part * fastest
 
 
+def test_the_largest_friction_sets_the_steps(tmp_path):
+    exciter = jv.Exciter(drive=jv.ConstantSpeed("60 rad/s"), unbalance=0.08)
+    scene = jv.Scene(SCENE.machine, exciters=[exciter], effects=[jv.FrictionSupport(30.0, width=1e-3)])
+    axes = {"effects.friction_support[0].force": [0.0, 50.0]}
+    plan = study(scene, axes, ["run.amplitude"], until=2.0).plan
+    decay = (1000.0 + 50.0 / 1e-3) / float(SCENE.machine.mass[0])
+    assert plan.each == np.ceil((2.0 - plan.window) / PARTS_OF_RUN * decay / 3.0) and not plan.implicit
+    data = jv.sweep(scene, axes, ["run.amplitude"], tmp_path / "s.zarr", until=2.0).data
+    run = jv.simulate(scene.replace(effects=jv.FrictionSupport(50.0, width=1e-3)), 2.0)
+    np.testing.assert_allclose(np.squeeze(data.amplitude.values)[1], run.amplitude[0], rtol=3e-3)  # a step passes the width
+
+
 @pytest.mark.parametrize(("until", "window"), [(0.2, 0.1), (200.0, None)])
 def test_windows_take_at_most_half_of_a_run(until, window):
     plan = study(SCENE, {"machine.mass": [50.0, 60.0]}, ["run.load_speed"], until=until).plan

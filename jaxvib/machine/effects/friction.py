@@ -33,6 +33,19 @@ def sliding_sign(slip: Array, width: Array) -> Array:
     return jnp.tanh(slip / width)
 
 
+def length(v: tuple[Array, ...]) -> Array:
+    """Return the length of a vector, given by its entries; its derivative at 0 is 0."""
+    square = sum(x**2 for x in v)
+    zero = square == 0.0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))
+
+
+def sliding_share(speed: Array, width: Array) -> Array:
+    """Return tanh(speed / width) / speed, with its limit 1 / width at 0: friction per sliding velocity, for a speed >= 0."""
+    moving = speed > 1e-6 * width
+    return jnp.where(moving, sliding_sign(speed, width) / jnp.where(moving, speed, 1.0), 1.0 / width)
+
+
 def dry_lever(coefficient: Array, diameter: Array, slip: Array, width: Array) -> Array:
     """Return mu2 (d/2) sign(slip), m: the torque of dry friction per radial load |N| of a bearing.
 

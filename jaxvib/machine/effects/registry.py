@@ -7,7 +7,7 @@ from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction
 from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.effects.sliding import FreeSpin, Sliding
-from jaxvib.machine.effects.supports import CubicSupport, Stop
+from jaxvib.machine.effects.supports import CubicSupport, FrictionSupport, Stop
 
 EFFECTS: dict[str, type[Effect]] = {
     "gravity": Gravity,
@@ -17,6 +17,7 @@ EFFECTS: dict[str, type[Effect]] = {
     "rolling_friction": RollingFriction,
     "cubic_support": CubicSupport,
     "stop": Stop,
+    "friction_support": FrictionSupport,
     "load_contact": LoadContact,
     "free_spin": FreeSpin,
     "sliding": Sliding,

@@ -13,7 +13,7 @@ from jax import Array
 from jaxvib.errors import require_one_of
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Typical
-from jaxvib.machine.effects.friction import sliding_sign
+from jaxvib.machine.effects.friction import length, sliding_share, sliding_sign
 from jaxvib.machine.effects.terms import ContactFriction, Coordinates, Friction, Term
 from jaxvib.machine.loads import Loads, ball_radius
 from jaxvib.machine.numbers import read_numbers, unit
@@ -90,10 +90,7 @@ class RollingFriction(Effect):
             levers = [self._lever(loads, u, i, x) for i, x in enumerate(slip)]
         else:
             v = jax.jvp(loads.position, u, slip)[1]
-            size = _length(v)
-            # tanh(x)/x, with its limit at x = 0.
-            moving = size > 1e-6 * self.width
-            share = jnp.where(moving, sliding_sign(size, self.width) / jnp.where(moving, size, 1.0), 1.0 / self.width)
+            share = sliding_share(length(v), self.width)
             levers = jax.vjp(loads.position, *u)[1](tuple(share * x for x in v))
         first, *others = (-scale * lever for lever in levers)
         return Friction(first, *normal_force, tuple(others), loads.one_sided)
@@ -101,11 +98,5 @@ class RollingFriction(Effect):
     def _lever(self, loads: Loads, u: tuple[Array, ...], i: int, slip: Array) -> Array:
         """Return |dp/du_i| tanh(|dp/du_i| slip / width)."""
         direction = tuple(jnp.ones_like(x) if k == i else jnp.zeros_like(x) for k, x in enumerate(u))
-        size = _length(jax.jvp(loads.position, u, direction)[1])
+        size = length(jax.jvp(loads.position, u, direction)[1])
         return size * sliding_sign(size * slip, self.width)
-
-
-def _length(v: tuple[Array, ...]) -> Array:
-    square = sum(x**2 for x in v)
-    zero = square == 0.0
-    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))

@@ -1,4 +1,4 @@
-"""Nonlinear supports: cubic springs and stops."""
+"""Nonlinear supports: cubic springs, stops and dry friction."""
 
 from typing import Literal, get_args
 
@@ -9,6 +9,7 @@ from jax import Array
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Typical
+from jaxvib.machine.effects.friction import length, sliding_share, sliding_sign
 from jaxvib.machine.effects.terms import SupportForce, Term
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import read_numbers, unit
@@ -42,9 +43,14 @@ def _read_place(
 ) -> tuple[int | None, Array | None]:
     if platform is not None and position is not None:
         raise InputError(f"effects.{kind}", "has both a platform and a position; give one of them")
-    if platform is not None and (isinstance(platform, bool) or not isinstance(platform, int) or platform < 1):
-        raise InputError(f"effects.{kind}.platform", f"is {quoted(platform)}; it must be a whole number, at least 1")
+    platform = None if platform is None else _read_platform(kind, "platform", platform)
     return platform, read_numbers(part, f"effects.{kind}", position=position)["position"]
+
+
+def _read_platform(kind: str, name: str, number: int) -> int:
+    if isinstance(number, bool) or not isinstance(number, int) or number < 1:
+        raise InputError(f"effects.{kind}.{name}", f"is {quoted(number)}; it must be a whole number, at least 1")
+    return number
 
 
 class CubicSupport(_Support):
@@ -191,3 +197,79 @@ class Stop(_Support):
         penetration, direction = self.penetration(displacement)
         closing = self.damping * jnp.sum(direction * velocity)
         return jnp.where(penetration > 0.0, jnp.maximum(closing, -self.stiffness * penetration), 0.0) * direction
+
+
+class FrictionSupport(_Support):
+    """Dry friction at a support or in a link: guides, rubbing shear mounts, leaf springs whose leaves rub.
+
+        force F tanh(|v|/width) v/|v| on the foundation,    v the velocity of the platform, or relative to the platform `to`
+
+    - Coulomb friction is the limit of a small `width`. An oscillation with the largest speed v loses less energy by the share
+      (pi^2/24) (width/v)^2, 0.41 (width/v)^2
+    - A machine that would stick under the force f < F creeps at the speed width artanh(f/F)
+    - A free vibration on a spring k decays by 4 F/k per period
+
+    **Arguments** (SI, or strings with a unit)
+
+    - `force` F, N, at least 0; typical: 1 % to 10 % of the largest force of the spring next to it
+    - `width`, m/s: range of velocities over which the sign of v is smoothed; typical: 0.01 (the default), 1 % to 10 % of the
+      largest velocity. Explicit steps must resolve the decay rate F/(width M) of a mass M that sticks
+    - `platform` or `position`: as for `CubicSupport`; typical: platform 1
+    - `to`: number of a second platform if the friction acts in the link between both; default: on the foundation
+
+    **Raises** `InputError` for values that are not allowed. A scene raises it for a place that the machine does not have.
+
+    >>> import jaxvib as jv
+    >>> float(jv.FrictionSupport("0.2 kN", platform=2, to=1).force)
+    200.0
+
+    Source: Den Hartog 1931 for the vibration with Coulomb friction, to which tests compare.
+    """
+
+    force: Array = eqx.field(metadata=unit("N", low=0.0, words="friction force at the support"))
+    width: Array = eqx.field(metadata=unit("m/s", low=0.0, open_low=True, words="smoothing width of support friction"))
+    platform: int | None = eqx.field(static=True)
+    position: Array | None = eqx.field(metadata=unit("m", words="position of the friction support", typical=0.1))
+    to: int | None = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        force: Number,
+        width: Number = 0.01,
+        platform: int | None = None,
+        position: Number | None = None,
+        to: int | None = None,
+    ):
+        self.kind = "friction_support"
+        given = read_numbers(FrictionSupport, "effects.friction_support", force=force, width=width)
+        self.force, self.width = given.values()
+        self.platform, self.position = _read_place(FrictionSupport, self.kind, platform, position)
+        self.to = to if to is None else _read_platform(self.kind, "to", to)
+        if to is not None and (position is not None or to == (platform or 1)):
+            problem = f"is {to}, and the friction acts between two different platforms; give their numbers"
+            raise InputError("effects.friction_support.to", problem)
+
+    def rows(self, machine: Machine) -> Array:
+        """Return the row of the platform's coordinate, relative to the platform `to`, or the rows of the two directions of the
+        axis.
+
+        **Raises** `InputError` for a place that the machine does not have.
+        """
+        rows = super().rows(machine)
+        return rows if self.to is None else rows - machine.rows_at(self.to, "effects.friction_support.to")
+
+    def terms(self) -> tuple[Term, ...]:
+        """Return the force of the friction."""
+        damping, is_link = self.force / self.width, self.to is not None
+        return (SupportForce(self.rows, self.energy, self.resistance, damping=damping, is_link=is_link),)
+
+    def energy(self, displacement: Array) -> Array:
+        """Return 0: friction has no potential."""
+        return jnp.zeros_like(displacement[0])
+
+    def resistance(self, displacement: Array, velocity: Array) -> Array:
+        """Return F tanh(|v|/width) v/|v|, (k,) N, at the `velocity` (k,), m/s."""
+        if velocity.shape[0] == 1:
+            return self.force * sliding_sign(velocity, self.width)
+        return self.force * sliding_share(length(tuple(velocity)), self.width) * velocity

@@ -238,8 +238,10 @@ class SupportForce:
     - `resistance`: function of x and its rate, the dissipative force on the foundation, (k,) N; or None
     - `is_smooth`: True if the force has all derivatives
     - `stiffness`: largest stiffness of the support, N/m, whose vibration equal steps must resolve; None if it has no limit
+    - `damping`: largest slope of the resistance, N s/m, whose decay explicit steps must resolve; None without a resistance
     - `penetration`: function of x that returns the penetration, m, negative without contact, and its direction (k,), if the
       force jumps when a contact begins; otherwise None
+    - `is_link`: True if the force acts between two points of the machine, False if it acts on the foundation
     """
 
     rows: Callable[[Machine], Array]
@@ -247,10 +249,12 @@ class SupportForce:
     resistance: Callable[[Array, Array], Array] | None = None
     is_smooth: bool = False
     stiffness: Array | None = None
+    damping: Array | None = None
     penetration: Callable[[Array], tuple[Array, Array]] | None = None
+    is_link: bool = False
 
     def force(self, displacement: Array, velocity: Array) -> Array:
-        """Return the force on the foundation, (k,) N. The force on the carrier has the opposite sign."""
+        """Return the force on the foundation or on the second point, (k,) N. The carrier has the opposite force."""
         force = jax.grad(self.energy)(displacement)
         return force if self.resistance is None else force + self.resistance(displacement, velocity)
 

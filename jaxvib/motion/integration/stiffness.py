@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import linear_model
+from jaxvib.equations.linear import LinearModel, linear_model
 from jaxvib.equations.sliding import kinematics
 from jaxvib.equations.state import State
 from jaxvib.machine.drives.drive import Drive
@@ -50,23 +50,32 @@ def _motor_decay(drive: Drive) -> Array:
 
 @cached
 def machine_decay(scene: Scene) -> Array:
-    """Return the fastest decay rate, 1/s, due to the drag of the loads or the damping of the carrier: the larger of
+    """Return the fastest decay rate, 1/s, due to the drag of the loads or the damping of carrier and supports: the larger of
 
         max_j(-Q'_j / H_j) / (1 - mu sum_j m_j / kappa_j)   and   the largest eigenvalue of M^-1 C
 
+    C contains the largest damping of nonlinear supports (`SupportForce.damping`).
     Q' is the derivative of the resistance of a load with respect to its rate, H its inertia, mu the trace of P M^-1 P^T with
     the rows P of the mount (the motion of the carrier reduces the effective inertia of the loads). The denominator is at least
     0.1. Explicit steps must resolve this rate, even if the motion is slow.
     """
     scene = jax.lax.stop_gradient(scene)
     linear = linear_model(scene)
-    damping, inverse = relative_to(linear.mass, linear.carrier.damping)
+    damping, inverse = relative_to(linear.mass, _damping(linear))
     rates = [
         _load_decay(exciter.loads, exciter.drive.speed, jnp.sum((mount.rows[0] @ inverse.T) ** 2))
         for exciter, mount in zip(scene.exciters, linear.mounts, strict=True)
         if exciter.loads is not None
     ]
     return functools.reduce(jnp.maximum, [*rates, jnp.max(hermitian_modes(damping)[0])])
+
+
+def _damping(linear: LinearModel) -> Array:
+    """Return the damping of the carrier and the largest damping of its nonlinear supports, (nd, nd) N s/m."""
+    damping = linear.carrier.damping
+    for term, rows in zip(terms_of(linear.scene.effects, SupportForce), linear.supports, strict=True):
+        damping = damping if term.damping is None else damping + term.damping * rows.T @ rows
+    return damping
 
 
 def _load_decay(loads: Loads, speed: Array, accelerance: Array) -> Array:
@@ -133,9 +142,14 @@ def advice(scene: Scene) -> str:
     decay, motion = float(fastest_decay(scene)), float(frequency_bounds(scene)[0])
     if not decay > 10.0 * motion:
         return ""
-    carrier, machine = float(np.max(np.asarray(_carrier_decay(scene)))), float(machine_decay(scene))
-    name = "machine.damping makes vibrations" if carrier >= decay else "loads.drag makes speeds of loads"
-    name = name if machine >= decay else "a motor makes its speed or its currents"
+    causes = (
+        "machine.damping makes vibrations",
+        "friction at a support (force/width) makes vibrations",
+        "loads.drag makes speeds of loads",
+    )
+    rates = (*_carrier_decays(scene), machine_decay(scene))
+    name = next((cause for cause, rate in zip(causes, rates, strict=True) if float(rate) >= decay), None)
+    name = name or "a motor makes its speed or its currents"
     return (
         f"; {name} decay at {decay:.2g} 1/s, {decay / motion:.1g} times as fast as the motion: use a "
         "smaller value, or the default solver"
@@ -143,6 +157,11 @@ def advice(scene: Scene) -> str:
 
 
 @cached
-def _carrier_decay(scene: Scene) -> Array:
+def _carrier_decays(scene: Scene) -> tuple[Array, ...]:
+    """Return the fastest decay rates due to the damping of the carrier without and with its nonlinear supports, 1/s."""
     linear = linear_model(scene)
-    return hermitian_modes(relative_to(linear.mass, linear.carrier.damping)[0])[0]
+    return tuple(_fastest(linear, damping) for damping in (linear.carrier.damping, _damping(linear)))
+
+
+def _fastest(linear: LinearModel, damping: Array) -> Array:
+    return jnp.max(hermitian_modes(relative_to(linear.mass, damping)[0])[0])

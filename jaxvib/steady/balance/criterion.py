@@ -13,6 +13,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, SpeedUnit, speed_unit
 from jaxvib.equations.linear import circular_loads, require_one_point, require_terms, rotating_direction
 from jaxvib.errors import InputError
+from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import (
     ContactFriction,
     DrillingSpinRelease,
@@ -146,7 +147,7 @@ def criterion(scene: Scene) -> Criterion:
     **Returns** `Criterion`; derivatives and `vmap` are supported as by `characteristic_speeds`.
 
     **Raises** `InputError` in the cases of `characteristic_speeds`, for a single load, and for effects whose potential exerts a
-    torque on each single load (`Gravity`).
+    torque on each single load (`Gravity`) or that damp the machine at rest (`FrictionSupport`).
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,
@@ -161,6 +162,10 @@ def criterion(scene: Scene) -> Criterion:
     if scene.loads.count < 2:
         raise InputError("loads.count", "is 1; the criterion is about the gathering of loads and needs 2 or more")
     require_terms(scene.all_effects, CRITERION_TERMS, "acts|act on each load separately, which the criterion excludes")
+    for effect in scene.all_effects:
+        if any(term.damping is not None for term in terms_of([effect], SupportForce)):
+            problem = "holds a machine without vibration, which the criterion excludes; leave it out here, or simulate"
+            raise InputError(f"effects.{effect.kind}", problem)
     return _criterion_at_speeds(characteristic_speeds(scene))
 
 

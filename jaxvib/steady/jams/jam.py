@@ -310,7 +310,7 @@ def jam_modes(scene: Scene) -> JamModes:
     - loads without drag or at different stations
     - a machine whose coordinates couple through the rotor speed
     - a motor in place of a prescribed speed
-    - effects that this function does not include (`CubicSupport`, `Stop`)
+    - effects that this function does not include (`CubicSupport`, `Stop`, `FrictionSupport`)
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

@@ -40,10 +40,10 @@ JAMMED_CASES = {
     "two jammed balls, readings clipped at 60 %": {"balls": True, "full_scale": 0.6},
 }
 
-SUPPORT_CASES = {"stop": {"support": "stop"}, "cubic support": {"support": "cubic"}}
+SUPPORT_CASES = {"stop": {"support": "stop"}, "cubic support": {"support": "cubic"}, "friction": {"support": "friction"}}
 """Cases of `repeated_records.supports`."""
 
-FACTORS = {"stop[0].gap": 1.2, "stop[0].stiffness": 1.3, "cubic": 1.3, "stiffness": 1.1, "damping": 1.5}
+FACTORS = {"stop[0].gap": 1.2, "stop[0].stiffness": 1.3, "cubic": 1.3, "force": 1.3, "stiffness": 1.1, "damping": 1.5}
 JAMMED_FACTORS = {"stiffness": 1.05, "damping": 1.3, "loads.mass": 1.1, "drag": 1.2}
 """Factors on the first values; the first word in the name of a number counts."""
 
@@ -108,7 +108,7 @@ def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None
     names, factor = ((*NAMES, "loads.mass", "loads.drag"), JAMMED_FACTORS) if balls else (NAMES, FACTORS)
     if support:
         truth, scene = supports.truth(support), supports.scene_of
-        names = [*NAMES, *(name for name in truth if name.startswith("effects"))]
+        names = [*NAMES, *(name for name in truth if name.startswith("effects") and "width" not in name)]
     away, relative, statuses, order = [], [], [], ()
     for k in range(count):
         rng = np.random.default_rng([seed, k])

@@ -16,6 +16,9 @@ STOP = {"effects.stop[0].stiffness": 3e5, "effects.stop[0].gap": 1e-3, "effects.
 CUBIC = {"effects.cubic_support[0].stiffness": 2e9}
 """Cubic support under the second mass."""
 
+FRICTION = {"effects.friction_support[0].force": 20.0, "effects.friction_support[0].width": 0.01}
+"""Dry friction under the second mass, of which the width is known."""
+
 TIMES = 0.016 * np.arange(1000)
 
 
@@ -33,6 +36,7 @@ def motion(numbers, first=(0.0,) * 4, phase=0.4, times=TIMES, turning=ramp):
     numbers = dict(numbers)
     stop = tuple(numbers[name] for name in STOP) if next(iter(STOP)) in numbers else None
     cubic = numbers.get(next(iter(CUBIC)), 0.0)
+    friction, width = (numbers.get(name, default) for name, default in zip(FRICTION, (0.0, 1.0), strict=True))
     m1, m2, k1, k2, c1, c2, k, c, s = (numbers[name] for name in MACHINE)
 
     def rates(t, y, side):
@@ -41,7 +45,7 @@ def motion(numbers, first=(0.0,) * 4, phase=0.4, times=TIMES, turning=ramp):
         link = k * (x1 - x2) + c * (v1 - v2)
         force = (
             s * (speed**2 * np.sin(theta + phase) - change * np.cos(theta + phase)) - k2 * x2 - c2 * v2 - cubic * x2**3 + link
-        )
+        ) - friction * np.tanh(v2 / width)
         if side:
             force -= side * (stop[0] * (side * x2 - stop[1]) + stop[2] * side * v2)
         return np.array([v1, v2, (-k1 * x1 - c1 * v1 - link) / m1, force / m2])
@@ -91,14 +95,14 @@ def clean_motion(kind):
 
 
 def truth(kind):
-    """Return the numbers of a `kind` of support, "stop" or "cubic"."""
-    return MACHINE | {"stop": STOP, "cubic": CUBIC}[kind]
+    """Return the numbers of a `kind` of support, "stop", "cubic" or "friction"."""
+    return MACHINE | {"stop": STOP, "cubic": CUBIC, "friction": FRICTION}[kind]
 
 
 def scene_of(numbers):
     """Return the scene with these numbers."""
-    values = [numbers[name] for name in (*STOP, *CUBIC) if name in numbers]
-    effect = jv.Stop(*values, platform=2) if len(values) == 3 else jv.CubicSupport(*values, platform=2)
+    values = [numbers[name] for name in (*STOP, *CUBIC, *FRICTION) if name in numbers]
+    effect = {3: jv.Stop, 1: jv.CubicSupport, 2: jv.FrictionSupport}[len(values)](*values, platform=2)
     scene = linear_scene_of(numbers)
     return jv.Scene(scene.machine, exciters=scene.exciters, effects=effect)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.machine.effects.rolling import _length
+from jaxvib.machine.effects.friction import length
 from jaxvib.machine.numbers import number_specs
 
 POSITIVE, NOT_NEGATIVE = "greater than 0", "at least 0"
@@ -79,6 +79,15 @@ PARTS = {
             "position": ("m", "", "position of the stop", 0.1),
         },
     ),
+    "friction_support": (
+        jv.FrictionSupport,
+        {"force": 50.0, "width": 0.02, "position": 0.2},
+        {
+            "force": ("N", NOT_NEGATIVE, "friction force at the support", None),
+            "width": ("m/s", POSITIVE, "smoothing width of support friction", None),
+            "position": ("m", "", "position of the friction support", 0.1),
+        },
+    ),
 }
 
 
@@ -92,7 +101,7 @@ def test_numbers_of_effects_have_units_bounds_and_labels(kind):
 
 
 @pytest.mark.parametrize("platform", [True, 0, -1, 1.0, "1"])
-@pytest.mark.parametrize("kind", ["cubic_support", "stop"])
+@pytest.mark.parametrize("kind", ["cubic_support", "stop", "friction_support"])
 def test_platforms_of_supports_are_counted_from_one(kind, platform):
     part, given, _ = PARTS[kind]
     with pytest.raises(jv.InputError, match="platform"):
@@ -123,8 +132,8 @@ def test_typical_bearing_has_a_fifth_of_the_largest_radius():
 
 def test_length_of_no_speed_is_zero_with_its_slope():
     x, y = jnp.array([0.0, 3.0, -1e-9]), jnp.array([0.0, 4.0, 0.0])
-    np.testing.assert_allclose(_length((x, y)), [0.0, 5.0, 1e-9], rtol=1e-14)
-    slopes = jax.grad(lambda x: jnp.sum(_length((x, y))))(x)
+    np.testing.assert_allclose(length((x, y)), [0.0, 5.0, 1e-9], rtol=1e-14)
+    slopes = jax.grad(lambda x: jnp.sum(length((x, y))))(x)
     np.testing.assert_allclose(slopes, [0.0, 0.6, -1.0], rtol=1e-14)
 
 

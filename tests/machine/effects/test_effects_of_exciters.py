@@ -51,6 +51,7 @@ SCENES = {
     "rolling_friction": lambda: loaded(PLATFORMS, BALL, jv.RollingFriction(3e-5)),
     "cubic_support": lambda: unbalanced(PLATFORMS, jv.CubicSupport(1e8, platform=1)),
     "stop": lambda: unbalanced(PLATFORMS, jv.Stop(1e5, gap=1e-3, platform=1)),
+    "friction_support": lambda: unbalanced(PLATFORMS, jv.FrictionSupport(50.0, platform=2, to=1)),
     "load_contact": lambda: loaded(PLATFORMS, BALLS, jv.LoadContact(1e5)),
     "free_spin": lambda: loaded(PLANAR, _torus(), jv.FreeSpin()),
     "sliding": lambda: loaded(PLANAR, BALLS, jv.Sliding(0.1)),
@@ -74,7 +75,7 @@ def _regime(scene):
 
 AVERAGED = {"gravity"}
 IMBALANCES = {"static_imbalance", "moment_imbalance"}
-PERIODIC = {*AVERAGED, *IMBALANCES, "dry_friction", "rolling_friction", "cubic_support", "stop"}
+PERIODIC = {*AVERAGED, *IMBALANCES, "dry_friction", "rolling_friction", "cubic_support", "stop", "friction_support"}
 ANALYSES = {
     "synchronous_regimes": (jv.synchronous_regimes, AVERAGED),
     "near": (lambda s: jv.synchronous_regimes(s, near=(90.0, jnp.zeros(_masses(s)))), AVERAGED),

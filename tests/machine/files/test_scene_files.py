@@ -89,6 +89,7 @@ EVERY_EFFECT = (
     jv.Stop(1e6, gap=1e-3, damping=30.0, position=0.165),
     jv.CubicSupport(2e9, position=-0.1),
     jv.Stop(2e6, gap=2e-3, position=-0.155),
+    jv.FrictionSupport(90.0, width=0.02, position=0.165),
 )
 
 

@@ -113,6 +113,7 @@ def test_a_run_out_of_steps_names_the_drag():
     for scene, name in (
         (dragged(1e6), "loads.drag makes speeds of loads decay"),
         (dragged(1.0, 1e8), "machine.damping makes vibrations"),
+        (dragged(1.0, effects=(jv.FrictionSupport(1e6, 1e-4),)), "friction at a support .force/width. makes vibrations"),
     ):
         with pytest.raises(jv.ComputationError, match=f"max_steps_reached.*{name}"):
             jv.simulate(scene, 5.0, solver=UnrolledDopri8(), max_steps=1000, save="window")
