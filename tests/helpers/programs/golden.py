@@ -69,6 +69,7 @@ def scenes() -> dict[str, jv.Scene]:
         "imbalance and a motor": (two, equal, jv.DCMotor(120.0, stall_torque=8.0, inertia=0.2), (jv.StaticImbalance(0.005),)),
         "cubic support": (two, equal, SPEED, (jv.CubicSupport(1e9, platform=1),)),
         "stop": (two, equal, SPEED, (jv.Stop(1e6, gap=0.01, damping=50.0, platform=2),)),
+        "friction support": (two, equal, SPEED, (jv.FrictionSupport(30.0, platform=2, to=1),)),
         "contact": (one, sized, SPEED, (jv.LoadContact(1e5, damping=3.0),)),
         "planar rotor": (planar, pendulums, SPEED),
         "rotor": (rotor, pendulums, SPEED),

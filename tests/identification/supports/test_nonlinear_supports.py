@@ -59,7 +59,7 @@ def test_motion_is_that_of_scipy(kind):
     readings, _ = closed_motion(problem.unknowns, problem.runs[0], problem.scene, x[: problem.unknowns.count], own)
     expected = motion(truth(kind), times=SHORT)
     n = len(problem.raw[0])
-    assert np.max(np.abs(expected)) > 1.0
+    assert np.max(np.abs(expected)) > 0.5
     np.testing.assert_allclose(readings[:n], expected[:n], atol=1e-6)
 
 
@@ -250,7 +250,7 @@ def test_further_run_on_a_stop_is_predicted():
 
 def test_friction_of_a_support_is_found():
     names = ["machine.stiffness", "machine.damping", "exciters[0].unbalance", "effects.friction_support[0].force"]
-    first = {"stiffness": 1.1, "damping": 0.67, "force": 1.5}
+    first = {"machine.stiffness": 1.1, "machine.damping": 0.67, "force": 1.5}
     numbers = {
         name: value * next((f for word, f in first.items() if word in name), 1.0) for name, value in truth("friction").items()
     }

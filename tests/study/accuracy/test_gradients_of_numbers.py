@@ -20,6 +20,7 @@ FREE = {
     "imbalance": ["effects.static_imbalance.moment", "effects.static_imbalance.angle"],
     "cubic support": ["effects.cubic_support[0].stiffness"],
     "stop": [f"effects.stop[0].{name}" for name in ("stiffness", "gap", "damping")],
+    "friction support": [f"effects.friction_support[0].{name}" for name in ("force", "width")],
     "contact": ["loads.ball_radius", "effects.load_contact.stiffness", "effects.load_contact.damping"],
     "rotor with stations": [f"machine.{name}" for name in ("transverse_inertia", "polar_inertia", "position", "stations")],
     "torus": ["loads.tube", "loads.ball_radius", "effects.gravity.g", "effects.rolling_friction.coefficient"],
