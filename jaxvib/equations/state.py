@@ -211,4 +211,5 @@ def _require_shapes(field: str, values: object, shape: tuple[int, ...], count: i
         several = "; for the states of a trajectory use jax.vmap" if len(wrong[0]) > len(shape) else ""
         raise InputError(field, f"has shape {wrong[0]}; this scene needs {shape}{several}")
     if len(shapes) != count:
-        raise InputError(field, f"has {len(shapes)} arrays; {count} of shape {shape} are needed, one for each coordinate")
+        needed = f"one array of shape {shape} is" if count == 1 else f"{count} arrays of shape {shape} are"
+        raise InputError(field, f"has {len(shapes)} arrays; {needed} needed")

@@ -51,6 +51,13 @@ def test_a_state_of_another_machine_is_refused():
         jv.initial_state(eqx.tree_at(lambda s: s.drive, published().scene(), jv.SpinUp(3.0, 1.0)), "jam", mode=3)
 
 
+def test_a_displacement_per_coordinate_is_refused():
+    state = jv.initial_state(published().scene())
+    state = eqx.tree_at(lambda s: s.displacement, state, (state.displacement, state.displacement))
+    with pytest.raises(jv.InputError, match=r"start.displacement has 2 arrays; one array of shape \(2,\) is needed$"):
+        jv.simulate(published().scene(), 1.0, start=state)
+
+
 @pytest.mark.parametrize(
     ("parts", "says"),
     [
