@@ -21,14 +21,16 @@ channel, for the angle of the rotor or of jammed loads) causes the status `patte
 _ANGLE_NAMES = ("the rotor's angle", "the angle of the jammed loads")
 
 _WINDOWS, _ORDERS = 16, 3
-"""Number of segments of a record, and number of orders of the rotor speed, at which residuals are compared with noise."""
+"""Number of equal segments of a record in which residuals are compared with noise, and number of orders of the rotor speed that
+are compared."""
 
 _CONTRADICTION = 4.0
 """Distance of a fitted value from its known value, in standard errors, above which the records contradict the known value."""
 
 _ANGLE_SHARE = 0.1
-"""Errors of the rotor's angle that are not unknowns of the fit cause a share of the residuals. Above this share, intervals
-count as too narrow. It is small because these errors change slowly and do not average out like noise."""
+"""Largest share of the residuals that errors of the rotor's angle may cause. Above it, intervals count as too narrow. Only
+errors that are not unknowns of the fit count. The limit is small because these errors change slowly and do not average out like
+noise."""
 
 _COARSE_ANGLE = 0.3
 """Standard error of the rotor's angle, rad, above which the response is not linear in it."""
@@ -53,9 +55,9 @@ class FitStatus(eqx.Enumeration):
 
     found = "the model explains the records up to noise"
     patterned = (
-        "the residuals are not noise: they repeat with the rotor's angle or contain another vibration, so the model lacks a "
-        "part, the angle is inaccurate, or the fit has ended at a wrong minimum, and the intervals are too narrow; see the "
-        "notes, plot the residuals over speed, and start from better values"
+        "the residuals are not noise, or the rotor's angle is inaccurate: see the notes. The model lacks a part, the angle has "
+        "errors, or the fit has ended at a wrong minimum, and the intervals are too narrow; plot the residuals over speed, and "
+        "start from better values"
     )
     undetermined = "the records do not determine all unknowns: see `undetermined` for the directions and how to determine them"
     contradicted = (
@@ -228,10 +230,14 @@ def coverage_notes(fitted: Fitted, frequency: np.ndarray, damping_ratio: np.ndar
     for k, time in enumerate(problem.times):
         lasts = float(time[-1] - time[0])
         if lasts < _DECAY_TIMES * longest:
-            each = f"{longest:.3g} s each" if math.isfinite(longest) else "which does not decay"
+            if math.isfinite(longest):
+                reason = f"less than two decay times of the mode that decays most slowly ({longest:.3g} s each)"
+                remedy = "record a longer run"
+            else:
+                reason, remedy = "and a mode of the fitted machine does not decay", "check its damping"
             yield (
-                f"run {k + 1} lasts {lasts:.3g} s, less than two decay times of the mode that decays most slowly ({each}): its "
-                "response cannot be distinguished from the free vibration at its start; record a longer run"
+                f"run {k + 1} lasts {lasts:.3g} s, {reason}: its response cannot be distinguished from the free vibration at "
+                f"its start; {remedy}"
             )
 
 
@@ -327,7 +333,8 @@ def _disagreements(fitted: Fitted) -> Iterator[str]:
         polar = turn.T @ matrix @ turn
         parts.append((eliminate(polar, kept), elimination(polar, kept).T @ (turn.T @ gradient)))
     total, gradient_sum = (np.sum(each, axis=0) for each in zip(*parts, strict=True))
-    step = pseudoinverse(total)[0] @ gradient_sum  # to the exact minimum, which matters for a run with much less information
+    # Rest of the way from the fitted values to the minimum. It matters for a run with much less information than the others.
+    step = pseudoinverse(total)[0] @ gradient_sum
     for k, (part, gradient) in enumerate(parts[:-1]):
         deviation = disagreement(total - part, part, gradient - part @ step, names)
         if deviation.p_value < SIGNIFICANCE_LEVEL:

@@ -24,7 +24,7 @@ from jaxvib.identification.directions import (
 )
 from jaxvib.identification.fit import Fitted, unknown_count
 from jaxvib.identification.jammed.start import first_states, with_first_motion
-from jaxvib.identification.problem import Problem, build_problem, damped_modes, has_supports
+from jaxvib.identification.problem import Problem, build_problem, damped_modes, has_nonlinear_supports
 from jaxvib.identification.profile_likelihood import QUANTILE, profile_intervals
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.identification.start import track_orders
@@ -253,7 +253,7 @@ def identify(
     if problem.has_loads:
         problem, first = with_first_motion(problem)
         starts = [first]
-    elif has_supports(scene):
+    elif has_nonlinear_supports(scene):
         problem, first = with_guided_motion(problem)
         starts = [first]
     else:

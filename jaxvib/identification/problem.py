@@ -55,7 +55,6 @@ sampling rate."""
 DELAY_MARGIN = 2
 """Number of steps by which both readings and model are delayed, so that the interpolation has samples on both sides."""
 
-
 _MAX_DELAY = 450
 """Largest delay of readings in steps; the longest filter contains it and a whitening filter."""
 
@@ -80,16 +79,16 @@ class Problem(NamedTuple):
     - `scene` with the known values; `unknowns`, see `Unknowns`
     - `runs`: the samples of each run, padded to whole segments
     - for each run, without the padding: `masks` (n, C), True for samples that count; `raw` (n, C), readings without a filter;
-      `bounds` (n, C), 1 for readings clipped from above, -1 from below, otherwise 0; `times` (n,), s; `angles` of the rotors
-      (n, E), rad
+      `bounds` (n, C), 1 for readings clipped at the upper end of the range, -1 at the lower end, otherwise 0; `times` (n,), s;
+      `angles` of the rotors (n, E), rad
     - `rotors`: for each run, the angles of the rotors as functions of time
     - `means` and `precisions` (p,): known values of x, and 1/error^2 of these values; both are 0 for a free parameter
     - `marked`: True if the zero of the rotor's angle is the same mark in all runs
     - `unbalances`: for each exciter its known value, None if it is free
-    - `angle_errors`, rad: standard error of the rotor's angle in each run, without the errors that are unknowns
+    - `angle_errors`, rad: for each run, the part of the standard error of the rotor's angle that no unknown describes
     - `notes`: sentences for the reader
-    - `linear` (L,): first values of the linear unknowns of a motion with loads or on nonlinear supports, in which the readings
-      are not linear; None for a linear response
+    - `linear` (L,), for a motion with loads or on nonlinear supports: first values of the initial states, unbalances and
+      offsets. The readings are not linear in these unknowns. None for a linear response, whose readings are linear in them
     - `load_spread` (L, L): information from the assumption that all loads of a run have nearly the same angle and speed at the
       first sample; None without loads
     """
@@ -251,9 +250,9 @@ def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs:
         if is_of_drive(number):
             raise InputError(
                 f"unknown.{name}",
-                "is a parameter of the drive, which the recorded angle does not determine; leave it out. Only the parameters "
-                "of the motor of a scene with linear supports and one exciter without loads can be unknown, if the motor has "
-                "no currents as states and each run has a channel of pulses, angle or speed",
+                "is a parameter of the drive, which these records do not determine; leave it out. Parameters of a drive can be "
+                "unknown only if it is a motor without currents as states, the scene has one exciter, no loads and linear "
+                "supports, and each run has a channel of pulses, angle or speed",
             )
 
 
@@ -284,10 +283,10 @@ def has_loads(scene: Scene) -> bool:
 
 def is_nonlinear(scene: Scene) -> bool:
     """Return True for a scene whose motion is not linear in its state and its unbalance: with loads or nonlinear supports."""
-    return has_loads(scene) or has_supports(scene)
+    return has_loads(scene) or has_nonlinear_supports(scene)
 
 
-def has_supports(scene: Scene) -> bool:
+def has_nonlinear_supports(scene: Scene) -> bool:
     """Return True if a scene has nonlinear supports, such as stops."""
     return has_term(scene.effects, SupportForce)
 
@@ -318,7 +317,7 @@ def _require_included(scene: Scene, runs: Sequence[MeasuredRun]) -> None:
         if is_support and any(run.of_kind("force") for run in runs):
             raise InputError(
                 kind,
-                "is a nonlinear support, whose force a channel of kind 'force' does not contain; leave out the channel",
+                "is a nonlinear support, which the model of a 'force' channel does not contain; leave out the channel",
             )
         if not is_support and not has_term([effect], GravityField):
             raise InputError(
@@ -333,8 +332,8 @@ def _require_included(scene: Scene, runs: Sequence[MeasuredRun]) -> None:
 
 
 def _singles(scene: Scene, names: Sequence[str], field: str = "unknown") -> list[NamedNumber]:
-    """Return the named parameters, each entry of a named array as one parameter; zeros of arrays, which are absent parts, are
-    left out."""
+    """Return the named parameters, each entry of a named array as one parameter. Entries 0 of an array of springs or dampers
+    are left out, because these parts are absent."""
     singles: dict[str, NamedNumber] = {}
     for name in names:
         for part in present_numbers(scene, find_number(scene, name, field), field):
@@ -383,12 +382,12 @@ def _changed(scene: Scene, run: MeasuredRun) -> Scene:
 
 
 def with_angle_errors(problem: Problem, runs: Sequence[bool]) -> Problem:
-    """Return the problem with the errors of the rotor's angle in the marked `runs` as further unknowns, which have
-    the standard normal distribution."""
+    """Return the problem with the errors of the rotor's angle in each run that is True in `runs` as further unknowns, which
+    have the standard normal distribution."""
     first, samples, left_out = problem.unknowns.count, list(problem.runs), list(problem.angle_errors)
     count = 0
-    for k, (of_run, rotors, is_marked) in enumerate(zip(problem.runs, problem.rotors, runs, strict=True)):
-        if is_marked:
+    for k, (of_run, rotors, is_included) in enumerate(zip(problem.runs, problem.rotors, runs, strict=True)):
+        if is_included:
             first_error, errors = first + count, max(rotor.error_count for rotor in rotors)
             drives = tuple(rotor.drive for rotor in rotors)
             samples[k] = dataclasses.replace(of_run, drives=drives, errors=(first_error, errors))
@@ -447,7 +446,7 @@ def _samples(
         actions=tuple(actions),
         turn=turn,
         segments=divide(_changed(scene, run), count, step, largest) if is_nonlinear(scene) else (0, 0, 0),
-        guide=jnp.zeros((state_count(scene, channels), len(channels))) if has_supports(scene) else None,
+        guide=jnp.zeros((state_count(scene, channels), len(channels))) if has_nonlinear_supports(scene) else None,
     )
     return samples, mask, raw, bounds, time, np.stack([angle.at(time) for angle in angles], axis=1)
 
@@ -478,7 +477,7 @@ def _on_grid(run: MeasuredRun, channels: Sequence[Channel], time: np.ndarray) ->
         used = np.isfinite(values) & (index >= earliest) & (index < count)
         raw[index[used], k], mask[index[used], k] = values[used], ~clipped[used]
         if not np.any(mask[:, k]):
-            problem = "has no reading that is not clipped while the motion is known; correct range or delay, or leave it out"
+            problem = "has no unclipped reading while the motion is known; correct its range or delay, or leave it out"
             raise InputError(f"{run.source}: channel {channel.name!r}", problem)
         bounded_by = index[used & clipped]
         bounds[bounded_by, k] = np.sign(raw[bounded_by, k] - np.median(values[used]))
@@ -488,8 +487,8 @@ def _on_grid(run: MeasuredRun, channels: Sequence[Channel], time: np.ndarray) ->
 def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: Sequence[np.ndarray] | None = None) -> Problem:
     """Return the problem with readings and models filtered such that the noise of the readings is white.
 
-    **Arguments**: `noise` of the channels of each run; `differences` (n, C) of each run: readings minus model at the last
-    values, from which the influence of outliers and of clipped readings follows; None in the first passes.
+    **Arguments**: `noise` of the channels of each run; `differences` (n, C) of each run: readings minus model at the values
+    of the previous fit, from which the influence of outliers and of clipped readings follows; None if there is none.
     """
     runs = []
     for r, (samples, mask, raw, of_channels) in enumerate(zip(problem.runs, problem.masks, problem.raw, noise, strict=True)):

@@ -153,6 +153,12 @@ def test_coverage_of_runs_in_words(frequency, until, words):
     assert (len(found) > 0) == (len(words) > 0) and all(word in found[0] for word in words)
 
 
+def test_a_mode_without_decay_asks_for_its_damping():
+    time = np.linspace(0.0, 10.0, 2001)
+    (found,) = coverage_notes(runs_of(time, np.linspace(10.0, 50.0, 2001)), np.array([30.0, 40.0]), np.array([0.1, 0.0]))
+    assert "a mode of the fitted machine does not decay" in found and found.endswith("check its damping")
+
+
 def outcome(monkeypatch, **changes):
     """Return the status of a fit of one run with two channels, from the results of its checks."""
     given = {

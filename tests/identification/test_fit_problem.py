@@ -226,7 +226,7 @@ def test_readings_of_the_motion_before_the_record_do_not_count():
     (mask,) = build_problem(scene_of(), [run], ["machine.stiffness"], {}).masks
     assert np.flatnonzero(~mask[:, 0]).tolist() == [*range(7)] and np.all(mask[:, 1])
     run = run_with({"a": np.sin(T), "b": np.sin(T)}, channels=[channel("a"), channel("b", delay=4.1)])
-    with pytest.raises(jv.InputError, match=r"channel 'b' has no reading that is not clipped while the motion is known"):
+    with pytest.raises(jv.InputError, match=r"channel 'b' has no unclipped reading while the motion is known"):
         build_problem(scene_of(), [run], ["machine.stiffness"], {})
 
 

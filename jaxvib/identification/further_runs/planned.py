@@ -16,7 +16,7 @@ from jaxvib.identification.directions import covariance_of, eliminate, in_polar_
 from jaxvib.identification.fit import Fitted, information_at, unknown_count
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.jammed.start import is_jammed, with_jam
-from jaxvib.identification.problem import MOTIONS, Problem, build_problem, has_supports, with_noise
+from jaxvib.identification.problem import MOTIONS, Problem, build_problem, has_nonlinear_supports, with_noise
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive
@@ -145,7 +145,7 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
                 f"candidates: {planned.name}: drive",
                 "has a speed at which the loads do not stay jammed below the rotor speed; give a faster drive",
             )
-    elif has_supports(scene):
+    elif has_nonlinear_supports(scene):
         problem = problem._replace(linear=linear)
     fitted = information_at(problem, linear)
     has_mark = any(channel.kind in ("pulses", "angle") for channel in planned.channels)

@@ -16,7 +16,7 @@ from jaxvib.identification.fit import differences_of, linear_at, minimize, polar
 from jaxvib.identification.further_runs.planned import own_precisions, problem_of_run, shared_indices
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.jammed.start import with_first_motion
-from jaxvib.identification.problem import EXACT, Known, Problem, has_supports, is_nonlinear, with_noise
+from jaxvib.identification.problem import EXACT, Known, Problem, has_nonlinear_supports, is_nonlinear, with_noise
 from jaxvib.identification.records.decimation import filter_readings
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.identification.supports.start import with_guided_motion
@@ -204,7 +204,7 @@ def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
     fixed, means, precisions = pairs if has_mark or len(sizes) > 1 else None, problem.means, problem.precisions
     if is_nonlinear(fit.scene):  # the first state has a nonlinear effect; the parameters are held by their priors
         held = problem._replace(means=x, precisions=np.full(x.size, _NUMBER_ERROR**-2))
-        problem = (with_guided_motion if has_supports(fit.scene) else with_first_motion)(held)[0]
+        problem = (with_guided_motion if has_nonlinear_supports(fit.scene) else with_first_motion)(held)[0]
 
     def with_filters(
         problem: Problem, noise: list[Noise], differences: list[np.ndarray] | None

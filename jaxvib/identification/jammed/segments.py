@@ -13,8 +13,9 @@ from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.integration.stiffness import equal_step_length, machine_decay
 
 _SEGMENT_ANGLE, _MAX_SEGMENTS = 25.0, 64
-"""Length of a segment of a nonlinear motion, rad of the slowest vibration, and largest number of segments. With the first
-values of the unknowns, the phase error within a segment must be less than a radian."""
+"""Length of a segment of a nonlinear motion, rad of the slowest vibration, and largest number of segments. All segments of a
+record are integrated at once, each from its own initial state (multiple shooting). With the first values of the unknowns, the
+phase error within a segment must be less than a radian."""
 
 _STEPS_PER_RADIAN = 1.0
 """Number of steps of order 8 per radian of the fastest motion, with errors of about 2e-7 in a turn."""

@@ -295,5 +295,5 @@ def test_scenes_with_supports_that_are_not_included_are_refused():
     refused(jv.Scene(scene.machine, balls, scene.exciter.drive, scene.effects), "effects.stop is a nonlinear support; identify")
     several = [scene.exciter, jv.Exciter(drive=jv.ConstantSpeed(50.0), unbalance=0.1)]
     refused(jv.Scene(scene.machine, exciters=several, effects=scene.effects), "only in scenes with one exciter without loads")
-    refused(scene, "effects.stop is a nonlinear support, whose force", channels=(jv.Channel("f", "force", direction="up"),))
-    refused(scene, "of a scene with linear supports and one exciter without loads can be unknown", names=["drive.inertia"])
+    refused(scene, "effects.stop is a nonlinear support, which the model", channels=(jv.Channel("f", "force", direction="up"),))
+    refused(scene, "the scene has one exciter, no loads and linear supports", names=["drive.inertia"])
