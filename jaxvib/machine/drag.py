@@ -50,12 +50,14 @@ def drag_of(
         "rolling":  F = m R Omega^2 f / r
         "bearing":  F = mu m R Omega^2 d / (2 R)
 
-    with the Reynolds number Re = 2 rho r v / eta. Only a slow ball in thick oil (Re < 1) has a drag 6 pi eta r that does not
-    depend on the speed. In all other cases the drag holds for the given speeds: compute it again for the load speed of a jam.
-    Rolling and bearing friction can also be simulated as they are, by `RollingFriction` and `DryFriction`.
+    with the Reynolds number Re = 2 rho r v / eta. Only a slow ball in thick oil (Re below 0.1) has a drag that hardly depends
+    on the speed: 6 pi eta r within about 3 %. In all other cases the drag holds for the given speeds: compute it again for the
+    load speed of a jam. Rolling and bearing friction can also be simulated as they are, by `RollingFriction` and
+    `DryFriction`.
 
-    The balls of a balancer need two values: whether they jam at a critical speed follows from the drag at `load_speed` =
-    critical speed and `rotor_speed` = working speed; the balanced motion and its stability from that at nearly equal speeds.
+    The balls of a balancer need two values of the drag. Compute the first with `load_speed` = critical speed and
+    `rotor_speed` = working speed; it decides whether the balls jam at the critical speed. Compute the second with two nearly
+    equal speeds; the balanced motion and its stability follow from it.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -80,8 +82,8 @@ def drag_of(
 
     Conditions that are not checked:
 
-    - oil: the oil turns with the rotor. The formula is that of a ball far from walls; a ball on its track, and more so in a
-      channel narrower than about five ball diameters, has a larger drag. Measure it
+    - oil: the oil turns with the rotor. The formula is that of a ball far from walls. A ball on its track has a larger
+      drag, especially in a channel narrower than about five ball diameters. Measure this drag
     - bearing: the values of mu for rolling bearings hold for open bearings with good lubrication, at about a tenth of their
       dynamic load rating. Seals add their own friction
 
@@ -138,6 +140,6 @@ def _oil_drag(speed: Array, r: Array, viscosity: Array, density: Array) -> Array
     limit = f"the formula holds up to {_MAX_REYNOLDS:g}; give a thicker oil or speeds that are closer together"
     problem = "gives a Reynolds number of {:.3g}; " + limit
     require_if_known(lambda number: number <= _MAX_REYNOLDS, reynolds, field="viscosity", problem=problem)
-    # C_D rho pi r^2 v / 2 with the factor Re of C_D taken out, because Re can be very small.
+    # C_D rho pi r^2 v / 2 = (pi/4) eta r (Re C_D). The product Re C_D needs no division by Re, which can be very small.
     inertial = 0.42 * reynolds / (1.0 + 42500.0 * reynolds**-1.16)
     return np.pi / 4.0 * viscosity * r * (24.0 * (1.0 + 0.15 * reynolds**0.687) + inertial)

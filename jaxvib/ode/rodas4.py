@@ -72,13 +72,15 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
     """Hairer and Wanner's RODAS: a Rosenbrock method of order 4 with 6 stages, an embedded method of order 3 for the error
     estimate, and an interpolant of order 3. The method is L-stable and stiffly accurate.
 
-        (1/(gamma h) - J) k_i = f(t + c_i h, y + sum_j a_ij k_j) + sum_j (c_ij / h) k_j + h d_i df/dt,   y_new = y + sum b_i k_i
+        (1/(gamma h) - J) k_i = f(t + s_i h, y + sum_j a_ij k_j) + sum_j (c_ij / h) k_j + h d_i df/dt,   y_new = y + sum b_i k_i
+
+    with nodes s_i and coefficients gamma, a_ij, b_i, c_ij and d_i.
 
     A step of any length costs one Jacobian J by forward mode, one inverse and 6 evaluations, without a Newton iteration. The
     state must be one vector, of at most a few dozen entries unless `linearize` is given.
 
-    **Attribute** `linearize`: function of the equations, t, y and their arguments for a Jacobian that is not a dense matrix. It
-    returns the function that maps a shift to the function r -> (shift - J)^-1 r, and df/dt. Default: dense matrices
+    **Attribute** `linearize`: function (terms, t, y, args), as those of `terms.vf`, for a Jacobian that is not a dense matrix.
+    It returns the function that maps a shift to the function r -> (shift - J)^-1 r, and df/dt. Default: dense matrices
 
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, section IV.7.
     """

@@ -48,9 +48,9 @@ class SearchResult(NamedTuple):
     """Results of searches.
 
     **Attributes**: those of `Polished`; `drawn`: number of random designs; `existing`: number of these for which the objective
-    exists; `interrupted`: True if the user interrupted the search; `bounds`: lower and upper bounds (d,) of the d free
-    parameters within which the best design was searched for, SI; `nodes`: number of bounded problems that branch and bound
-    solved.
+    exists (in a search from given designs, both are the number of given designs); `interrupted`: True if the user interrupted
+    the search; `bounds`: lower and upper bounds (d,) of the d free parameters within which the best design was searched for,
+    SI; `nodes`: number of bounded problems that branch and bound solved.
     """
 
     point: Point
@@ -138,7 +138,7 @@ def _find(problem: Problem, options: Options, report: Progress) -> SearchResult 
     **Returns** None if the objective does not exist for any design. An interrupt (KeyboardInterrupt) ends the search with its
     present result.
     """
-    report("drawing starts", 0.0)
+    report("selecting initial designs", 0.0)
     begin, history, interrupted = options.begin, [], False
     if begin is None and options.searcher == "cma":
         evolved = evolve(

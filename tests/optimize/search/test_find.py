@@ -96,7 +96,7 @@ def test_search_reports_progress_and_history():
     problem = problem_of(DesignSpace(SCENE, FREE), NEAR, [], 4)
     told = []
     found = find(problem, OPTIONS, lambda what, share: told.append((what, share)))
-    assert told[0] == ("drawing starts", 0.0)
+    assert told[0] == ("selecting initial designs", 0.0)
     shares = [share for _, share in told]
     assert shares == sorted(shares) and ("descending, best 2.063", 0.7) in told and told[-1] == ("polishing, best 2", 0.9)
     random = np.random.default_rng(0).uniform(size=(4, 2))
@@ -117,7 +117,7 @@ def test_costly_objectives_start_from_nominal_optima():
     told = []
     found = find(problem, OPTIONS, lambda what, share: told.append((what, share)))
     shares = [share for _, share in told]
-    assert shares == sorted(shares) and {"drawing starts"} == {what for what, share in told if share in (0.0, 0.5)}
+    assert shares == sorted(shares) and {"selecting initial designs"} == {what for what, share in told if share in (0.0, 0.5)}
     assert found.drawn == found.existing == 4 and len(found.point.z) == 16  # the best one, and random ones beside it
     random = np.random.default_rng(0).uniform(size=(16, 2))
     begun = evaluate(problem, np.concatenate([[[0.625, 0.5]], random])[:16], ())
