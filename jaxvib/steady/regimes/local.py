@@ -19,8 +19,12 @@ from jaxvib.equations.torque_balance import TorqueBalance, balance_residuals, in
 from jaxvib.numerics.linalg import eliminate, magnitude, small_solve, svd_in_turn
 
 _TRIALS, _NEWTON_STEPS, _POLISHING_STEPS = 120, 6, 8
-"""Number of steps of the search for a fold, number of Newton steps in each of them, and number of Newton steps that refine the
-fold."""
+"""Maximum number of steps of the search for a fold, number of Newton steps in each of them, and number of Newton steps that
+refine the fold."""
+
+_SHORTEST_STEP = 1e-9
+"""Relative step of the factor below which the search for a fold ends. The distance of the unknowns from the fold is about the
+square root of the step, close enough for Newton's method."""
 
 _LARGEST_FACTOR = 1e6
 """Largest finite margin; see `margin_of`."""
@@ -144,8 +148,7 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
         slopes = jax.jacfwd(balance_residuals)(x, frozen, factor)
         return x - jnp.clip(eliminate(slopes, balance_residuals(x, frozen, factor)), -0.5, 0.5), factor
 
-    def trial(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        x, factor, step = state
+    def trial(x: Array, factor: Array, step: Array) -> tuple[Array, Array, Array]:
         new_x, new_factor = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, (x, factor * (1.0 + step)))
         good = size(new_x, new_factor) < tolerance
         good = good & (jnp.max(jnp.abs(new_x - x)) < _LONGEST_STEP) & (factor < _LARGEST_FACTOR)
@@ -155,7 +158,12 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
             jnp.where(good, jnp.minimum(1.5 * step, 1.0), 0.4 * step),
         )
 
-    at, factor, _ = jax.lax.fori_loop(0, _TRIALS, trial, (start, one, 0.1 * one))
+    def continues(state: tuple[Array, Array, Array, Array]) -> Array:
+        k, _, factor, step = state
+        return (k < _TRIALS) & (factor < _LARGEST_FACTOR) & (step > _SHORTEST_STEP)
+
+    begin = jnp.asarray(0), start, one, 0.1 * one
+    _, at, factor, _ = jax.lax.while_loop(continues, lambda state: (state[0] + 1, *trial(*state[1:])), begin)
     fold, fold_factor, slopes = _fold_near(frozen, at, factor)
     polished = (jnp.abs(fold_factor - factor) < 1e-2 * factor) & (jnp.max(jnp.abs(fold - at)) < _LONGEST_STEP)
     at, factor = jnp.where(polished, fold, at), jnp.where(polished, fold_factor, factor)

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.torque_balance import TorqueBalance, balance_residuals, influence_of, motion_of, unknowns_of
 from jaxvib.numerics.linalg import eliminate
 from jaxvib.runtime.devices import on_device
@@ -68,7 +67,7 @@ def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
         omega, phases, neutral = (np.concatenate(pair) for pair in zip(known, solved, strict=True))
         before = known[0].size
         kept = _one_of_each_family(omega, neutral, tolerance[0])
-        kept = kept[distinct_regimes(omega[kept], phases[kept], exchanges, tolerance)]
+        kept = kept[distinct_regimes(omega[kept], phases[kept], exchanges, tolerance, np.count_nonzero(kept < before))]
         known = omega[kept], phases[kept], neutral[kept]
         grown = kept[kept >= before]
         if grown.size == 0 or count == 1 or count > MAX_COMPLETE:
@@ -98,14 +97,9 @@ def tolerances(dtype: np.dtype) -> tuple[float, float]:
 def exchanges_in(balance: TorqueBalance) -> list[Exchange]:
     """Return the exchanges of masses that leave the torque balance unchanged, see `exchanges_of`."""
     speeds = float(balance.speed) * np.array([0.31, 0.57, 0.83, 0.99])
-    influence, torque = _data_at(balance, speeds.astype(balance.unbalance.dtype))
+    influence, torque = map(np.asarray, _at_speeds(balance, on_device(speeds.astype(balance.unbalance.dtype))))
     numbers = [balance.unbalance, balance.averaged.inertia, balance.is_prescribed, *torque]
     return exchanges_of(influence, np.stack([np.nan_to_num(np.asarray(x, float)) for x in numbers], axis=1))
-
-
-def _data_at(balance: TorqueBalance, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    influence, torque = _at_speeds(balance, on_device(speeds))
-    return np.asarray(influence), np.asarray(torque)
 
 
 @cached
@@ -114,19 +108,38 @@ def _at_speeds(balance: TorqueBalance, speeds: Array) -> tuple[Array, Array]:
     return jax.vmap(lambda w: (influence_of(balance, w), balance.driving_torque(w)))(speeds)
 
 
+@cached
+def _total_torques(phases: Array, balance: TorqueBalance, speeds: Array) -> Array:
+    """Return the sum of all torques, (sets, n) N m, for sets of phases (sets, count) at speeds (n,)."""
+    influence, torque = _at_speeds(balance, speeds)
+    unbalances = balance.unbalance[None, :] * jnp.exp(1j * phases)
+    products = unbalances.conj()[:, :, None] * unbalances[:, None, :]
+    braking = jnp.einsum("aik,gik->ag", products, influence, precision="highest").imag
+    return jnp.sum(torque, axis=1)[None, :] + braking * (speeds**4 / 2.0)[None, :]
+
+
+@cached
+def _resonances(balance: TorqueBalance) -> Array:
+    """Return the natural frequencies (nd,), rad/s."""
+    return balance.model.modes()[0]
+
+
 def _speeds(balance: TorqueBalance) -> np.ndarray:
     """Return speeds up to the largest working speed, dense near resonances and near the working speeds of the drives.
 
-    No regime is faster, because above these speeds the sum of the driving torques is negative, and the vibration brakes.
+    No regime is faster, because above these speeds the sum of the driving torques is negative, and the vibration brakes. The
+    largest speed is repeated in place of higher and equal speeds: otherwise most changes of a parameter would change the number
+    of speeds, and with it the compiled program.
     """
     drives = np.array([float(drive.speed) for drive in balance.averaged.drives])
     top = drives.max()
-    resonances = np.asarray(estimated_frequencies(balance.model.scene), float)
+    resonances = np.asarray(_resonances(balance), float)
     centres = np.concatenate([drives, resonances[(resonances > 0.0) & (resonances < 1.2 * top)]])
     distance = np.concatenate([[0.0], np.geomspace(1e-7, 0.3, _NEAR_SPEEDS)])
     near = [w * (1.0 + side * distance) for w in centres for side in (-1.0, 1.0)]
-    speeds = np.unique(np.concatenate([np.linspace(0.005, 1.01, _EVEN_SPEEDS) * top, *near]))
-    return speeds[speeds < 1.02 * top].astype(balance.unbalance.dtype)
+    all_speeds = np.concatenate([np.linspace(0.005, 1.01, _EVEN_SPEEDS) * top, *near])
+    speeds = np.unique(all_speeds[all_speeds < 1.02 * top])
+    return np.pad(speeds, (0, all_speeds.size - speeds.size), constant_values=1.02 * top).astype(balance.unbalance.dtype)
 
 
 def sets_of_phases(prescribed: np.ndarray, dtype: np.dtype, per_unknown: int = _PHASES_PER_UNKNOWN) -> np.ndarray:
@@ -160,12 +173,7 @@ def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tup
     """
     if balance.is_prescribed.any():
         return np.full(len(sets), np.asarray(balance.speed)), sets
-    influence, torque = _data_at(balance, speeds)
-    unbalances = np.asarray(balance.unbalance) * np.exp(1j * sets)
-    parts = np.array_split(unbalances, -(-len(unbalances) // _SETS_AT_ONCE))
-    each = [np.einsum("ai,gik,ak->ag", part.conj(), influence, part, optimize=True).imag for part in parts]
-    braking = np.concatenate(each) * speeds**4 / 2.0
-    total = np.sum(torque, axis=1) + braking
+    total = in_chunks(_SETS_AT_ONCE, _total_torques, sets, shared=(balance, on_device(speeds)))
     place, passed = np.nonzero(total[:, :-1] * total[:, 1:] <= 0.0)
     low, high = total[place, passed], total[place, passed + 1]
     share = low / np.where(low == high, 1.0, low - high)

@@ -88,17 +88,22 @@ def _shifts(influence: np.ndarray, exchanged: np.ndarray, small: np.ndarray) -> 
 
 
 def distinct_regimes(
-    speed: np.ndarray, phases: np.ndarray, exchanges: list[Exchange], tolerance: tuple[float, float]
+    speed: np.ndarray, phases: np.ndarray, exchanges: list[Exchange], tolerance: tuple[float, float], known: int = 0
 ) -> np.ndarray:
-    """Return indices of regimes (n,) of which no two differ only by a common shift of phases, an exchange, or rounding.
+    """Return indices of regimes (n,), in the order of decreasing speed, of which no two differ only by a common shift of
+    phases, an exchange, or rounding.
 
-    **Arguments**: `speed` (n,), `phases` (n, count); `tolerance` of speeds, relative, and of exp(i alpha).
+    **Arguments**: `speed` (n,), `phases` (n, count); `tolerance` of speeds, relative, and of exp(i alpha); `known`: number of
+    the first regimes that are already distinct, and are kept.
     """
     phasors = np.exp(1j * phases)
     permutations, shifts = (np.array(parts) for parts in zip(*exchanges, strict=True))
     inverses = np.argsort(permutations)
-    distinct: list[int] = []
-    for k in np.argsort(-speed, kind="stable"):
+    distinct = list(range(known))
+    order = np.concatenate([np.arange(known), known + np.argsort(-speed[known:], kind="stable")])
+    for k in order[_without_copies(speed[order], phasors[order], tolerance)]:
+        if k < known:
+            continue
         # All exchanged forms of this regime, (exchanges, count).
         forms = np.take_along_axis(phasors[k] * np.exp(1j * shifts), inverses, axis=1)
         near = [i for i in distinct if abs(speed[i] - speed[k]) <= tolerance[0] * speed[i]]
@@ -107,4 +112,15 @@ def distinct_regimes(
         common = common / np.where(np.abs(common) > 0.0, np.abs(common), 1.0)
         if not np.any(np.max(np.abs(others[:, None] - common * forms[None]), axis=-1) < tolerance[1]):
             distinct.append(int(k))
-    return np.asarray(distinct, dtype=int)
+    return np.asarray(sorted(distinct, key=lambda k: -speed[k]), dtype=int)
+
+
+def _without_copies(speed: np.ndarray, phasors: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
+    """Return the ascending indices of regimes without those that agree with an earlier one in rounded speed and phasors.
+
+    Most regimes are found from many starts. The search for exchanges is slow, and this comparison leaves few of them to it.
+    """
+    relative = phasors * phasors[:, :1].conj() / (0.5 * tolerance[1])
+    level = np.log(np.maximum(speed, np.finfo(speed.dtype).tiny)) / tolerance[0]
+    cells = np.round(np.concatenate([level[:, None], relative.real, relative.imag], axis=1))
+    return np.sort(np.unique(cells, axis=0, return_index=True)[1])

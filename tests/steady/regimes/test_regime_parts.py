@@ -251,7 +251,7 @@ def test_sets_of_phases_are_regular_even_and_random():
 
 def test_speeds_are_dense_near_resonances_and_drives():
     speeds = search._speeds(assemble_torque_balance(THREE))
-    assert np.all(np.diff(speeds) > 0.0) and 0.0 < speeds[0] < 0.6 and 101.0 * 1.01 <= speeds[-1] < 1.02 * 101.0
+    assert np.all(np.diff(speeds) >= 0.0) and 0.0 < speeds[0] < 0.6 and speeds[-1] == 1.02 * 101.0
     for w in (*np.asarray(jv.natural_frequencies(THREE)), *SPEEDS):
         near = np.sort(np.abs(speeds / w - 1.0))
         assert near[0] < 1e-12 and near[1] == pytest.approx(1e-7, rel=1e-6) and np.sum(near < 1e-3) > 40
