@@ -25,8 +25,11 @@ def mass_names(scene: Scene) -> tuple[str, ...]:
 def axis_labels(scene: Scene) -> dict[str, tuple[str, ...]]:
     """Return the labels of results of a scene, or of a batch of scenes, by the name of the axis, see
     `jaxvib.results.fields.labels_of`."""
-    if batch := np.ndim(scene.exciters[0].drive.speed):  # the scenes of a batch have the same names
-        scene = jax.tree.map(lambda leaf: leaf[(0,) * batch], scene)
+    if np.ndim(scene.exciters[0].drive.speed):
+        # The scenes of a batch have the same names. One of them is traced, so that no array is computed.
+        found: list[dict[str, tuple[str, ...]]] = []
+        jax.eval_shape(lambda scenes: jax.vmap(lambda scene: found.append(axis_labels(scene)))(scenes), scene)
+        return found[0]
     structure, masses = scene.machine.structure(), mass_names(scene)
     # A single direction needs no name.
     directions = structure.foundation_directions if len(structure.foundation_directions) > 1 else ()
