@@ -205,7 +205,7 @@ class Carrier(Readable):
         return self.coordinate_units or ("m",) * len(self.coordinates)
 
     def as_lengths(self, values: Array) -> Array:
-        """Return values (..., nd) of the coordinates as lengths, m, so that translations and rotations can be compared.
+        """Return `values` (..., nd) of the coordinates as lengths, m, so that translations and rotations can be compared.
 
         A rotation is multiplied by the length at which its energy is that of a translation, the square root of the mean moment
         of inertia divided by the mean mass (of the diagonal of M). The values are returned unchanged if all coordinates have
