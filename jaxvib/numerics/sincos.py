@@ -95,13 +95,14 @@ def _sine(x: Array, ahead: float) -> Array:
     # The largest term is added last, which keeps the roundings of the others as small as in Horner's form.
     total = constant + z * _summed(z, others)
     # The sine changes its sign if the number `whole` of half turns is odd. The sum of `whole` and a large constant has no
-    # fractional part, and its last bit is 1 if `whole` is odd. This bit is shifted to the position of the sign, because
-    # operations on bits take almost no time.
+    # fractional part, and its last bit is 1 if `whole` is odd. This bit is shifted to the position of the sign of 1, because
+    # operations on bits take almost no time. The sine itself is not an operand of such an operation: JAX drops the rule of
+    # `custom_jvp` in reverse derivatives of loops, so that second derivatives are those of the operations below.
     bits = np.dtype(f"uint{8 * dtype.itemsize}")
     beside = whole + 1.5 * 2.0 ** np.finfo(dtype).nmant
     sign = jax.lax.bitcast_convert_type(beside, bits) << bits.type(8 * dtype.itemsize - 1)
-    sine = r + (r * z) * total
-    return jax.lax.bitcast_convert_type(jax.lax.bitcast_convert_type(sine, bits) ^ sign, dtype)
+    one = jax.lax.bitcast_convert_type(sign | np.ones((), dtype).view(bits), dtype)
+    return (r + (r * z) * total) * one
 
 
 @jax.custom_jvp

@@ -29,3 +29,15 @@ def test_sines_at_whole_quarters_and_beyond_numbers():
     s, c = sine_and_cosine(jnp.asarray([0.0, np.pi / 2, -np.pi, jnp.inf, jnp.nan]))
     np.testing.assert_array_equal([s[0], c[0], s[1], c[2]], [0.0, 1.0, 1.0, -1.0])
     assert np.all(np.isnan([*s[3:], *c[3:]]))
+
+
+def test_second_derivatives_hold_within_loops():
+    """In reverse derivatives of loops JAX differentiates the operations of a `custom_jvp` in place of its rule."""
+
+    def repeated(x):
+        return jax.lax.fori_loop(0, 3, lambda j, x: x + sine_and_cosine(x)[0] * sine_and_cosine(2.0 * x)[1], x)
+
+    for x in (0.4, 2.5, -9.0):
+        second = jax.jacfwd(jax.grad(repeated))(x)
+        expected = jax.jacfwd(jax.jacfwd(repeated))(x)
+        np.testing.assert_allclose(second, expected, rtol=1e-12)
