@@ -274,9 +274,9 @@ def state_signals(scene: Scene, state: State) -> list[Signal]:
 
 
 def has_events(scene: Scene) -> bool:
-    """Return True if the equations are piecewise smooth: non-smooth forces, or a drive whose acceleration jumps."""
-    smooth = all(term.is_smooth for effect in scene.all_effects for term in effect.terms())
-    return not smooth or any(exciter.drive.jump_ts() for exciter in scene.exciters)
+    """Return True if the equations are piecewise smooth: forces or torques that are not smooth, or a drive whose acceleration
+    jumps."""
+    return bool(scene.not_smooth) or any(exciter.drive.jump_ts() for exciter in scene.exciters)
 
 
 def named_entries(scene: Scene) -> list[NamedNumber]:

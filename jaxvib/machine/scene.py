@@ -296,6 +296,12 @@ class Scene(Part):
         return len(self.exciters) == 1 and self.exciters[0].is_plain
 
     @property
+    def not_smooth(self) -> tuple[Effect | Drive, ...]:
+        """Effects and drives whose forces or torques do not have all derivatives, except at the times `Drive.jump_ts`."""
+        effects = [effect for effect in self.all_effects if not all(term.is_smooth for term in effect.terms())]
+        return (*effects, *(exciter.drive for exciter in self.exciters if not exciter.drive.is_smooth))
+
+    @property
     def has_loads(self) -> bool:
         """True if an exciter has loads."""
         return any(exciter.loads is not None for exciter in self.exciters)

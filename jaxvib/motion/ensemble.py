@@ -34,6 +34,7 @@ from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, na
 from jaxvib.motion.batch import advance, batch_size, divide_run, pack_batch
 from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.integration.stiffness import is_unresolved
+from jaxvib.motion.integration.system import with_first_derivatives
 from jaxvib.motion.plan import ENSEMBLE_PARTS, EqualSteps, plan_ensemble
 from jaxvib.ode.replay import forward_only
 from jaxvib.ode.types import Y
@@ -348,6 +349,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     state from that with the last count, True if the motion stayed finite, True for loads that lost contact with their track,
     and the number of steps.
     """
+    scene, (state, end) = with_first_derivatives(scene, (state, end))
     has_one_sided_loads = any(exciter.loads is not None and exciter.loads.one_sided for exciter in scene.exciters)
     field, start = field_of(equations, scene), state
     if has_one_sided_loads:

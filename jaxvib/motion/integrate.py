@@ -27,7 +27,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory, unmeasured
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.integration.contacts import Contacts, ContactSolver
-from jaxvib.motion.integration.system import PackedSystem
+from jaxvib.motion.integration.system import PackedSystem, with_first_derivatives
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.numerics.linalg import eigenvalues_in_turn
 from jaxvib.ode.control import PIController
@@ -189,6 +189,7 @@ def integrate(
 
     **Arguments**: `is_measured`: False to skip the measurement; None to measure always, without a branch in the program.
     """
+    scene, (end, state) = with_first_derivatives(scene, (end, state))
     # An initial state that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)

@@ -100,7 +100,8 @@ def simulate(
     **Returns** `Run`, with its estimated `error` and its cost.
 
     - Forward and reverse derivatives, `jit` and `vmap` are supported. First derivatives contain the shift of the time at which
-      a contact with a `Stop` or a `LoadContact` that has damping begins, and its force jumps; second derivatives do not
+      a contact with a `Stop` or a `LoadContact` that has damping begins, and its force jumps. Second derivatives
+      (`jax.hessian`) exist for scenes whose forces and torques are smooth
     - In single precision, the default methods of order 8 keep angles within one turn during the integration, and angles of the
       window are relative to the number of turns at its beginning. Runs of one exciter of more than 20,000 turns at constant
       speed that keep only a window are divided into segments. Long runs therefore keep their phase

@@ -162,6 +162,29 @@ def forward_only(outputs: T, field: str, problem: str) -> T:
     return eqx.combine(jax.tree.unflatten(structure, unchanged(leaves)), others)
 
 
+def differentiable_once(inputs: T, field: str, problem: str) -> T:
+    """Return the inputs of a computation; derivatives of its first derivatives with respect to them raise `InputError`."""
+    numbers, others = eqx.partition(inputs, eqx.is_inexact_array)
+
+    @jax.custom_jvp
+    def constant(leaves: list[Array]) -> list[Array]:
+        return leaves
+
+    @functools.partial(constant.defjvp, symbolic_zeros=True)
+    def _(primals: Any, tangents: Any) -> tuple[list[Array], list[Any]]:
+        if all(isinstance(slope, SymbolicZero) for slope in tangents[0]):
+            return primals[0], tangents[0]
+        raise InputError(field, problem)
+
+    @jax.custom_jvp
+    def unchanged(leaves: list[Array]) -> list[Array]:
+        return leaves
+
+    unchanged.defjvp(lambda primals, slopes: (constant(primals[0]), slopes[0]))
+    leaves, structure = jax.tree.flatten(numbers)
+    return eqx.combine(jax.tree.unflatten(structure, unchanged(leaves)), others)
+
+
 def _refuse_reverse(*_: object, field: str, problem: str) -> NoReturn:
     raise InputError(field, problem)
 

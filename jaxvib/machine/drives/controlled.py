@@ -67,6 +67,11 @@ class TorqueTable(Motor):
         return jnp.max(jnp.where(is_zero, self.speeds[:-1] + jnp.diff(self.speeds) * share, 0.0))
 
     @property
+    def is_smooth(self) -> bool:
+        """False: the slope of the torque jumps at each point."""
+        return False
+
+    @property
     def dips(self) -> int:
         """Largest possible number of dips (local minima) of the torque: each needs two points between the first and the last
         point."""
@@ -305,6 +310,11 @@ class SpeedControl(Motor):
     def largest_speed(self) -> Array:
         """Largest speed of the reference, rad/s."""
         return self.reference.largest_speed
+
+    @property
+    def is_smooth(self) -> bool:
+        """False: the slope of the torque jumps at its limit."""
+        return False
 
     def _torques(self, t: Array, speed: Array, integral: Array) -> tuple[Array, Array, Array]:
         """Return the error of the speed, the torque without a limit, and the torque."""

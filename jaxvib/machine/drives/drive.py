@@ -49,6 +49,11 @@ class Drive(Part):
         """Largest speed of the rotor during a run, rad/s, without vibrations of the speed; `speed` by default."""
         return self.speed
 
+    @property
+    def is_smooth(self) -> bool:
+        """True if the torque of a motor has all derivatives, except at the times `jump_ts`."""
+        return True
+
     @abc.abstractmethod
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
         """Return the rotor speed, rad/s.
@@ -514,6 +519,11 @@ class MotorWrapper(Motor):
     def largest_speed(self) -> Array:
         """Largest speed of the motor."""
         return self.motor.largest_speed
+
+    @property
+    def is_smooth(self) -> bool:
+        """True if the motor's torque has all derivatives."""
+        return self.motor.is_smooth
 
     @property
     def inertia(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]

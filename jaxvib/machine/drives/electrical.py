@@ -113,6 +113,11 @@ class NamePlateMotor(Motor):
         return self.frequency / (jnp.ceil(self.frequency / self.rated_speed * (1.0 - 1e-6)) - 1.0)
 
     @property
+    def is_smooth(self) -> bool:
+        """True without a starting torque, which makes the second derivative of the torque jump at the breakdown slip."""
+        return self.starting_ratio is None
+
+    @property
     def breakdown_torque(self) -> Array:
         """Largest torque T_b, N m."""
         return self.breakdown_ratio * self.power / self.rated_speed

@@ -49,8 +49,7 @@ class LoadContact(Effect):
     - `stiffness` k, N/m, positive; typical: 4e4 to 1e6, softer than steel so that a contact lasts 1 to 10 ms. Choose
       k = mu (pi/t)^2 for a contact that lasts t, such as a tenth of a turn of the rotor: 8e4 for balls of 44 g at 3000 rpm.
       Loads that collide with the speed v overlap by v sqrt(mu/k). Ten times the stiffness needs about three times the steps
-    - `damping` c, N s/m, at least 0 (the default); typical: 2 to 200. With damping or a restitution, second derivatives of runs
-      are wrong after a collision, see `simulate`
+    - `damping` c, N s/m, at least 0 (the default); typical: 2 to 200
     - `restitution` e in place of the damping, above 0, up to 1; typical: 0.3 to 0.9
 
     **Raises** `InputError` for values that are not allowed, and for both damping and restitution. A scene raises it for loads

@@ -119,8 +119,7 @@ class Stop(_Support):
     - `stiffness` k, N/m, at least 0; typical: 1e5 to 1e7, that is 10 to 100 times that of the support. A stiffer stop needs
       shorter steps
     - `gap`, m, at least 0; typical: 0.001 to 0.02
-    - `damping` c, N s/m, at least 0 (the default); typical: 0 to 5000. With damping, second derivatives of runs are wrong after
-      a contact, see `simulate`
+    - `damping` c, N s/m, at least 0 (the default); typical: 0 to 5000
     - `side` of the platform: "above", "below" or "both" (the default); around a rotor's axis only "both"
     - `platform` or `position`: as for `CubicSupport`; typical: platform 1
 

@@ -131,10 +131,10 @@ def estimated_error(
 
         difference * share + 2 eps (steps + radians)
 
-    If an effect is not smooth, or if the acceleration of a drive jumps within a step, the share is 2: the error then depends on
-    the positions of the steps relative to the kinks and jumps, and both runs may have the same error. Rounding adds 2 eps for
-    each step and for each radian of the fastest motion, whose phase depends on rounded times. `ensemble` omits this term,
-    because equal steps cause much smaller rounding errors.
+    If an effect or a drive is not smooth, or if the acceleration of a drive jumps within a step, the share is 2: the error then
+    depends on the positions of the steps relative to the kinks and jumps, and both runs may have the same error. Rounding adds
+    2 eps for each step and for each radian of the fastest motion, whose phase depends on rounded times. `ensemble` omits this
+    term, because equal steps cause much smaller rounding errors.
 
     **Arguments**: `difference`: see `scaled_error`; `share`: error of a smooth motion, relative to the difference; `steps`:
     number of steps of the run; `radians`: phase of the fastest motion over the run, rad; `ends_at_jumps`: True if steps end at
@@ -142,8 +142,7 @@ def estimated_error(
 
     **Returns** a scalar, or an array with one value for each run.
     """
-    is_smooth = all(term.is_smooth for effect in scene.all_effects for term in effect.terms())
-    is_smooth = is_smooth and (ends_at_jumps or not any(exciter.drive.jump_ts() for exciter in scene.exciters))
+    is_smooth = not scene.not_smooth and (ends_at_jumps or not any(exciter.drive.jump_ts() for exciter in scene.exciters))
     factor = share if is_smooth else 2.0
     return difference * factor + 2.0 * float(np.finfo(scene.top_speed.dtype).eps) * (steps + radians)
 

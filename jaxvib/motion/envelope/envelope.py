@@ -40,6 +40,7 @@ from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.analysis.separation import MIN_SEPARATION_GROWTH, nearly_coincident_pairs
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite, with_jump_times
+from jaxvib.motion.integration.system import with_first_derivatives
 from jaxvib.motion.plan import Tolerance, require, require_error_estimate
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.motion.start import Start, initial_state, must_compile_jams, start_state, with_spin_up_drive
@@ -268,6 +269,7 @@ def _run(
     window_periods: int,
     max_steps: int,
 ) -> Envelope:
+    scene, (end, state) = with_first_derivatives(scene, (end, state))
     begin = _at_rest(scene) if state is None else amplitudes_of(scene, state)
     # An initial state that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
     exists = is_finite(begin)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -15,13 +15,17 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.equations.state import State
+from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fence import entries, hidden_one
 from jaxvib.ode.dopri8 import UnrolledDopri8, ravel
 from jaxvib.ode.dopri8_loop import LoopDopri8
+from jaxvib.ode.replay import differentiable_once
 from jaxvib.ode.scalar_programs import fenced, with_reciprocals
 from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, scalarized_program, scalars_of
 from jaxvib.ode.types import Args, RealScalarLike
 from jaxvib.runtime.compat import ClosedJaxpr, jaxpr_as_fun
+
+T = TypeVar("T")
 
 IntegratorState: TypeAlias = PyTree[Array]
 """State of the integrator: the entries of a `State`; if angles are wrapped, a pair of the entries and the numbers of whole
@@ -217,3 +221,16 @@ def _add_turns(y: IntegratorState, turns: IntegratorState, sign: float) -> Integ
 
 def _rates_of(t: Array, y: State, field: Callable[[Array, State], State]) -> State:
     return field(t, y)
+
+
+def with_first_derivatives(scene: Scene, inputs: T) -> tuple[Scene, T]:
+    """Return a scene and the other inputs of a run; second derivatives with respect to them raise `InputError` if the scene has
+    forces or torques that are not smooth.
+
+    The derivatives of a step in which a force has a kink can be differentiated, but the result lacks the shift of the kink.
+    """
+    if not scene.not_smooth:
+        return scene, inputs
+    parts = ", ".join(dict.fromkeys(type(part).__name__ for part in scene.not_smooth))
+    problem = f"has no second derivatives of runs, because {parts} is not smooth; use central differences of first derivatives"
+    return differentiable_once((scene, inputs), "scene", problem)
