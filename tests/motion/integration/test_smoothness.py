@@ -45,7 +45,7 @@ NOT_SMOOTH = {
 
 @pytest.mark.parametrize("name", NOT_SMOOTH)
 def test_second_derivatives_are_refused_with_kinks(name):
-    """With the undamped stop the derivative of the gradient was -6.6e-7 in place of 1.4e-3."""
+    """Check that wrong values are refused: with the undamped stop the derivative was -6.6e-7 in place of 1.4e-3."""
     parts = NOT_SMOOTH[name]
     with pytest.raises(jv.InputError, match=f"because {name.split()[0]} is not smooth; use central differences"):
         jax.hessian(lambda k: displacement(k, *parts.get("effects", ()), drive=parts.get("drive")))(4e4)
@@ -69,7 +69,7 @@ def test_derivatives_of_other_terms_of_a_gradient_are_allowed():
     assert jax.jacfwd(slope)(3.0) == 6.0
 
 
-def test_second_derivatives_of_smooth_scenes_are_those_of_differences():
+def test_second_derivatives_of_smooth_scenes_are_exact():
     slope = jax.jit(jax.grad(lambda z: displacement(4e4 * (1.0 + z), jv.CubicSupport(1e9))))
     expected = (slope(1e-5) - slope(-1e-5)) / 2e-5  # differs by 1e-7; rounding contributes less
     np.testing.assert_allclose(jax.jacfwd(slope)(0.0), expected, rtol=1e-6)
