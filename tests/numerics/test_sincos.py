@@ -32,7 +32,7 @@ def test_sines_at_whole_quarters_and_beyond_numbers():
 
 
 def test_second_derivatives_hold_within_loops():
-    """Compare with forward mode: in reverse derivatives of loops JAX differentiates the operations of a `custom_jvp` in place of its rule."""
+    """Compare with forward mode; reverse derivatives of loops do not use the rule of a `custom_jvp`."""
 
     def repeated(x):
         return jax.lax.fori_loop(0, 3, lambda j, x: x + sine_and_cosine(x)[0] * sine_and_cosine(2.0 * x)[1], x)
