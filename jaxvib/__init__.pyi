@@ -28,10 +28,9 @@ from jaxvib.machine.torus import torus_balls as torus_balls
 # Drives
 from jaxvib.machine.drives.drive import Drive as Drive, IdealDrive as IdealDrive, Motor as Motor, ConstantSpeed as ConstantSpeed
 from jaxvib.machine.drives.drive import SpinUp as SpinUp, RunUp as RunUp, DCMotor as DCMotor, InductionMotor as InductionMotor
-from jaxvib.machine.drives.drive import SwitchedOff as SwitchedOff
 from jaxvib.machine.drives.belt import BeltDrive as BeltDrive
 from jaxvib.machine.drives.controlled import Converter as Converter, SpeedControl as SpeedControl, SpeedProfile as SpeedProfile
-from jaxvib.machine.drives.controlled import TorqueTable as TorqueTable
+from jaxvib.machine.drives.controlled import SwitchedOff as SwitchedOff, TorqueTable as TorqueTable
 from jaxvib.machine.drives.electrical import DCMotorElectrical as DCMotorElectrical
 from jaxvib.machine.drives.electrical import InductionMotorCircuit as InductionMotorCircuit
 from jaxvib.machine.drives.electrical import InductionMotorElectrical as InductionMotorElectrical

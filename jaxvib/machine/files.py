@@ -18,8 +18,8 @@ from jaxvib.errors import CONTROL, InputError, quoted, read_text, within, writte
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drag import drag_of
 from jaxvib.machine.drives.belt import BeltDrive
-from jaxvib.machine.drives.controlled import Converter, SpeedControl, SpeedProfile, TorqueTable
-from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor, Drive, InductionMotor, RunUp, SpinUp, SwitchedOff
+from jaxvib.machine.drives.controlled import Converter, SpeedControl, SpeedProfile, SwitchedOff, TorqueTable
+from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor, Drive, InductionMotor, RunUp, SpinUp
 from jaxvib.machine.drives.electrical import DCMotorElectrical, InductionMotorCircuit, InductionMotorElectrical, NamePlateMotor
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS

@@ -6,7 +6,8 @@ import equinox as eqx
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.drives.drive import INERTIA, Drive, Motor, MotorWrapper, SwitchedOff
+from jaxvib.machine.drives.controlled import SwitchedOff
+from jaxvib.machine.drives.drive import INERTIA, Drive, Motor, MotorWrapper
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number
 
@@ -550,57 +549,3 @@ class MotorWrapper(Motor):
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the times of the motor's jumps."""
         return self.motor.jump_ts()
-
-
-class SwitchedOff(MotorWrapper):
-    """Motor that is switched off at a time and then turns with the friction of its bearings only.
-
-        T = torque of the motor  (t < at),    T = -bearing theta'  (t >= at)
-
-    `simulate` ends a step at that time. In analyses of steady motions the motor is off: `torque` is the friction. States of the
-    motor, such as currents, have no effect and no meaning after that time.
-
-    **Arguments** (SI, or strings with a unit)
-
-    - `motor` before that time, such as an `InductionMotor`
-    - `at`: time at which it is switched off, s, at least 0 (the default: off from the start); typical: 0 to 60
-    - `bearing` b, N m s: viscous friction of bearings and belts, at least 0; typical: 0.001 to 0.1
-
-    **Raises** `InputError` for a wrong unit, a negative value, and a motor of the wrong type.
-
-    >>> import jaxvib as jv
-    >>> motor = jv.DCMotor("3000 rpm", stall_torque=2.0, inertia=0.01)
-    >>> off = jv.SwitchedOff(motor, at="10 s", bearing=0.01)
-    >>> [round(float(off.torque_at(t, 50.0)), 3) for t in (9.0, 11.0)]
-    [1.682, -0.5]
-    """
-
-    motor: Motor
-    at: Array = eqx.field(metadata=unit("s", low=0.0, words="time at which the motor is switched off"))
-    bearing: Array = eqx.field(metadata=unit("N m s", low=0.0, words="friction of the bearings"))
-    kind: str = eqx.field(static=True)
-
-    def __init__(self, motor: Motor, at: Number = 0.0, bearing: Number = 0.0):
-        if not isinstance(motor, Motor) or isinstance(motor, SwitchedOff):
-            raise InputError(
-                "drive.motor",
-                f"is {quoted(motor)}; it must be a motor that is not switched off already, for example InductionMotor(...)",
-            )
-        self.motor, self.kind = motor, "switched_off"
-        self.at, self.bearing = read_numbers(SwitchedOff, "drive", at=at, bearing=bearing).values()
-
-    def torque(self, speed: Array) -> Array:
-        """Return the friction of the bearings."""
-        return -self.bearing * speed
-
-    def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
-        """Return the torque of the motor at `speed` before the time `at`, afterwards the friction of the bearings."""
-        return jnp.where(t < self.at, self.motor.torque_at(t, speed, states), self.torque(speed))
-
-    def jump_ts(self) -> tuple[Array, ...]:
-        """Return the time at which the motor is switched off, and the times of the motor's jumps."""
-        return (self.at, *self.motor.jump_ts())
-
-    def settled(self) -> Drive:
-        """Return the motor, switched off from the start."""
-        return eqx.tree_at(lambda drive: drive.at, self, jnp.zeros_like(self.at))

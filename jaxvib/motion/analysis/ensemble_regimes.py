@@ -16,7 +16,7 @@ from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.drives.drive import SwitchedOff
+from jaxvib.machine.drives.controlled import SwitchedOff
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.scene_field import mass_names
 from jaxvib.motion.analysis.measure import turning_angles, turning_directions

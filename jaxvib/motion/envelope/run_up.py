@@ -14,7 +14,8 @@ from jaxvib.display import Drawn, Onto, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.equations.model import assemble
 from jaxvib.errors import InputError
-from jaxvib.machine.drives.drive import Motor, MotorWrapper, SwitchedOff
+from jaxvib.machine.drives.controlled import SwitchedOff
+from jaxvib.machine.drives.drive import Motor, MotorWrapper
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE

@@ -20,7 +20,7 @@ from jaxvib.equations.linear import require_terms
 from jaxvib.equations.state import State
 from jaxvib.equations.torque_balance import mass_owners
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.drives.drive import SwitchedOff
+from jaxvib.machine.drives.controlled import SwitchedOff
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction, GravityField, LoadPotential, RotorImbalance, SupportForce
 from jaxvib.machine.scene import Exciter, Scene
