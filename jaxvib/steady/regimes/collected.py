@@ -1,9 +1,19 @@
-"""Synchronous regimes in which all loads of each exciter are at one angle, and their course over the speed of the drives."""
+"""Synchronous regimes in which all loads of each exciter are at one angle, and their course over the speed of the drives.
+
+One mass stands for all loads of an exciter: it has the sum of their unbalances, moments of inertia and drags. In the averaged
+equations the loads can also separate. If the deviations of the phases of N equal loads from their mean add to 0, the force of
+the loads does not change, and neither does the acceleration a of their point. The averaged equation of each load becomes
+
+    I d'' + D d' - (S/2) Re(e^{-i psi} a) d = 0
+
+with the deviation d, the phase psi of the loads, and the unbalance S, the moment of inertia I and the drag D of one load. A
+regime is stable if the disturbances of the masses and these deviations decay.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -11,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.averaged import require_rotating_masses
-from jaxvib.equations.torque_balance import assemble_for_search
+from jaxvib.equations.averaged import decays, require_rotating_masses
+from jaxvib.equations.torque_balance import TorqueBalance, assemble_for_search, assemble_torque_balance
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
@@ -22,14 +32,27 @@ from jaxvib.steady.regimes.synchronous import (
     RegimeSearchStatus,
     RegimeStatus,
     SynchronousRegimes,
-    fields_near,
+    fields_of_balance,
     regimes_from,
     require_one_speed,
-    synchronous_regimes,
 )
 
 POINTS = 31
 """Number of speeds at which a regime is followed to each side, including the speed of the scene."""
+
+
+class _CollectedBalance(TorqueBalance):
+    """Torque balance in which each mass stands for several loads; `loads_per_mass` is their number."""
+
+    loads_per_mass: tuple[int, ...] = eqx.field(static=True, kw_only=True)
+
+    def total_driving_torque(self, omega: Array, factor: Array | None = None) -> Array:
+        """Return `driving_torque`, with all differences between the single loads multiplied by `factor`."""
+        torque, count = self.driving_torque(omega), np.asarray(self.loads_per_mass)
+        if factor is None:
+            return torque
+        mean = jnp.zeros_like(omega) if any(self.is_prescribed) else jnp.sum(torque) / np.sum(count)
+        return count * mean + factor * (torque - count * mean)
 
 
 def collected_regimes(scene: Scene) -> SynchronousRegimes:
@@ -42,18 +65,12 @@ def collected_regimes(scene: Scene) -> SynchronousRegimes:
     **Raises** `InputError` in the cases of `synchronous_regimes`.
     """
     scene = validate_scene(scene)
-    counts = [1 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters]
-    several = [k for k, count in enumerate(counts) if count > 1]
-    if not several or not all(has_equal_loads(scene, k) for k in several):
-        return synchronous_regimes(scene)
-    single = [_one_load(cast(Loads, scene.exciters[k].loads)) for k in several]
     require_rotating_masses(scene)
     require_one_speed(scene)
-    balance = assemble_for_search(eqx.tree_at(lambda s: [s.exciters[k].loads for k in several], scene, single))
-    omega, phases = all_regimes(balance)
-    is_complete = balance.unbalance.size <= MAX_COMPLETE
+    balance = assemble_for_search(_with_collected_loads(scene))
+    is_complete = balance.unbalance.size <= MAX_COMPLETE or balance.is_prescribed.all()
     search = RegimeSearchStatus.done if is_complete else RegimeSearchStatus.sampled
-    return regimes_from(scene, omega, np.repeat(phases, counts, axis=1), search=search)
+    return regimes_from(scene, *all_regimes(balance), search=search, near=_collected_near)
 
 
 def has_equal_loads(scene: Scene, exciter: int) -> bool:
@@ -63,10 +80,60 @@ def has_equal_loads(scene: Scene, exciter: int) -> bool:
     return mount.at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(loads))
 
 
+def _loads_per_mass(scene: Scene) -> tuple[int, ...]:
+    """Return the number of loads for which each mass of the scene with collected loads stands; 1 for an unbalance."""
+    counts = [1 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters]
+    if all(count == 1 or has_equal_loads(scene, k) for k, count in enumerate(counts)):
+        return tuple(counts)
+    return (1,) * sum(counts)
+
+
+def _with_collected_loads(scene: Scene) -> Scene:
+    """Return the scene in which one load has the mass, the moment of inertia and the drag of all loads of its exciter."""
+    several = [k for k, count in enumerate(_loads_per_mass(scene)) if count > 1]
+    if not several:
+        return scene
+    single = [_one_load(cast(Loads, scene.exciters[k].loads)) for k in several]
+    return eqx.tree_at(lambda s: [s.exciters[k].loads for k in several], scene, single)
+
+
 def _one_load(loads: Loads) -> Loads:
     """Return one load with the mass, the moment of inertia and the drag of all loads."""
     names = [name for name in ("mass", "drag", "inertia") if getattr(loads, name, None) is not None]
     return dataclasses.replace(loads, count=1, **{name: loads.count * getattr(loads, name) for name in names})
+
+
+@cached
+def _collected_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
+    return jax.vmap(lambda w, a: _fields_near(scene, w, a))(omega, phases)
+
+
+def _fields_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
+    """Return the fields, except `scene`, of the regime that is found from a start with the phases of the collected masses.
+
+    The fields are those of all loads.
+    """
+    count = np.asarray(_loads_per_mass(scene))
+    plain = assemble_torque_balance(_with_collected_loads(scene))
+    parts = {field.name: getattr(plain, field.name) for field in dataclasses.fields(TorqueBalance)}
+    balance = _CollectedBalance(**parts, loads_per_mass=tuple(count.tolist()))
+    fields = fields_of_balance(balance, omega, phases)
+    apart = _separation_growth(balance, fields)[np.flatnonzero(count > 1)]
+    growth, quasi_static = (jnp.max(apart, initial=fields[name]) for name in ("growth", "quasi_static"))
+    each = np.repeat(np.arange(count.size), count)
+    shared = {name: fields[name][each] / count[each] for name in ("torque", "vibrational_torque")}
+    stable = fields["stable"] & decays(growth, fields["speed"])
+    changed = {"growth": growth, "quasi_static": quasi_static, "stable": stable}
+    return {**fields, **changed, **shared, "masses": jnp.arange(each.size), "phases": fields["phases"][each]}
+
+
+def _separation_growth(balance: TorqueBalance, fields: dict[str, Any]) -> Array:
+    """Return the growth rate of deviations of loads from the common phase of their exciter, (mass,) 1/s."""
+    averaged = balance.averaged
+    acceleration = -(fields["speed"] ** 2) * (balance.direction.conj() @ fields["displacement"])
+    stiffness = -averaged.unbalance * (jnp.exp(-1j * fields["phases"]) * acceleration).real / (2.0 * averaged.inertia)
+    half = averaged.drag / (2.0 * averaged.inertia)
+    return -half + jnp.sqrt(jnp.maximum(half**2 - stiffness, 0.0))
 
 
 class FollowedRegimes(NamedTuple):
@@ -93,15 +160,16 @@ def follow_regimes(
 
     **Arguments**: `speed` (r,), rad/s, and `phases` (r, rotating masses), rad, of the regimes at the factor 1.
     """
+    first = np.cumsum((0, *_loads_per_mass(scene)))[:-1]
 
     def at(factor: Array, start: tuple[Array, Array]) -> tuple[tuple[Array, Array], FollowedRegimes]:
         speeds = [factor * exciter.drive.speed for exciter in scene.exciters]
         changed = eqx.tree_at(lambda s: [exciter.drive.speed for exciter in s.exciters], scene, speeds)
         names = ("speed", "phases", "amplitude", "foundation_force", "stable")
-        fields = fields_near(changed, *start, None)
+        fields = _fields_near(changed, *start)
         is_lost = fields["status"] == RegimeStatus.not_converged
         w, a = (jnp.where(is_lost, jnp.nan, fields[name]) for name in names[:2])
-        return (w, a), FollowedRegimes(factor, *(fields[name] for name in names))
+        return (w, a[first]), FollowedRegimes(factor, *(fields[name] for name in names))
 
     def along(end: Array, w: Array, a: Array) -> FollowedRegimes:
         factors = 1.0 + (end - 1.0) * jnp.linspace(0.0, 1.0, POINTS)
@@ -111,5 +179,5 @@ def follow_regimes(
         both = jax.vmap(along, in_axes=(0, None, None))(jnp.asarray([low, high]), w, a)
         return jax.tree.map(lambda leaf: jnp.concatenate([leaf[0, :0:-1], leaf[1]]), both)
 
-    found = jax.vmap(follow)(jnp.asarray(speed), jnp.asarray(phases))
+    found = jax.vmap(follow)(jnp.asarray(speed), jnp.asarray(phases)[:, first])
     return found._replace(factor=found.factor[0])

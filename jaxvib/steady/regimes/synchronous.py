@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, overload
 
 import equinox as eqx
@@ -373,13 +373,18 @@ def regimes_from(
     group: tuple[int, ...] | None = None,
     *,
     search: RegimeSearchStatus,
+    near: Callable[[Scene, Array, Array], dict[str, Any]] | None = None,
 ) -> SynchronousRegimes:
     """Return the regimes that Newton's method finds from starts, the stable ones first.
 
     **Arguments**: `omega` (n,), rad/s, and `phases` (n, mass), rad, of the starts; `group`: numbers of the masses, None for
-    all; `search`: status of the search.
+    all; `search`: status of the search; `near`: function of the scene and of the starts that returns the fields of the regimes;
+    default: Newton's method for all masses.
     """
-    fields = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: _regimes_near(scene, w, a, group), omega, phases)
+    if near is None:
+        fields = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: _regimes_near(scene, w, a, group), omega, phases)
+    else:
+        fields = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: near(scene, w, a), omega, phases)
     order = np.flatnonzero(status_names(fields["status"]) != "not_converged")
     order = order[np.lexsort((-fields["speed"][order], ~fields["stable"][order]))]
     is_empty = order.size == 0 and status_name(search) == "done"
@@ -411,13 +416,14 @@ def fields_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ...
     """Return the fields, except `scene`, of the regime that is found from a start, for a group of masses (None: all)."""
     balance = assemble_torque_balance(scene)
     if group is not None:
-        fields = _fields_of(balance_of_group(balance, group), omega, phases)
+        fields = fields_of_balance(balance_of_group(balance, group), omega, phases)
         can_start = fields["can_start"][np.unique(mass_owners(scene)[list(group)])]
         return {**fields, "masses": jnp.asarray(group), "can_start": can_start}
-    return _fields_of(balance, omega, phases)
+    return fields_of_balance(balance, omega, phases)
 
 
-def _fields_of(balance: TorqueBalance, omega: Array, phases: Array) -> dict[str, Any]:
+def fields_of_balance(balance: TorqueBalance, omega: Array, phases: Array) -> dict[str, Any]:
+    """Return the fields, except `scene`, of the regime that is found from a start in a torque balance."""
     frozen = jax.lax.stop_gradient(balance)
     x = jax.lax.stop_gradient(unknowns_of(frozen, omega, phases))
     if x.size == 0:

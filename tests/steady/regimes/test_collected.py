@@ -37,3 +37,68 @@ def test_followed_regimes_are_those_at_the_changed_speed():
     np.testing.assert_allclose(followed.speed[0, -1], near.speed, rtol=1e-9)
     np.testing.assert_allclose(followed.amplitude[0, -1], near.amplitude, rtol=1e-6)
     assert near.status_name == "found"
+
+
+SPRINGS = [jv.support(at=(x, -0.2), stiffness=(2e5, 3e5), damping=(300.0, 300.0)) for x in (-0.6, 0.6)]
+BODY = jv.plane_body(mass=300.0, inertia=75.0, supports=SPRINGS)
+
+
+def on_body(*exciters):
+    """Scene with balls in exciters on a body: number of balls, drag, rotor speed in rpm, place, direction of each."""
+    return jv.Scene(
+        BODY,
+        exciters=[
+            jv.Exciter(
+                jv.balls(count=n, mass=0.8, radius=0.12, drag=drag), jv.ConstantSpeed(f"{rpm} rpm"), at=(x, 0.3), direction=way
+            )
+            for n, drag, rpm, x, way in exciters
+        ],
+    )
+
+
+def test_all_numbers_are_those_of_the_regimes_of_all_loads():
+    """The list of all loads has one phase, one equation and two eigenvalues for each load."""
+    scene = on_body((2, 1.5, 900, -0.3, 1), (3, 1.2, 880, 0.3, -1))
+    found = collected_regimes(scene)
+    assert found.speed.size > 10 and found.phases.shape[1] == 5
+    for k in range(0, found.speed.size, 3):
+        regime = found.select(k)
+        near = jv.synchronous_regimes(scene, near=(float(regime.speed), regime.phases))
+        for name in (
+            "speed",
+            "phases",
+            "growth",
+            "quasi_static",
+            "margin",
+            "torque",
+            "vibrational_torque",
+            "power",
+            "amplitude",
+        ):
+            np.testing.assert_allclose(getattr(regime, name), getattr(near, name), rtol=1e-6, atol=1e-8, err_msg=name)
+        assert bool(regime.stable) == bool(near.stable) and regime.status_name == near.status_name
+
+
+def test_three_exciters_with_loads_settle_in_the_stable_regime():
+    scene = on_body((2, 1.5, 900, -0.3, 1), (2, 1.5, 900, 0.0, 1), (2, 1.5, 900, 0.3, -1))
+    regime = collected_regimes(scene).select(0)
+    omega, phases = float(regime.speed), np.asarray(regime.phases)
+    assert bool(regime.stable)
+    moved = phases + np.repeat([0.0, 0.25, -0.2], 2) + np.tile([0.1, -0.1], 3)
+    turning = np.array([1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
+    rest = jv.initial_state(scene, "rest")
+    start = eqx.tree_at(
+        lambda s: [s.displacement, s.velocity, *(each.angle[0] for each in s.exciters), *(each.rate[0] for each in s.exciters)],
+        rest,
+        [
+            jnp.real(regime.displacement),
+            jnp.real(1j * omega * regime.displacement),
+            *jnp.split(jnp.asarray(turning * moved), 3),
+            *jnp.split(jnp.asarray(turning * omega), 3),
+        ],
+    )
+    run = jv.simulate(scene, 15.0, start=start, estimate=False)
+    late = np.asarray(run.trajectory.time) > 14.0
+    angles = np.concatenate([np.asarray(own.angle[0])[late] for own in run.trajectory.state.exciters], axis=1) * turning
+    lags = np.angle(np.mean(np.exp(1j * (angles - angles[:, :1])), axis=0))
+    np.testing.assert_allclose(lags, phases, atol=0.01)
