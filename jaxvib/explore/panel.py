@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping, Sequence
 
@@ -71,22 +72,24 @@ class Panel:
     def frame(self) -> list[Part]:
         """Return the axes and the grid lines at their ticks."""
         (left, right), (low, high) = self.x, self.y
-        upright = [self.line([x, x], self.y, _GRID) for x, _ in self._x_ticks()]
-        level = [self.line(self.x, [y, y], _GRID) for y, _ in self._y_ticks()]
+        upright = [self.line([x, x], self.y, _GRID) for x, _ in self._x_ticks]
+        level = [self.line(self.x, [y, y], _GRID) for y, _ in self._y_ticks]
         edge = np.array([self.place(left, high), self.place(left, low), self.place(right, low)], float)
         return [*upright, *level, Part(edge, {"color": "black", "lw": 0.8})]
 
     def texts(self) -> list[Text]:
         """Return the numbers at the ticks and the names of the axes."""
         small = {"fontsize": "small"}
-        across = [Text(self.at(x, self.y[0])[0], -0.18, text, {**small, "ha": "center"}) for x, text in self._x_ticks()]
-        up = [Text(self.left - 0.08, self.at(self.x[0], y)[1], text, {**small, "ha": "right"}) for y, text in self._y_ticks()]
+        across = [Text(self.at(x, self.y[0])[0], -0.18, text, {**small, "ha": "center"}) for x, text in self._x_ticks]
+        up = [Text(self.left - 0.08, self.at(self.x[0], y)[1], text, {**small, "ha": "right"}) for y, text in self._y_ticks]
         below = Text(self.left + 0.5 * self.wide, -0.46, self.below, {**small, "ha": "center"})
         return [*across, *up, below, Text(self.left - FIRST + 0.05, TALL + 0.22, self.title, small)]
 
+    @functools.cached_property
     def _x_ticks(self) -> list[tuple[float, str]]:
         return _ticks(MaxNLocator(_MAX_TICKS).tick_values(*self.x), self.x)
 
+    @functools.cached_property
     def _y_ticks(self) -> list[tuple[float, str]]:
         locator = log_places(*self.y, max_ticks=_MAX_TICKS) if self.log else MaxNLocator(_MAX_TICKS)
         return _ticks(locator.tick_values(*self.y), self.y)

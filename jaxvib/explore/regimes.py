@@ -3,6 +3,7 @@ results as text."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,18 +19,23 @@ from jaxvib.draw.style import COLORS, GUIDE
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.equations.torque_balance import mass_owners
 from jaxvib.errors import InputError
+from jaxvib.explore.latest import keep_latest
 from jaxvib.explore.panel import APART, FIRST, LAST, ROTOR, TALL, WIDE, WORKING, Panel, legend
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.regimes.collected import collected_regimes, follow_regimes
-from jaxvib.steady.regimes.synchronous import SynchronousRegime, synchronous_regimes
+from jaxvib.steady.regimes.synchronous import SynchronousRegime, SynchronousRegimes, synchronous_regimes
 from jaxvib.steady.regimes.working import working_regime
 
 _SPEEDS = {1: 61, 2: 61, 3: 25}
 """Number of speeds of the chart for each number of exciters; the time for one speed grows steeply with the number."""
 
-_MAX_LISTED = 2
-"""Number of exciters up to which all regimes are listed. The search takes too long for more."""
+_MAX_LISTED, _MAX_WITH_LOADS = 2, 4
+"""Numbers of exciters, with unbalances and with loads, up to which all regimes are searched for. The search takes too long for
+more."""
+
+_MAX_LINES = 12
+"""Largest number of regimes in the list."""
 
 _MAX_FOLLOWED = 4
 """Number of regimes of loads in the chart."""
@@ -37,12 +43,7 @@ _MAX_FOLLOWED = 4
 _LINE = {"lw": 1.5}
 _UNSTABLE = {"lw": 1.2, "ls": "--"}
 _RESONANCE = {"color": GUIDE, "lw": 0.8, "ls": ":"}
-_LEGEND = {
-    "regime": {**_LINE, "color": "black"},
-    "resonance": _RESONANCE,
-    "rotor speed = motor speed": ROTOR,
-    "working speed": WORKING,
-}
+_LEGEND = {"regime": {**_LINE, "color": "black"}, "resonance": _RESONANCE, "working speed": WORKING, "motor speed": ROTOR}
 """Styles of the lines in the legend, by their names."""
 
 
@@ -70,8 +71,8 @@ def regime_chart(scene: Scene, max_speed: float) -> str:
 
     **Arguments**: `max_speed`: the highest motor speed in the diagram, rad/s.
 
-    **Returns** the text of an SVG file. **Raises** `InputError` for more than three exciters, and for a scene without averaged
-    regimes; the message names the part of the scene that prevents them.
+    **Returns** the text of an SVG file. **Raises** `InputError` for more than three exciters with unbalances, for more than
+    four with loads, and for a scene without averaged regimes; the message names the part of the scene that prevents them.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -80,7 +81,7 @@ def regime_chart(scene: Scene, max_speed: float) -> str:
     True
     """
     count = len(scene.exciters)
-    if count not in _SPEEDS:
+    if not scene.has_loads and count not in _SPEEDS:
         problem = f"are {count}; the chart over the motor speed is drawn for at most {max(_SPEEDS)}, because it takes too long"
         raise InputError("exciters", f"{problem} for more; use jaxvib sweep")
     for k, exciter in enumerate(scene.exciters):
@@ -186,33 +187,36 @@ def _working_regimes(scene: Scene, factors: Array) -> _Curves:
     return jax.vmap(at)(factors)
 
 
-_latest: list[tuple[Scene, list[SynchronousRegime]]] = []
-"""Scene of the last call of `regimes_of` and its regimes, because the text and the sketch of one page need the same regimes."""
+@keep_latest
+def _search(scene: Scene) -> SynchronousRegimes:
+    """Return all regimes of a scene with few exciters; loads of each exciter stay together. **Raises** `InputError` for more
+    exciters with loads among them than `_MAX_WITH_LOADS`."""
+    if not scene.has_loads:
+        return jax.device_get(synchronous_regimes(scene))
+    if len(scene.exciters) > _MAX_WITH_LOADS:
+        problem = f"are {len(scene.exciters)}; regimes of loads are listed for at most {_MAX_WITH_LOADS} exciters, because the"
+        raise InputError("exciters", f"{problem} search takes too long for more; use jaxvib regimes")
+    return jax.device_get(collected_regimes(scene))
 
 
+def _has_list(scene: Scene) -> bool:
+    """Return True if the page shows all regimes, False if it shows the working regime alone."""
+    return scene.has_loads or len(scene.exciters) <= _MAX_LISTED
+
+
+@keep_latest
 def regimes_of(scene: Scene) -> list[SynchronousRegime]:
-    """Return the regimes that the page lists, the stable ones first: all for one or two exciters, otherwise the working
-    regime. Loads of each exciter stay together. The list is empty if there is no regime.
+    """Return the regimes that the page lists, the stable ones first: at most 12 of all regimes for one or two exciters and for
+    exciters with loads, otherwise the working regime. Loads of each exciter stay together. The list is empty if there is no
+    regime.
 
-    **Raises** `InputError` for more than two exciters with loads among them.
+    **Raises** `InputError` for more than four exciters with loads among them.
     """
-    for latest, regimes in _latest:
-        if latest is scene:
-            return regimes
-    if scene.has_loads:
-        if len(scene.exciters) > _MAX_LISTED:
-            problem = f"are {len(scene.exciters)}; regimes of loads are listed for at most {_MAX_LISTED}, because the search"
-            raise InputError("exciters", f"{problem} takes too long for more; use jaxvib regimes")
-        found = jax.device_get(collected_regimes(scene))
-        regimes = [found.select(k) for k in range(found.speed.shape[0])]
-    elif len(scene.exciters) > _MAX_LISTED:
+    if not _has_list(scene):
         regime = jax.device_get(working_regime(scene, throw=False))
-        regimes = [regime] if np.isfinite(regime.speed) else []
-    else:
-        found = jax.device_get(synchronous_regimes(scene))
-        regimes = [found.select(k) for k in range(found.speed.shape[0])]
-    _latest[:] = [(scene, regimes)]
-    return regimes
+        return [regime] if np.isfinite(regime.speed) else []
+    found = _search(scene)
+    return [found.select(k) for k in range(min(found.speed.shape[0], _MAX_LINES))]
 
 
 def deck_points(scene: Scene) -> list[tuple[float, float]]:
@@ -241,12 +245,23 @@ def regime_readings(scene: Scene) -> str:
     regimes = regimes_of(scene)
     if not regimes:
         advice = "the exciters turn at different speeds, or a resonance catches them; jaxvib run-up shows the motion from rest"
-        return f"no stable synchronous regime: {advice}" if len(scene.exciters) > _MAX_LISTED else f"no regime: {advice}"
+        return f"no regime: {advice}" if _has_list(scene) else f"no stable synchronous regime: {advice}"
     first, points = regimes[0], deck_points(scene)
-    lines = [each.summary() for each in regimes]
-    if len(scene.exciters) > _MAX_LISTED:
+    lines = [_with_one_phase_each(scene, each).summary() for each in regimes]
+    if not _has_list(scene):
         lines.append("jaxvib regimes lists all regimes")
+    elif (others := _search(scene).stable[len(regimes) :]).size:
+        lines.append(f"and {others.size} more regimes, {np.sum(others) or 'none'} of them stable")
     lines.append("motion in the first regime:" if len(regimes) > 1 else "motion in this regime:")
     force = f"foundation force {quantity_text(first.foundation_force, 'N', 4)}"
     lines.append(f"{force}, power of the drives {quantity_text(first.power, 'W', 4)}")
     return "\n".join([*lines, *([first.deck(points).summary()] if points else [])])
+
+
+def _with_one_phase_each(scene: Scene, regime: SynchronousRegime) -> SynchronousRegime:
+    """Return the regime with one phase for each exciter if all of its loads have this phase, otherwise unchanged."""
+    owners = mass_owners(scene)
+    first = np.unique(owners, return_index=True)[1]
+    if not np.array_equal(regime.phases, regime.phases[first][owners]):
+        return regime
+    return dataclasses.replace(regime, phases=regime.phases[first], masses=regime.masses[first])

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxvib.display import shown_unit
 from jaxvib.errors import InputError
+from jaxvib.explore.latest import keep_latest
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.numbers.named import NamedNumber, numbers_of, put_numbers
 from jaxvib.machine.scene import Scene
@@ -73,6 +74,7 @@ class Slider(NamedTuple):
         return f"{self.label}, {self.unit}" if self.unit else self.label
 
 
+@keep_latest
 def sliders_of(scene: Scene) -> list[Slider]:
     """Return the sliders of a scene; the sliders of the drives and the loads come first.
 

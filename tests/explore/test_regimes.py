@@ -18,6 +18,7 @@ from jaxvib.explore.regimes import deck_points, regime_chart, regimes_of
 from jaxvib.explore.sliders import scene_at, sliders_of, typed_value
 from jaxvib.machine.files import SCREENS
 from jaxvib.show.moving import regime_svg
+from jaxvib.steady.regimes.collected import collected_regimes
 
 SVG = svg_charts.SVG
 RPM = 30.0 / np.pi
@@ -167,7 +168,8 @@ def test_the_page_of_loads_shows_regimes_and_their_course(loaded):
     first = regimes_of(loaded)[0]
     assert bool(first.stable) and max(np.ptp(first.phases[:2]), np.ptp(first.phases[2:])) < 1e-9
     text = figures.readings(loaded)
-    assert text.startswith(first.summary()) and "spread over the deck" in text and "e-1" not in text
+    one_phase_each = first.summary().replace(": 0, 0, 0, 0 deg", ": 0, 0 deg")
+    assert text.startswith(one_phase_each) and "spread over the deck" in text and "e-1" not in text
     drawn = ElementTree.fromstring(figures.diagram(loaded, 126.0))
     spans = svg_charts.texts(drawn)
     starts = [x for x, _, text, _ in spans if re.match(r"load speed, rpm|amplitude, mm|phase, deg", text or "")]
@@ -184,6 +186,20 @@ def test_the_page_of_loads_shows_regimes_and_their_course(loaded):
     assert f"stable regime, {RPM * float(first.speed):.5g} rpm" in animation and "animate" in animation
 
 
+def test_three_exciters_with_loads_have_a_page(loaded):
+    middle = jv.Exciter(loaded.exciters[0].loads, loaded.exciters[0].drive, at=(0.0, 0.3))
+    three = jv.Scene(loaded.machine, exciters=[loaded.exciters[0], middle, loaded.exciters[1]])
+    shown = regimes_of(three)
+    lines = figures.readings(three).splitlines()
+    found = collected_regimes(three)
+    assert len(shown) == 12 < found.speed.size and bool(shown[0].stable) and not bool(shown[-1].stable)
+    assert [line.count(",") for line in lines[:12]] == [4] * 12  # three phases
+    assert lines[12] == f"and {found.speed.size - 12} more regimes, none of them stable"
+    texts = [text for *_, text, _ in svg_charts.texts(ElementTree.fromstring(figures.diagram(three, 126.0)))]
+    assert {"exciter 2", "exciter 3", "unstable"} <= set(texts)
+    assert "stable regime" in figures.machine(three, None)
+
+
 def test_sliders_of_loads_change_one_exciter(loaded):
     names = {each.name: each for each in sliders_of(loaded)}
     assert len({each.title for each in names.values()}) == len(names)
@@ -195,9 +211,9 @@ def test_sliders_of_loads_change_one_exciter(loaded):
 
 
 def test_scenes_that_the_explorer_lacks_name_a_command(linear, loaded):
-    three = jv.Scene(loaded.machine, exciters=[*loaded.exciters, linear.exciters[0]])
-    with pytest.raises(jv.InputError, match=r"exciters are 3; regimes of loads are listed for at most 2.* use jaxvib regimes"):
-        figures.readings(three)
+    five = jv.Scene(loaded.machine, exciters=[*loaded.exciters, *loaded.exciters, linear.exciters[0]])
+    with pytest.raises(jv.InputError, match=r"exciters are 5; regimes of loads are listed for at most 4 .* use jaxvib regimes"):
+        figures.readings(five)
     table = jv.TorqueTable(speeds=(0.0, 90.0, 100.0), torques=(50.0, 60.0, 0.0), inertia=0.6)
     tabled = jv.Scene(linear.machine, exciters=[jv.Exciter(drive=table, unbalance=2.0, at=(0.0, 0.8))])
     shown = figures.image(lambda: figures.diagram(tabled, 100.0), SceneOrProblem(tabled, ""))
