@@ -123,7 +123,7 @@ def _text(
         lines.append(f"phases of the unbalances {written} deg ({phases[1]}), at all speeds")
     end = [f"force, {force_unit}", "torque, N m"]
     if operating:
-        points, is_bounded = result.operating, np.isfinite(result.operating.amplitude).all(axis=1)
+        points, is_bounded = result.operating, np.all(np.isfinite(result.operating.amplitude), axis=1)
         rows = [motion(points, k, "yes" if points.stable[k] else "no" if is_bounded[k] else "unbounded") for k in operating]
         lines.append(table("operating points (zero to peak)", [unit, "stable", *moves, *end], rows))
         if several:

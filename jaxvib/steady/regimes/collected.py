@@ -48,10 +48,10 @@ class _CollectedBalance(TorqueBalance):
 
     def total_driving_torque(self, omega: Array, factor: Array | None = None) -> Array:
         """Return `driving_torque`, with all differences between the single loads multiplied by `factor`."""
-        torque, count = self.driving_torque(omega), np.asarray(self.loads_per_mass)
+        torque, count = self.driving_torque(omega), jnp.asarray(self.loads_per_mass)
         if factor is None:
             return torque
-        mean = jnp.zeros_like(omega) if any(self.is_prescribed) else jnp.sum(torque) / np.sum(count)
+        mean = jnp.zeros_like(omega) if any(self.is_prescribed) else jnp.sum(torque) / jnp.sum(count)
         return count * mean + factor * (torque - count * mean)
 
 

@@ -67,7 +67,7 @@ def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
         omega, phases, neutral = (np.concatenate(pair) for pair in zip(known, solved, strict=True))
         before = known[0].size
         kept = _one_of_each_family(omega, neutral, tolerance[0])
-        kept = kept[distinct_regimes(omega[kept], phases[kept], exchanges, tolerance, np.count_nonzero(kept < before))]
+        kept = kept[distinct_regimes(omega[kept], phases[kept], exchanges, tolerance, int(np.sum(kept < before)))]
         known = omega[kept], phases[kept], neutral[kept]
         grown = kept[kept >= before]
         if grown.size == 0 or count == 1 or count > MAX_COMPLETE:
