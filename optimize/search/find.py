@@ -48,7 +48,7 @@ class SearchResult(NamedTuple):
     """Results of searches.
 
     **Attributes**: those of `Polished`; `drawn`: number of random designs; `existing`: number of these for which the objective
-    exists (in a search from given designs, both are the number of given designs); `interrupted`: True if the user interrupted
+    exists (in a search from given designs, `drawn` is the number of these); `interrupted`: True if the user interrupted
     the search; `bounds`: lower and upper bounds (d,) of the d free parameters within which the best design was searched for,
     SI; `nodes`: number of bounded problems that branch and bound solved.
     """
@@ -154,7 +154,7 @@ def _find(problem: Problem, options: Options, report: Progress) -> SearchResult 
     elif begin is not None:
         point = evaluate(problem, begin, find_speeds(problem, begin))
         point = point.take(np.flatnonzero(point.exists()))
-        drawn = existing = len(begin)
+        drawn, existing = len(begin), len(point.z)
     else:
         starts = draw_starts(problem, options.starts, options.seed, find_speeds)
         point = starts.point if starts.point is not None else starts.off_held

@@ -85,10 +85,11 @@ def _phases(scene: jv.Scene, given: str | None) -> tuple[np.ndarray, str]:
         return np.asarray(numbers([part.strip() for part in given.split(",")], "rad", "--phases", count)), "given"
     if count == 1:
         return np.zeros(1), "of one exciter"
-    if not any(exciter.loads or exciter.effects for exciter in scene.exciters):
-        regimes = jv.synchronous_regimes(scene)
-        if np.any(regimes.stable):
-            return np.asarray(regimes.phases[0]), "those of the first stable regime"
+    if any(exciter.loads or exciter.effects for exciter in scene.exciters):
+        return np.zeros(count), "equal, because regimes do not include effects on a rotor"
+    regimes = jv.synchronous_regimes(scene)
+    if np.any(regimes.stable):
+        return np.asarray(regimes.phases[0]), "those of the first stable regime"
     return np.zeros(count), "equal, because there is no stable regime"
 
 

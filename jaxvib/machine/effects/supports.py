@@ -98,7 +98,10 @@ class CubicSupport(_Support):
         platform = which + 1 if machine.places == "platform" else None
         position = 0.0 if machine.places == "shaft" else None
         stiffness = jnp.max(jnp.abs(carrier.foundation_stiffness[:, which])) * 0.04 / (3.0 * a**2)
-        return Typical(cls(stiffness, platform, position), f"1 % stiffer on average at an amplitude of {1e3 * float(a):.3g} mm")
+        return Typical(
+            cls(stiffness, platform, position),
+            f"mean stiffness 1 % of that of the support at an amplitude of {1e3 * float(a):.3g} mm",
+        )
 
     def terms(self) -> tuple[Term, ...]:
         """Return the force of the spring."""

@@ -80,7 +80,7 @@ class MotorRunUp(Result):
     """
 
     status: MotorRunUpStatus
-    resonances: Array = eqx.field(metadata=in_unit("rad/s", "coordinate"))
+    resonances: Array = eqx.field(metadata=in_unit("rad/s", "resonance"))
     speed: Array = eqx.field(metadata=in_unit("rad/s", "exciter"))
     caught_at: Array = eqx.field(metadata=in_unit("", "exciter"))
     peak_amplitude: Array = eqx.field(metadata=in_unit("m or rad", "coordinate"))

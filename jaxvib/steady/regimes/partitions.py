@@ -73,7 +73,8 @@ class RegimePartitions(Result):
     - `group` (n, mass): number of the group of each rotating mass, from 0
     - `speed` (n, mass), rad/s, and `phases` (n, mass), rad, of each rotating mass; the phases are those of a
       `SynchronousRegime` of its group
-    - `growth` (n,), 1/s: the largest of all groups; `stable` (n,): True if it is negative
+    - `growth` (n,), 1/s: the largest of all groups; `stable` (n,): True if it is negative by more than a rounding
+      error
     - `interaction` (n,): estimated relative error of the differences of the speeds, because groups act on each other; 0 for a
       single group; typical: 1e-4 to 0.3
     - `scene`

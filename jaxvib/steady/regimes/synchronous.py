@@ -112,7 +112,8 @@ class AbstractSynchronousRegime(Result):
     - `speed` Omega, rad/s
     - `phases` (mass,), rad, in the direction of rotation. If unbalances have ideal drives, their phases are 0; otherwise that
       of the first mass is 0
-    - `growth`, 1/s, of the fastest growing small disturbance of the averaged motion, and `stable`: True if it is negative
+    - `growth`, 1/s, of the fastest growing small disturbance of the averaged motion, and `stable`: True if it is negative by
+      more than a rounding error
     - `quasi_static`, 1/s: the same according to the usual quasi-static criterion, which assumes that free vibrations of the
       machine decay infinitely fast; -inf if all speeds are prescribed
     - `margin`: the factor by which all differences of the driving torques can grow until the regime ends in a fold; inf if it

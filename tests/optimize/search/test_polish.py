@@ -146,7 +146,7 @@ def test_starts_are_moved_to_the_held_values():
     corner = problem_of(DesignSpace(SCENE, FREE, [hold(product, 80.9)]), NEAR, [], starts=8)  # of 81 at most
     there = draw_starts(corner, 8, 0, find_speeds)
     np.testing.assert_allclose(np.prod(xy(there.point), axis=1), 80.9, rtol=1e-8)
-    # Where none can keep it, the designs that were drawn are the nearest known.
+    # If no design has the value that is held, random designs are returned in `off_held`.
     far = problem_of(DesignSpace(SCENE, FREE, [hold(product, 500.0)]), NEAR, [], starts=8)
     none = draw_starts(far, 8, 0, find_speeds, rounds=2)
     assert none.point is None and none.drawn == none.existing == 16
