@@ -267,11 +267,11 @@ class FrictionSupport(_Support):
         return (SupportForce(self.rows, self.energy, self.resistance, damping=damping, is_link=is_link),)
 
     def energy(self, displacement: Array) -> Array:
-        """Return 0: friction has no potential."""
+        """Return 0 at any `displacement`: friction has no potential."""
         return jnp.zeros_like(displacement[0])
 
     def resistance(self, displacement: Array, velocity: Array) -> Array:
-        """Return F tanh(|v|/width) v/|v|, (k,) N, at the `velocity` (k,), m/s."""
+        """Return F tanh(|v|/width) v/|v|, (k,) N, at the `velocity` v (k,), m/s, and any `displacement`."""
         if velocity.shape[0] == 1:
             return self.force * sliding_sign(velocity, self.width)
         return self.force * sliding_share(length(tuple(velocity)), self.width) * velocity
