@@ -116,7 +116,7 @@ def exciter(**more):
         (lambda: jv.unbalance(force=0.0, at="1000 rpm"), "force is 0 N; it must be greater than 0"),
         (
             lambda: jv.scene_from_toml(SCREENS["feeder"].replace('force = "10 kN"', 'force = "10 kg"', 1)),
-            r"exciters\[0\]\.unbalance\.force is '10 kg', which is not in N",
+            r"exciters\[0\]\.unbalance\.force is '10 kg'; a kilogram is a mass",
         ),
         (lambda: jv.unbalance(force="10 kN", at=1450), "at is 1450, and a plain number is in rad/s; write '1450 rpm' or"),
         (
