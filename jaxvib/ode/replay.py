@@ -164,25 +164,33 @@ def forward_only(outputs: T, field: str, problem: str) -> T:
 
 def differentiable_once(inputs: T, field: str, problem: str) -> T:
     """Return the inputs of a computation; derivatives of its first derivatives with respect to them raise `InputError`."""
+    if not CAN_DEFINE_PRIMITIVES:
+        return inputs
     numbers, others = eqx.partition(inputs, eqx.is_inexact_array)
-
-    @jax.custom_jvp
-    def constant(leaves: list[Array]) -> list[Array]:
-        return leaves
-
-    @functools.partial(constant.defjvp, symbolic_zeros=True)
-    def _(primals: Any, tangents: Any) -> tuple[list[Array], list[Any]]:
-        if all(isinstance(slope, SymbolicZero) for slope in tangents[0]):
-            return primals[0], tangents[0]
-        raise InputError(field, problem)
 
     @jax.custom_jvp
     def unchanged(leaves: list[Array]) -> list[Array]:
         return leaves
 
-    unchanged.defjvp(lambda primals, slopes: (constant(primals[0]), slopes[0]))
+    unchanged.defjvp(lambda primals, slopes: (_constants(*primals[0], field=field, problem=problem), slopes[0]))
     leaves, structure = jax.tree.flatten(numbers)
     return eqx.combine(jax.tree.unflatten(structure, unchanged(leaves)), others)
+
+
+def _refuse_derivative(primals: object, tangents: object, *, field: str, problem: str) -> NoReturn:
+    raise InputError(field, problem)
+
+
+_constants = primitive(
+    "constants",
+    impl=lambda *numbers, **_: list(numbers),
+    batching_rule=lambda numbers, axes, **named: (_constants(*numbers, **named), list(axes)),
+    jvp=_refuse_derivative,
+    lowering=lambda *numbers, **_: list(numbers),
+    abstract_eval=lambda *types, **_: types,
+)
+"""Primitive that returns numbers and has no derivatives. JAX drops the rule of a `custom_jvp` in reverse derivatives of loops,
+but not that of a primitive."""
 
 
 def _refuse_reverse(*_: object, field: str, problem: str) -> NoReturn:

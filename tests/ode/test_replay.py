@@ -11,7 +11,7 @@ from jaxvib.errors import InputError
 from jaxvib.ode.control import PIController
 from jaxvib.ode.dopri8 import UnrolledDopri8
 from jaxvib.ode.dopri8_loop import LoopDopri8
-from jaxvib.ode.replay import solve
+from jaxvib.ode.replay import differentiable_once, solve
 
 ARGS = (jnp.asarray(0.7), jnp.asarray(1.3))
 
@@ -200,3 +200,13 @@ def test_second_derivatives_are_forward_over_reverse():
     for reverse in (jax.jacrev, jax.grad):
         with pytest.raises(InputError, match="use forward over reverse"):
             reverse(reverse(state))(2.0)
+
+
+def test_second_derivatives_are_refused_within_loops():
+    def repeated(x):
+        return jax.lax.fori_loop(0, 3, lambda _, y: y + 0.1 * differentiable_once(y, "scene", "is not smooth") ** 3, x)
+
+    assert np.isfinite(jax.vmap(jax.grad(repeated))(jnp.arange(2.0))).all()
+    for function in (jax.grad(repeated), jax.jit(jax.grad(repeated)), jax.jacfwd(repeated)):
+        with pytest.raises(InputError, match="scene is not smooth"):
+            jax.jacfwd(function)(0.7)
