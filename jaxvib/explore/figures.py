@@ -26,8 +26,10 @@ _ABOUT_SLIDERS = """The sliders of masses, springs, dampers, radii, drags, unbal
 times the value in the file. The arrow keys move a slider by one step; the field above the sliders sets one of them to a typed
 number."""
 
-_ABOUT_LOADS = """Each number of loads needs its own compiled program. The programs for the seven numbers closest to the number
-in the file are compiled while the page is open; any other takes one or two seconds the first time and is then stored.
+_ABOUT_COUNTS = """Each number of loads needs its own compiled program. The programs for the seven numbers closest to the number
+in the file are compiled while the page is open; any other takes one or two seconds the first time and is then stored."""
+
+_ABOUT_LOADS = f"""{_ABOUT_COUNTS}
 
 Amplitudes and forces are zero to peak. The page shows the theory of light loads. For exact results, save the machine and run
 `jaxvib simulate` or `jaxvib modes --exact`."""
@@ -139,7 +141,10 @@ def has_branches(scene: Scene) -> bool:
 
 def about(scene: Scene) -> str:
     """Return the text below the figures, as Markdown."""
-    theory = _ABOUT_LOADS if scene.is_plain else _ABOUT_COLLECTED if scene.has_loads else _ABOUT_UNBALANCES
+    if scene.is_plain:
+        theory = _ABOUT_LOADS if has_branches(scene) else _ABOUT_COUNTS
+    else:
+        theory = _ABOUT_COLLECTED if scene.has_loads else _ABOUT_UNBALANCES
     return f"{heading(scene)}\n\n{_ABOUT_SLIDERS} {theory}"
 
 

@@ -238,7 +238,8 @@ class SupportForce:
     - `resistance`: function of x and its rate, the dissipative force on the foundation, (k,) N; or None
     - `is_smooth`: True if the force has all derivatives
     - `stiffness`: largest stiffness of the support, N/m, whose vibration equal steps must resolve; None if it has no limit
-    - `damping`: largest slope of the resistance, N s/m, whose decay explicit steps must resolve; None without a resistance
+    - `damping`: largest slope of a resistance that acts at any displacement, N s/m, whose decay explicit steps must resolve;
+      None for a contact, and without a resistance
     - `penetration`: function of x that returns the penetration, m, negative without contact, and its direction (k,), if the
       force jumps when a contact begins; otherwise None
     - `is_link`: True if the force acts between two points of the machine, False if it acts on the foundation

@@ -34,7 +34,6 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     """Return starting values of the load speeds (rad/s) of the exact jams at the scene's rotor speed, by mode.
 
     The exact branch n(Omega) is computed point by point and cut at its folds; its pieces are numbered as in `jam_modes`. The
-    load speeds are interpolated between these points. The
     load speeds are interpolated between these points.
     """
     grid, resonances = _search_grid(scene)
@@ -69,8 +68,8 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
 def _ends_before(scene: Scene, low: float, high: float, target: float, refinements: int = 2) -> bool:
     """Return True if the exact branch has a fold between two load speeds, before it reaches the rotor speed `target`.
 
-    The fold is bracketed `refinements` times in smaller and smaller intervals. The rotor speed of the
-    fold is the largest or smallest one of the interpolated cubic in the last interval, with an error of the size of rounding.
+    The fold is bracketed `refinements` times in smaller and smaller intervals. The rotor speed of the fold is the largest or
+    smallest one of the interpolated cubic in the last interval, with an error of the size of rounding.
     """
     omega = np.linspace(low, high, _BRANCH_POINTS)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
