@@ -72,7 +72,7 @@ UNITS = {
         "ripple": ("rad", ("time", "load")),
     },
     jv.MotorRunUp: {
-        "resonances": ("rad/s", ("coordinate",)),
+        "resonances": ("rad/s", ("resonance",)),
         "speed": ("rad/s", ("exciter",)),
         "caught_at": ("", ("exciter",)),
         "peak_amplitude": ("m or rad", ("coordinate",)),
