@@ -1,9 +1,9 @@
 """Angle of a rotor over time, from the pulses of a tachometer, an angle, a speed, or a prescribed drive.
 
 Pulses and samples are fitted by a spline of degree 5 (`records/spline.py`). If a wheel has several marks, each mark has an
-unknown offset from its place, because marks are unevenly spaced. All pulses may be early or late by a common time with the
-standard error of one pulse, because recorders round times up, down, or to the nearest sample. The functions e_m(t) follow from
-the covariance of the coefficients:
+unknown offset from its place, because marks are unevenly spaced. All pulses have an unknown common delay, because recorders
+round times up, down, or to the nearest sample; its standard error is that of the time of one pulse. The errors e_m(t) of the
+angle follow from the covariance of the coefficients:
 
     angle(t) = spline(t) + sum_m z_m e_m(t),      z_m independent and standard normal
 

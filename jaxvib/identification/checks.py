@@ -61,8 +61,8 @@ class FitStatus(eqx.Enumeration):
     )
     undetermined = "the records do not determine all unknowns: see `undetermined` for the directions and how to determine them"
     contradicted = (
-        "the records contradict one another, the scene, a known value or the calibration of a sensor: see the notes, and check "
-        "that value"
+        "the records contradict one another, the scene, a known value or the calibration of a sensor: the notes name what to "
+        "check"
     )
     not_converged = (
         "no fit was found: the model does not resemble the records; check places and directions of the channels and the "

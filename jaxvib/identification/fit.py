@@ -49,9 +49,9 @@ _STEADY_VALUES = 0.05
 """Change of the unknowns in a pass, in standard errors, below which the influence of outliers and bounds is final."""
 
 _MAX_GROWTH = 1.2
-"""Standard deviation of residuals, relative to that of a fit with white noise, above which the coloured noise contains a part
-of the motion. The noise then has the frequencies of the machine, because a free decay of its vibration can be attributed
-to noise or to motion."""
+"""Ratio of the standard deviation of residuals to that in a fit with white noise. Above this ratio the coloured noise contains
+a part of the motion: the noise has the frequencies of the machine, because a free decay of the machine's vibration can be
+attributed to noise or to motion."""
 
 _ANGLE_MATTERS = 0.03
 """Share of the noise due to the error of the rotor's angle above which the angle is fitted with the machine."""
@@ -154,7 +154,7 @@ def unbalance_prior(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, n
 
 
 def project(problem: Problem, x: np.ndarray) -> _Trial:
-    """Return the best linear unknowns at `x` and their cost; for a nonlinear motion, those of the problem and their cost."""
+    """Return the best linear unknowns at `x`, and the cost. For a nonlinear motion, `problem.linear` is returned unchanged."""
     if problem.linear is not None:
         return _nonlinear_trial(problem, x, problem.linear)
     total = _linear_equations(problem, x)
@@ -210,7 +210,10 @@ def _linear_equations(problem: Problem, x: np.ndarray) -> np.ndarray:
 
 
 def linear_at(problem: Problem, x: np.ndarray, unbalance: np.ndarray | None) -> np.ndarray:
-    """Return the best linear unknowns at `x`, with the components (a, b) of each unbalance as given, if not None."""
+    """Return the best linear unknowns at `x`.
+
+    **Arguments**: `unbalance`: given components (a, b) of each unbalance; None to compute them too.
+    """
     if unbalance is None:
         return project(problem, x).linear
     total, n = _linear_equations(problem, x), unbalance.size
@@ -393,11 +396,13 @@ def _damped_step(
     bend: Callable[[Any, np.ndarray], np.ndarray] | None,
     positive: np.ndarray,
 ) -> np.ndarray | None:
-    """Return a damped step with its second-order correction; None if the correction is longer than three quarters of the step,
-    in multiples of the scale of each unknown.
+    """Return a damped step with its second-order correction; None if the correction is longer than three quarters of the step.
 
-    The logarithm of a parameter near 0 hardly changes the model, and its step is long. Such a step is shortened, and the other
-    unknowns adapt to it. If all steps were shortened together, the descent would stop.
+    Lengths are those of vectors whose entries are divided by the scale of each unknown, the inverse root of the diagonal of
+    `damped`.
+
+    A change of the logarithm of a parameter near 0 hardly changes the model; the step of this logarithm is therefore long. It
+    is shortened, and the other unknowns adapt to it. If all unknowns were shortened together, the descent would stop.
     """
     size, step, free = np.sqrt(np.diagonal(damped)), solved(damped, gradient), np.ones(len(gradient), bool)
     while np.max(np.abs(step[positive]), initial=0.0) > 1.001 * _LONGEST_STEP:
@@ -567,7 +572,7 @@ def _pass(
 
 
 def information_at(problem: Problem, linear: np.ndarray) -> Fitted:
-    """Return a fit without iterations, whose information is that at the first values of the unknowns x and at these linear
+    """Return a fit without iterations: its information is computed at the first values of the unknowns x and at the `linear`
     unknowns (L,)."""
     x = np.zeros(problem.unknowns.count)
     information, prior, _ = joint_equations(problem, x, linear)

@@ -47,8 +47,8 @@ _REFITS_NEAR_FIRST_VALUES = 2
 values."""
 
 _SAME_NOISE = 1.01
-"""Noise of a channel in such a repeated fit, relative to the fit before it, above which the repeated fit has ended at another,
-worse minimum."""
+"""Ratio of the noise of a channel in such a repeated fit to that in the fit before it. Above this ratio the repeated fit has
+ended at another, worse minimum."""
 
 _STEP = 1e-4
 """Relative change of a parameter in a difference quotient."""
@@ -65,8 +65,9 @@ class MachineFit(Result):
     - `notes`: sentences with repairs, doubts and advice
     - `scene` with the fitted parameters
     - `names` (k,), `units` (k,) and `estimates` (k,) of the parameters; the interval of an undetermined parameter is unbounded
-    - `scale` (k,), in `units`: change of each parameter that counts as the relative change 1, see `covariance` and
-      `information`: the value of a positive parameter, otherwise the absolute first value
+    - `scale` (k,), in `units`: the value to which changes of each parameter are relative in `covariance` and `information`. It
+      is the fitted value of a positive parameter; for other parameters it is the modulus of the first value (a typical
+      magnitude if the first value is 0)
     - `covariance` (k, k) of the relative errors of the parameters in the determined directions
     - `information` (k + g + 1, k + g + 1): Fisher information about relative changes of the parameters and of the gains, and
       about the angle of the first unbalance
@@ -80,10 +81,10 @@ class MachineFit(Result):
       the loads, their speeds and the angle of the rotor at the first sample; empty without loads
     - `channels`: names of the compared channels of each run, and their `kinds`
     - `noise`: standard deviation of the residuals of each run's channels, SI
-    - `p_value`: probability that pure noise has vibrations at orders of the rotor speed that are as strong as those of the
-      residuals; the smallest one of all channels
-    - `time`, s, `readings`, and `fitted` (readings of the fitted model), SI: arrays for each run, NaN for samples that do not
-      count
+    - `p_value`: smallest p-value of all channels. It is the probability that the vibrations of pure noise at orders of the
+      rotor speed are at least as strong as those of the residuals
+    - `time` (n,), s, `readings` (n, C) and `fitted` (n, C), the readings of the fitted model, SI, of each run with n samples of
+      C channels; NaN for readings that do not count
     """
 
     status: FitStatus
@@ -187,12 +188,13 @@ def identify(
     rotor follows from the run (a channel of kind "pulses", "angle" or "speed") or from a drive of prescribed speed.
 
     - The least-squares fit uses the whole record, including the transients
-    - The unknowns of the fit are the unknown parameters, the gains of the sensors (known to `gain_error`), the angle of the
-      unbalance, the offsets, and the state at the first sample
+    - The unknowns of the fit are the unknown parameters, the gains of the sensors (each is 1 with the standard error
+      `gain_error` of its channel), the angle of the unbalance, the offsets, and the state at the first sample
     - The noise of each channel may be coloured: residuals are whitened by an autoregressive model, and the
       intervals follow from the Fisher information with the estimated noise
-    - The loads of a scene with one exciter (balls, rollers, pendulums) must be jammed throughout the runs; their motion is that
-      of `vector_field`, and their angles and speeds at the first sample are unknowns
+    - An exciter can have loads (balls, rollers, pendulums) if the scene has no other exciter. The loads must be jammed
+      throughout the runs. Their motion follows from the equations of `vector_field`; their angles and speeds at the first
+      sample are unknowns
     - A scene with one exciter without loads can have nonlinear supports: `CubicSupport`, `FrictionSupport` and `Stop`. The
       parameters of a stop that is not touched in the runs are not determined
     - Parameters of a motor, such as "drive.inertia" and "drive.stall_torque", can be unknown if a channel gives the angle or
@@ -210,7 +212,7 @@ def identify(
       pendulum a `Record`
     - `unknown`: names of parameters of the scene or of arrays of them, such as "machine.stiffness"
     - `known`: values of parameters with their standard errors, such as {"machine.mass[1]": "95 kg +- 1 %"}; without an error
-      the value is exact. Parameters that are neither in `unknown` nor in `known` have the values of the scene exactly
+      the value is exact. All other parameters have exactly the values of the scene
     - `dry`, `air`, `torque`, `instrument`: only for a pendulum. True to identify the dry friction mu2, the drag b of the air or
       the torque M as well. `instrument`: relative uncertainty of J; typical: 0.01 to 0.03 (default 0)
     - `throw`: True (the default) to raise an error if there is no fit
@@ -269,7 +271,8 @@ def identify(
 def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted:
     """Return a fit in which undetermined combinations of parameters have nearly their first values.
 
-    A fit alone leaves them at an arbitrary point of a curved valley of equal residuals. Plans of further runs depend on them.
+    A single fit ends at an arbitrary point of a curved valley of equal residuals, and plans of further runs would depend on
+    this point.
     """
     first = [float(np.asarray(scene.exciters[k].unbalance, float)) for k in free_unbalances(problem)]
     for _ in range(_REFITS_NEAR_FIRST_VALUES):

@@ -43,7 +43,7 @@ _MAX_UNEVENNESS = 0.02
 """Largest deviation of a sample from the even grid, in steps."""
 
 EXACT = 1e-4
-"""Relative standard deviation of an unbalance that counts as known exactly."""
+"""Relative standard error that an exactly known unbalance has in a fit, in place of 0."""
 
 _FILTER_LENGTHS = (1, 9, 49, 129, 513)
 """Lengths to which filters are extended with zeros, so that filters of nearly equal length share a program."""
@@ -242,7 +242,7 @@ def is_of_drive(number: NamedNumber) -> bool:
 
 
 def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs: Sequence[MeasuredRun]) -> None:
-    """Raise if no record determines an unknown parameter of a drive."""
+    """Raise if the records do not determine an unknown parameter of a drive."""
     drive, measured = scene.exciters[0].drive, all(run.of_kind(*ROTOR_KINDS) for run in runs)
     if len(scene.exciters) == 1 and not drive.ideal and not drive.state_units() and measured and not is_nonlinear(scene):
         return
@@ -257,10 +257,11 @@ def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs:
 
 
 def _with_reduced_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
-    """Return the run with the sampling rate that its highest frequency needs if it is long, otherwise the same run.
+    """Return a long run with a lower sampling rate, which its highest frequency still allows; return other runs unchanged.
 
-    The natural frequencies are increased by a margin, because they are computed with the first values of the unknowns. Contacts
-    with a stop and friction at a support change accelerations faster than this frequency.
+    The natural frequencies are increased by a margin, because they are computed with the first values of the unknowns. Runs
+    with a stop or with friction at a support are not changed, because contacts and friction change accelerations faster than
+    the highest natural frequency.
     """
     is_smooth = all(term.is_smooth for term in terms_of(scene.effects, SupportForce))
     if not is_smooth or max(time.size for time in run.times.values()) < MIN_SAMPLES:
@@ -322,8 +323,8 @@ def _require_included(scene: Scene, runs: Sequence[MeasuredRun]) -> None:
         if not is_support and not has_term([effect], GravityField):
             raise InputError(
                 kind,
-                "is not included in identify, which needs viscous drag of loads, and supports that are linear, cubic, stops or "
-                "with dry friction; remove the effect",
+                "is not included in identify, which allows gravity, cubic supports, stops and supports with dry friction; "
+                "remove the effect",
             )
     if any(scene.machine.mounting(exciter.place).gyroscopic is not None for exciter in scene.exciters):
         raise InputError(
@@ -382,8 +383,10 @@ def _changed(scene: Scene, run: MeasuredRun) -> Scene:
 
 
 def with_angle_errors(problem: Problem, runs: Sequence[bool]) -> Problem:
-    """Return the problem with the errors of the rotor's angle in each run that is True in `runs` as further unknowns, which
-    have the standard normal distribution."""
+    """Return the problem with the errors of the rotor's angle as further unknowns, which have the standard normal distribution.
+
+    **Arguments**: `runs`: True for each run whose errors become unknowns.
+    """
     first, samples, left_out = problem.unknowns.count, list(problem.runs), list(problem.angle_errors)
     count = 0
     for k, (of_run, rotors, is_included) in enumerate(zip(problem.runs, problem.rotors, runs, strict=True)):
@@ -407,7 +410,8 @@ def _samples(
     """Return the samples of a run, the mask, the readings, their bounds, the times and the angles of the rotors."""
     channels = run.of_kind(*MOTIONS)
     if not channels:
-        raise InputError(run.source, f"has no channel of a motion; add a channel of kind {', '.join(MOTIONS)}")
+        kinds = f"{', '.join(MOTIONS[:-1])} or {MOTIONS[-1]}"
+        raise InputError(run.source, f"has no channel that the model can be compared with; add a channel of kind {kinds}")
     axes = scene.machine.mounting().axes
     for channel in channels:
         rows_of_channel(scene, channel)  # raises for a place that the machine does not have
@@ -452,7 +456,7 @@ def _samples(
 
 
 def _largest_readings(channels: Sequence[Channel], raw: np.ndarray, mask: np.ndarray) -> dict[str, float]:
-    """Return half the range of the readings of each kind, in SI."""
+    """Return, for each kind of channels, half of the largest range of the readings of a channel, in SI."""
     ranges: dict[str, float] = {}
     for channel, values, used in zip(channels, raw.T, mask.T, strict=True):
         ranges[channel.kind] = max(ranges.get(channel.kind, 0.0), 0.5 * float(np.ptp(values[used])))
@@ -488,7 +492,8 @@ def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: 
     """Return the problem with readings and models filtered such that the noise of the readings is white.
 
     **Arguments**: `noise` of the channels of each run; `differences` (n, C) of each run: readings minus model at the values
-    of the previous fit, from which the influence of outliers and of clipped readings follows; None if there is none.
+    of the previous fit. The influence of outliers and of clipped readings follows from them. Without them (None), outliers
+    count like other readings, and clipped readings are not used.
     """
     runs = []
     for r, (samples, mask, raw, of_channels) in enumerate(zip(problem.runs, problem.masks, problem.raw, noise, strict=True)):

@@ -63,7 +63,7 @@ class RunPlan(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the largest relative error of the parameters after each candidate run."""
+        """Plot the largest relative error of the parameters after each candidate run; an undetermined parameter counts as 1."""
         from jaxvib.draw.results import points_chart  # slow import
 
         largest = np.max(np.where(np.isfinite(self.errors), self.errors, 1.0), axis=1)

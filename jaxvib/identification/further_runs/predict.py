@@ -29,12 +29,12 @@ _NOISE_RATIO = 1.5
 `patterned`."""
 
 _NUMBER_ERROR = 1e-6
-"""Relative standard error of the parameters in a nonlinear motion, so small that a fit of the first state does not change
-them."""
+"""Relative standard error that fixes the parameters while the first state of a nonlinear motion is fitted."""
 
 
 _MIN_FILTERED = 64
-"""Smallest number of residuals per factor of a reduced sampling rate; with fewer, the rest counts as white noise."""
+"""Smallest number of residuals that remain after the filter that reduces their sampling rate. If this number limits the
+reduction, the residuals are assumed to be white noise in the rest of the reduction."""
 
 
 class PredictionStatus(eqx.Enumeration):
@@ -93,9 +93,9 @@ class RunPrediction(Result):
 def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     """Return the prediction of a run that the fit did not use, and its comparison with the readings.
 
-    - The parameters and the gains are those of the fit. The motion at the first sample and the offsets are fitted to the run.
-      The zero of the rotor's angle is also fitted, unless the fit and the run both have the mark of a tachometer and the scene
-      has neither loads nor nonlinear supports, or the scene has several exciters
+    - The parameters and the gains are those of the fit. The motion at the first sample and the offsets are fitted to the run
+    - The zero of the rotor's angle is fitted too, with two exceptions: the fit and the run both have the mark of a tachometer,
+      and the scene has neither loads nor nonlinear supports; or the scene has several exciters
     - A likelihood-ratio test compares two hypotheses: the machine has the same parameters in the run as in the fit, or it has
       other parameters. The test accounts for the errors of the fit and the noise of the run. If the p-value of the deviation is
       below 1e-5, the run contradicts the fit, and a note names the parameter whose change explains most of the deviation. In a
@@ -154,7 +154,7 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
 
 def _noise_ratio(fit: MachineFit, name: str, time: np.ndarray, residuals: np.ndarray) -> float:
     """Return the standard deviation of the residuals (n,) of a channel, relative to that of the last run of the fit with this
-    channel; NaN without such a run. The one with the higher sampling rate is reduced to the rate of the other."""
+    channel; NaN without such a run. The residuals with the higher sampling rate are reduced to the lower rate."""
     runs = [r for r, names in enumerate(fit.channels) if name in names]
     if not runs:
         return math.nan

@@ -30,7 +30,8 @@ _ORDERS = {"acceleration": 0, "velocity": 1, "displacement": 2}
 def divide(scene: Scene, count: int, step: float, readings: Mapping[str, float]) -> tuple[int, int, int]:
     """Return the number of the segments of a nonlinear motion, the samples of each, and the steps per sample.
 
-    **Arguments**: `count` of the samples, and their `step`, s; largest `readings` of each kind of channel, in SI.
+    **Arguments**: `count` of the samples, and their `step`, s; `readings`: amplitude of the readings of each kind of channel,
+    in SI.
     """
     fastest, slowest = (float(each) for each in frequency_bounds(scene))
     acceleration = max((value * fastest ** _ORDERS[kind] for kind, value in readings.items() if kind in _ORDERS), default=0.0)
@@ -39,8 +40,8 @@ def divide(scene: Scene, count: int, step: float, readings: Mapping[str, float])
     if is_stiff:
         raise InputError(
             "scene",
-            "has damping that makes speeds settle much faster than the vibration; reduce loads.drag, loads.radius or "
-            "machine.damping, or increase the width of effects.friction_support",
+            "has a decay rate much higher than the frequencies of the vibration; reduce loads.drag or machine.damping, or "
+            "increase the width of effects.friction_support",
         )
     for effect in scene.effects:
         if isinstance(effect, FrictionSupport) and acceleration > 0.0:

@@ -55,9 +55,10 @@ _MIN_TURNS = 8
 """Smallest number of turns of jammed loads in a record."""
 
 _COINCIDENT_SPREAD, _FREE_SPREAD = 1e-3, 0.2
-"""Standard deviations for equal loads at one station, and for all other loads: of the angles of the loads of a run at the first
-sample about their mean, rad, and of their speeds about the mean speed, relative to it. Equal loads at one station gather in a
-jam, and a small difference of their angles changes no reading."""
+"""Assumed scatter of the loads of a run at the first sample: the first number is that of equal loads at one station, the second
+that of all other loads. It is the standard deviation of the angles from their mean, rad, and of the speeds from the mean
+speed, relative to this speed. Equal loads at one station gather in a jam, and a small difference of their angles changes no
+reading."""
 
 _GAP_SIZE = 0.01
 """Gap between two segments, relative to the size of each state (angles: rad), that costs as much as a reading whose residual
@@ -67,8 +68,8 @@ _UNEXPLAINED = 0.25
 """Cost per reading, relative to the variance of the readings, above which a motion does not resemble the records."""
 
 _ABOVE_JAM, _SAME_STIFFNESS = 1.04, 0.01
-"""Natural frequency of a resonance relative to the speed of a jam at it, and change of the logarithm of the stiffnesses below
-which their first values are not replaced."""
+"""Ratio of a natural frequency to the speed of the jam near it, and change of the logarithm of the stiffnesses below which
+their first values are not replaced."""
 
 _MAX_TURN = 0.7
 """Largest change of the angle of a load in one step, rad."""

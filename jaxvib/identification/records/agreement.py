@@ -83,8 +83,8 @@ def check_agreement(
 def turn_speed(channel: Channel, time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return times, s, and the rotor speed, rad/s, from a channel of pulses (`value`: their numbers), angle or speed.
 
-    For pulses the speed is the average over each turn, because marks may be unevenly spaced. A pulse that a recorder rounds to
-    its samples changes this average by up to a sample per turn.
+    For pulses the speed is the average over each turn, because marks may be unevenly spaced. If a recorder rounds the times of
+    pulses to its samples, the duration of a turn has an error of up to one sampling step.
     """
     if channel.kind == "speed":
         is_finite = np.isfinite(value)

@@ -202,8 +202,9 @@ def dropouts(value: np.ndarray) -> np.ndarray:
 def without_spikes(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, list[str]]:
     """Return the readings with NaN in place of spikes, and a note about them.
 
-    Spikes are less than 10 readings beyond all others by more than three times the range of the others. A fit by least squares
-    begins with all readings, and one such spike is enough to hide the motion.
+    Spikes are at most 9 readings at each end of the range that exceed all other readings by more than three times the range of
+    the others. They are searched for in a channel of at least 100 readings. A fit by least squares begins with all readings,
+    and one such spike is enough to hide the motion.
 
     >>> value = np.sin(0.1 * np.arange(400.0))
     >>> value[7] = 500.0
