@@ -9,7 +9,7 @@ import jaxvib.code_changes  # noqa: F401  before all other imports, which it wat
 
 
 def _homes() -> dict[str, str]:
-    """Return the module that defines each public name, from the imports of the stub `__init__.pyi`, which type checkers use."""
+    """Return the module of each public name, as a dictionary; read from the imports of the stub `__init__.pyi`."""
     stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     return {alias.name: str(node.module) for node in imports for alias in node.names}
@@ -27,6 +27,7 @@ def __getattr__(name: str) -> Any:
         return version("jaxvib")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # `start` makes the settings of `prepare_cpu` and `use_cache`, which a user may call with other arguments.
     if not _HOMES[name].startswith(("jaxvib.errors", "jaxvib.runtime")):
         from jaxvib.runtime.startup import start
 

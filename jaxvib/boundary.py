@@ -3,7 +3,7 @@
 The decorator `validated` is applied to every public function and to the public methods of results. An argument of a wrong type,
 such as None in place of a scene, a string in place of a count or a list in place of a function, therefore raises an error with
 a message of one sentence before anything is traced. Each function itself checks the properties that a type does not express:
-bounds, units and names of numbers.
+bounds, units and names of parameters.
 """
 
 from __future__ import annotations
@@ -58,8 +58,10 @@ _MAX_WHOLE = 2**63 - 1
 def validated(function: F) -> F:
     """Check the arguments of a public function by its annotations before it runs.
 
-    **Raises** `InputError` for an argument of another type; `TypeError`, as Python does, for a name that the function does not
-    have.
+    A list given in place of an array is converted to an array of floats, and an array given in place of a list to a list.
+
+    **Raises** `InputError` for an argument of another type, and for a traced argument if the function needs its value;
+    `TypeError`, as Python does, for a name that the function does not have.
 
     >>> from pathlib import Path
     >>> @validated

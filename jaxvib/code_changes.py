@@ -60,7 +60,12 @@ class _WatchedModule(ModuleType):
 
 
 class _Code:
-    """Original definitions and files of the watched modules, and the current state of the code."""
+    """Original definitions and files of the watched modules, and the current state of the code.
+
+    **Attributes**: `stamps` of the source files at the import; `originals`: first values of names that were set from outside;
+    `members` of the classes at the import; `doubtful`: modules whose code may differ from the source files since their import;
+    `was_set`: True if a name was set since the last comparison; `last_differences`: result of the last comparison.
+    """
 
     def __init__(self) -> None:
         self.root = Path(__file__).parents[1]
@@ -128,7 +133,8 @@ def _stamp(file: str | Path) -> _Stamp:
 def _is_stale(file: str) -> bool:
     """Return True if Python used outdated bytecode.
 
-    Python does not detect an edit that keeps the size of the file and is made within the same second.
+    Python compares the size of the source file and its modification time in whole seconds. It therefore does not detect an edit
+    that keeps the size, if it is made in the same second as the edit before.
     """
     source, bytecode = _stamp(file), _stamp(importlib.util.cache_from_source(file))
     if source is None or bytecode is None:

@@ -31,7 +31,7 @@ _SPEED_FACTORS = {"rad/s": 1.0, "rpm": 30.0 / math.pi, "Hz": 0.5 / math.pi}
 
 
 ELECTRICAL = "rad/s of a supply"
-"""Unit of frequencies that are shown in Hz where speeds are shown in rpm."""
+"""Unit of the frequency of an electrical supply, shown in Hz for every unit of speeds, and in rad/s with SI units."""
 
 
 GRAVITIES = "g0"
@@ -55,8 +55,8 @@ def display_units(*, speed: SpeedUnit = "rpm", si: bool = False) -> None:
     **Arguments**
 
     - `speed`: unit of speeds and frequencies, "rpm", "Hz" or "rad/s"
-    - `si`: True for m, N/m and kg; False for mm, N/mm and g where they suit the size of the value. Use `speed="rad/s",
-      si=True` for machines with dimensionless parameters
+    - `si`: True for SI units, such as m, N/m, kg and rad; False for deg, and for mm, N/mm, g and kN if they suit the size of
+      the value. Use `speed="rad/s", si=True` for machines with dimensionless parameters
 
     **Returns** None. **Raises** `InputError` for another unit.
 

@@ -203,7 +203,8 @@ def optional_module(name: str, extra: str) -> ModuleType:
 def require_writable(path: Path) -> None:
     """Check that a file can be written, before the computation begins.
 
-    **Raises** `InputError` for a missing folder, a read-only file and a name that is not allowed.
+    **Raises** `InputError` for a missing folder, a path that is itself a folder, a read-only file and a name that is not
+    allowed.
     """
     try:
         if not path.parent.is_dir():

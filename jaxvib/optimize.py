@@ -1,4 +1,4 @@
-"""Alias of the package `optimize`, which a file optimize.py beside a user's script does not hide."""
+"""Alias of the package `optimize`. It finds the package even if a file optimize.py lies beside a user's script."""
 
 import importlib.util
 import sys

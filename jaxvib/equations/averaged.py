@@ -1,9 +1,14 @@
 """Averaged equations of motion: complex amplitudes of the carrier and load speeds in place of vibrations.
 
+**Symbols.** q are the coordinates of the carrier. M, C, K and G are its mass, damping, stiffness and gyroscopic matrices, and
+M includes the masses of the loads. n is the rotor speed. Load j has the mass m_j, the angle phi_j, the radius R_j, the inertia
+factor kappa_j (7/5 for balls) and the drag b_Wj; B_j q is the displacement of the point that carries it (B q if all loads have
+one point).
+
 **Carrier.** Let theta be the loads' mean angle and Omega = theta' their mean rate, phi_j = theta + psi_j, w_j = phi_j'. The
-motion is q = Re(Y e^{i theta}), q' = Re(V e^{i theta}), and the position of a load is R Re(exp(i phi) e), where e is the vector
-(1, -i) of the directions (horizontal, up). The carrier's equations M q'' + (C + n G) q' + K q = - sum_j m_j B^T p_j'', where M
-includes the loads' masses, become without any approximation
+motion is q = Re(Y e^{i theta}), q' = Re(V e^{i theta}), and the position of a load relative to its point is
+p_j = R_j Re(exp(i phi_j) e), where e is the vector (1, -i) of the directions (horizontal, up). The carrier's equations
+M q'' + (C + n G) q' + K q = - sum_j m_j B^T p_j'' become without any approximation
 
     Y' = V - i Omega Y
     V' = A - i Omega V,     M A = - (C + n G) V - K Y + B^T e sum_j S_j e^{i psi_j} (w_j^2 - i w_j'),     S_j = m_j R_j
@@ -122,8 +127,9 @@ class Averaged(eqx.Module):
       for the accelerations of the coordinates, so that their cost is linear in the number of masses
     - `unbalance` S_j kg m, `inertia` I_j kg m^2, `drag` D_j N m s of each rotating mass, all (count,)
     - `groups` of the exciters' drives, see `Group`
-    - of each exciter: `counts`, the number of its loads, 0 for an unbalance; `directions` of rotation
-    - `owners`: the exciter of each row of `port`
+    - `axes`: the p directions of the mount, 0 horizontal, 1 up
+    - of each exciter: `counts`, the number of its loads, 0 for an unbalance; `directions` of rotation, 1 or -1
+    - `owners`: the number of the exciter to which each row of `port` belongs
     - `other_rotors`: speeds, anticlockwise, rad/s, of the rotors whose masses are not part of the equations; the gyroscopic
       matrix of the machine belongs to them too
     """

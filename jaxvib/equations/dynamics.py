@@ -246,8 +246,10 @@ def vector_field(scene: Scene) -> Dynamics:
         kappa_j m_j J_j^T J_j u_j'' + kappa_j m_j J_j^T (dJ_j/dt) u_j' + m_j J_j^T B_j q'' = Q_u,      J_j = dp_j/du_j
         I theta'' = T(theta') - torque of loads and imbalance        (under a motor; I: moment of inertia of the rotor)
 
-    Load j has the mass m_j, the inertia factor kappa_j (7/5 for balls), the coordinates u_j, such as its angle, the position
-    p_j(u_j) relative to the point that carries it, and the generalized forces Q_u; B_j q is the displacement of this point.
+    q are the coordinates of the carrier, and M, C, K and G its mass, damping, stiffness and gyroscopic matrices. Load j has the
+    mass m_j, the inertia factor kappa_j (7/5 for balls), the coordinates u_j, such as its angle, the position p_j(u_j) relative
+    to the point that carries it, and the generalized forces Q_u; B_j q is the displacement of this point. theta is the angle of
+    the rotor, and T the torque of the motor.
 
     **Arguments**: `scene`, on any machine, with any drive and effects.
 

@@ -112,8 +112,13 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
             + theta' d'(theta).P q' + I_r theta'^2/2 + S g sin(theta)
             + sum_j [ (kappa_j - 1) m_j (|c_j|^2/2 - p_j'.c_j) + I_j s_j^2/2 ]
 
+    - q are the coordinates of the carrier with the mass matrix M and the stiffness matrix K
+    - load j has the mass m_j, the coordinates u_j, the position p_j relative to the point that carries it, and the inertia
+      factor kappa_j (7/5 for balls); B_j q is the displacement of this point
+    - theta is the angle of the rotor, and P q the displacement of its axis
     - V_j and V are the potentials of the effects on the loads and on the supports
-    - d(theta) is the vector of the unbalance S of the rotor and of its other imbalances
+    - d(theta) is the vector of the unbalance S of the rotor and of its other imbalances; d' is its derivative with respect to
+      theta
     - I_r is the inertia of a motor's rotor (an ideal drive has none); g is the gravity in the plane of the rotor
     - the terms of the loads and of the rotor are added over all exciters
     - c is the sliding velocity of a load's contact point and s its spin about the contact normal; each is 0 unless an effect
@@ -214,9 +219,11 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
         P_diss = q'.C q' + sum_j M_j (speed - phi_j') + power of effects
         M_j = b_W R^2 (speed - phi_j') + friction
 
-    - M_j is the torque of the rotor on load j; `friction` is the torque of contact friction
+    - M_j is the torque of the rotor on load j with the angle phi_j, the drag b_W and the radius R; `friction` is the torque of
+      contact friction
     - T is the torque with which an ideal drive turns its rotor against the loads, the unbalance S with the other imbalances (d,
       see `energy`) and the weight of the unbalance; g is the gravity in the plane of the rotor
+    - q are the coordinates of the carrier with the damping matrix C; P and theta as in `energy`
     - `speed` is the rotor speed. If the housing of the drive turns with the machine, the speed in P_in is that of the
       rotor relative to the housing
     - the effects that dissipate power are those on supports, contacts between loads, and resistances to the motion of the loads
@@ -293,7 +300,7 @@ def _drive_torque(
 
 
 def drive_torques(model: Model, field: Dynamics, t: Array, state: State) -> tuple[Array, Array]:
-    """Return the torque of each drive in the direction of its rotation, N m, and its power, W, (N,) each.
+    """Return the torque of each drive in the direction of its rotation, N m, and its power, W, as arrays (exciters,).
 
     **Arguments**: `field`: `dynamics_of(model)`; `t`, s. The torque with which the rotor changes the spin of loads that spin or
     slide is not included.
@@ -371,8 +378,9 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
 
         N = m (z - n . (a + g e)),      z = R phi'^2 for a load on a circle,      see `Loads.normal_force`
 
-    z is the centrifugal acceleration of the motion of the load relative to the point that carries it, a the acceleration of
-    this point, n the direction in which the load presses, g the acceleration of gravity, and e the unit vector against gravity.
+    m is the mass of the load, R the radius of its circle and phi its angle. z is the centrifugal acceleration of the motion of
+    the load relative to the point that carries it, a the acceleration of this point, n the direction in which the load presses,
+    g the acceleration of gravity, and e the unit vector against gravity.
     If N is negative, the equations keep the load on its track. Its friction is then proportional to |N| on a circle and 0 in a
     torus.
 

@@ -70,6 +70,9 @@ class LinearModel(Model):
 
         D(w) = K - w^2 M + i w (C + n G),      M = M_carrier + sum_j m_j B_j^T B_j
 
+    D is the dynamic stiffness. C, K and G are the damping, stiffness and gyroscopic matrices of the carrier, and n is the rotor
+    speed. Load j has the mass m_j, and B_j q is the displacement of the point that carries it (B q for loads at one point).
+
     **Attributes**, in addition to those of `Model`: `mass` M (nd, nd) kg, with each load at its own place; `modal`, the modal
     form of the model, see `decomposed`.
     """
@@ -79,7 +82,10 @@ class LinearModel(Model):
 
     @property
     def direction(self) -> Array:
-        """B^T e (nd,) complex. A unit force that turns at the mount acts on the coordinates with Re(B^T e exp(i w t))."""
+        """B^T e (nd,) complex, with e from `rotating_direction`.
+
+        A unit force that turns with w at the mount has the generalized force Re(B^T e exp(i w t)).
+        """
         return self.mount.rows[0].T @ rotating_direction(self.mount)
 
     def damping(self, speed: Array) -> Array:
@@ -161,7 +167,8 @@ def linear_model(scene: Scene) -> LinearModel:
 def mean_speed(scene: Scene, unbalances: Array | None = None) -> Array:
     """Return the mean speed of all rotors, rad/s, anticlockwise.
 
-    Rotors without loads turn at the speed `unbalances`, rad/s, others at the working speeds of their drives (default: all).
+    Rotors turn at the working speeds of their drives. If `unbalances`, rad/s, is given, rotors without loads turn at this speed
+    instead.
     """
     speeds = [
         exciter.direction * (exciter.drive.speed if unbalances is None or exciter.loads is not None else unbalances)
@@ -277,9 +284,12 @@ def jammed_model(scene: Scene) -> JammedModel:
 def natural_frequencies(scene: Scene) -> Array:
     """Return the undamped natural frequencies of the carrier with its loads, ascending, (nd,) rad/s.
 
-        det(K - w^2 (M + sum_j m_j B^T B)) = 0
+        det(K - w^2 (M + sum_j m_j B_j^T B_j)) = 0
 
-    **Arguments**: `scene`; only its machine and its loads are used.
+    K and M are the stiffness and mass matrices of the carrier. Load j has the mass m_j, and B_j maps the coordinates of the
+    carrier to the displacement of the point that carries the load.
+
+    **Arguments**: `scene`; only its machine, its loads and the masses of its unbalances are used.
 
     **Returns** an array (nd,), rad/s; typical: 10 to 100 for platforms on springs, 100 to 500 for rotors. Derivatives are
     finite for equal frequencies, and taken as 0 at frequency 0 (a carrier that is free to drift).

@@ -75,7 +75,7 @@ class ModalResponse(eqx.Module):
 
 @jax.custom_jvp
 def _reciprocal(x: Array) -> Array:
-    """Return 1/x. Its derivative is computed without another division, which takes half of the time of a sum over poles."""
+    """Return 1/x, with a derivative without another division: divisions take half of the time of a sum over poles."""
     return 1.0 / x
 
 

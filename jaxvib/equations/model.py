@@ -1,4 +1,4 @@
-"""Model of a scene: its matrices and places, assembled once for each analysis and passed on."""
+"""Model of a scene: its matrices, mounts and places of supports. Each analysis assembles the model once and passes it on."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Group(eqx.Module, Generic[Part]):
     members: tuple[int, ...] = eqx.field(static=True)
 
     def each(self, function: Callable[..., T], *values: object) -> T:
-        """Return function(part, *values) of each member."""
+        """Return function(part, *values); for several members, arguments and result have a leading axis over them."""
         return (function if len(self.members) == 1 else eqx.filter_vmap(function))(self.part, *values)
 
 
@@ -102,7 +102,7 @@ class Model(eqx.Module):
         return force
 
     def known_force(self, force: Array) -> Array:
-        """Return a force on the foundation as results state it: NaN for a machine whose foundation is unknown."""
+        """Return a force on the foundation, or NaN for a machine whose foundation is unknown (`Machine.has_foundation`)."""
         return force if self.scene.machine.has_foundation else jnp.full_like(force, jnp.nan)
 
     def vibration_force(self, displacement: Array, omega: Array) -> Array:

@@ -143,7 +143,9 @@ def resolve_contact(
 def slip_rates(loads: Loads, u: Coordinates, rate: Coordinates, slip: Coordinates, change: Sequence[Array]) -> Coordinates:
     """Return the rate of the slip along each coordinate, m/s^2.
 
-    The rate is the tangential part `change` of c', minus a part due to the rotation of the tangents.
+    The slip c is a vector with the components `slip` along the tangents of the track. `change` contains the components of c'
+    along the tangents. The rate of a component of c differs from that component of c', because the tangents rotate while the
+    load moves.
     """
 
     def tangents(*v: Array) -> list[list[Array]]:

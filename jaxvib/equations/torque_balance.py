@@ -2,15 +2,15 @@
 
 The angle of rotating mass k in the fixed frame is th_k = sigma_k (Omega t + alpha_k), with sigma_k = +1 anticlockwise, -1
 clockwise, and e_k = (1, -i sigma_k). The displacement of its point is B_k q, S_k is its unbalance, and L_k its driving
-torque: that of the drag on a load, T(Omega) of the motor of an unbalance. With D(w) = K - w^2 M + i w (C + n G), where n is the
-rotor speed,
+torque: that of the drag on a load, T(Omega) of the motor of an unbalance. M, C, K and G are the mass, damping, stiffness and
+gyroscopic matrices of the carrier with its loads, and n is the rotor speed. With D(w) = K - w^2 M + i w (C + n G),
 
     H_ik = e_i^H B_i D(Omega)^-1 B_k^T e_k
     V_i = (Omega^4/2) sum_k S_i S_k Im(exp(i (alpha_k - alpha_i)) H_ik)
     L_i(Omega) + V_i = 0,       q = Re(Y exp(i Omega t)),     Y = Omega^2 D^-1 sum_k B_k^T e_k S_k exp(i alpha_k)
 
-Source: the averaged equations (`jaxvib.equations.averaged`) at rest; I. I. Blekhman, Synchronization in Science and Technology,
-1988, for unbalances; Artyunin 2013 for pendulums.
+Source: the equilibria of the averaged equations (`jaxvib.equations.averaged`); I. I. Blekhman, Synchronization in Science and
+Technology, 1988, for unbalances; Artyunin 2013 for pendulums.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class TorqueBalance(eqx.Module):
 
     @property
     def speed(self) -> Array:
-        """Largest working speed of a drive, rad/s; of a scene with one exciter its rotor speed."""
+        """Largest working speed of all drives, rad/s."""
         drives = self.averaged.drives
         return drives[0].speed if len(drives) == 1 else jnp.max(jnp.stack([drive.speed for drive in drives]))
 
@@ -109,10 +109,9 @@ class TorqueBalance(eqx.Module):
         return eqx.tree_at(lambda balance: balance.model, self, self.model.decomposed(self.direction))
 
     def total_driving_torque(self, omega: Array, factor: Array | None = None) -> Array:
-        """Return `driving_torque`, with all its differences between the masses multiplied by `factor`.
+        """Return `driving_torque`, with the differences of the torques from their mean multiplied by `factor`.
 
-        If an ideal drive turns an unbalance, the torques of all others are multiplied, because the ideal drive balances any
-        torque.
+        If an ideal drive turns an unbalance, all torques are multiplied, because the ideal drive balances any torque.
         """
         torque = self.driving_torque(omega)
         if factor is None:
@@ -431,14 +430,15 @@ def response_of(balance: TorqueBalance, omega: Array, rate: Array | None = None)
 def torques_at(unbalance: Array, influence: Array, omega: Array, phasors: Array) -> Array:
     """Return the mean torques V (count,), N m, of the vibration on masses that turn at `omega`, rad/s.
 
-        V_j = (w^4/2) S_j sum_k S_k Im[exp(i (a_k - a_j)) e^H B_j D(w)^-1 B_k^T e],     S = m R
+        V_j = (w^4/2) S_j sum_k S_k Im[exp(i (a_k - a_j)) H_jk],     H_jk = e_j^H B_j D(w)^-1 B_k^T e_k,     S = m R
         D(w) = K - w^2 (M + sum_j m_j B_j^T B_j) + i w (C + n G)
 
-    w is `omega`; e = (1, -i) for two directions of the mount, 1 for one. B_j (directions of the mount, nd) maps the carrier's
-    coordinates to the displacement of the mount at mass j; M, C, K and G are the matrices of the carrier, n is the rotor speed.
+    w is `omega`. B_j (directions of the mount, nd) maps the carrier's coordinates to the displacement of the point that carries
+    mass j, and e_j = (1, -i sigma_j) contains an entry for each of these directions (for platforms, which move up only,
+    e_j = -i sigma_j). M, C, K and G are the matrices of the carrier, and n is the rotor speed.
 
-    **Arguments**: `unbalance` S (count,); `influence` e^H B_j D^-1 B_k^T e (count, count), see `influence_of`; `phasors`
-    exp(i a) (count,).
+    **Arguments**: `unbalance` S (count,), kg m; `influence` H (count, count), m/N, see `influence_of`; `phasors` exp(i a)
+    (count,) of the phases a.
 
     Source: Artyunin 2013, the pendulums' equation of (1), averaged over a turn.
     """

@@ -93,12 +93,12 @@ class Ensemble(Result):
     - `masses`: for several exciters, the `RotatingMasses` of each run: angle turned in the last quarter, phase at the end, and
       the resonance that catches the mass; `regimes` names the motions that follow from them. None for one exciter
     - `speed_group` (B,): groups of runs by the speed of their masses, from 1, ascending; 0 for runs with different speeds
-    - `error` (B,): estimated error of the final state, as for a `Run`, with displacements relative to the largest displacement
-      of the same run; typical: below 1e-6 with the default steps. NaN if no estimate was requested or the motion did not stay
+    - `error` (B,): estimated error of the final state, as for a `Run`; the largest displacement and velocity are those of the
+      final state. Typical: below 1e-6 with the default steps. NaN if no estimate was requested or the motion did not stay
       finite; infinite for 4 steps or fewer, because a run with larger steps does not exist
     - `allowed` (B,): False if `make` returned a scene with a value that its constructor does not allow
     - `finite` (B,): True if the motion stayed finite
-    - `resolved` (B,): False if explicit steps are too long for the fastest decay
+    - `resolved` (B,): False if explicit steps are too long for the fastest decay, which is possible under a JAX transformation
     - `detached` (B, count): True if, at any stage of any step, the track would have had to pull the load although it can only
       push
     - `steps` of each run
@@ -246,8 +246,9 @@ def ensemble(
     - `until`: end time of all runs, s or text; typical: 5 to 60
     - `stepsize_controller`: `EqualSteps(n)`, the number of steps of each run, rounded up to a multiple of 4. The default is 4
       for each radian of the fastest motion, or more to resolve a faster decay, by the drag of the loads, the damping of the
-      carrier or friction at a support. If a decay is at least 100 times as fast as the motion, all runs take implicit steps,
-      32 for each radian. The time is proportional to n
+      carrier, friction at a support or a motor. If a decay is at least 100 times as fast as the motion, all runs take implicit
+      steps, 32 for each radian. If n explicit steps would not resolve the decay, the n steps are implicit too (not under a JAX
+      transformation). The time is proportional to n
     - `estimate`: True to estimate errors by a second run with half as many steps, which takes half the time of the first. The
       estimate requires more than 4 steps
     - `batch`: number of runs that advance together; typical: the default, 64 on a CPU and 262,144 on an accelerator. The

@@ -126,8 +126,8 @@ def growth(
       unstable if it returns to its former state within three turns of its rotor and loads. An unstable jam is an example; its
       exponent is ln|multiplier| divided by the period of `jam_orbit`. An unstable motion that repeats itself only after more
       turns is called chaotic
-    - "regular": G + 3 s < ln 1000, and one of two conditions: G is not larger than 2 s or ln 1.01, the growth that errors of
-      integration can cause; or G < ln 2.1 with rates that decrease as for growth proportional to time
+    - "regular": G + 3 s < ln 1000, and one of two conditions: G is at most the larger of 2 s and ln 1.01 (the growth that
+      errors of integration can cause); or G < ln 2.1 with rates that decrease as for growth proportional to time
     - "undecided": all other cases, for example if the rate is certain but the run is too short to reach ln 1000
 
     Rounding makes every run leave an unstable motion after some time. The result then belongs to the motion that it reaches.

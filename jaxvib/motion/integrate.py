@@ -133,10 +133,11 @@ def motor_poles(drive: Drive) -> Array:
 
 @cached
 def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
-    """Return the largest and the smallest of rotor speed and natural frequencies, rad/s.
+    """Return the fastest and the slowest frequency of the motion of a scene, rad/s.
 
-    A natural frequency of 0 (a free carrier) is ignored. The largest value includes the natural frequency of the loads, if they
-    have one, the rates of effects, the largest speed of a drive during a run, and the frequencies of motors, see `motor_poles`.
+    The fastest is the largest of these: the natural frequencies of the carrier, that of the loads if they have one, the rates
+    of effects, the speeds of the drives during a run, and the frequencies of motors (see `motor_poles`). The slowest is the
+    lowest natural frequency of the carrier, in which the working speed replaces a frequency of 0 (a free carrier).
     """
     scene = jax.lax.stop_gradient(scene)
     frequencies, speed = estimated_frequencies(scene), scene.top_speed

@@ -50,7 +50,8 @@ _IMPLICIT_STEPS_FACTOR = 16.0
 """Factor by which the implicit method increases the default of `max_steps`."""
 
 _SEGMENT_TURNS = 2.0e4
-"""Number of turns after which single precision no longer resolves time; longer runs are divided into segments."""
+"""Number of turns of the fastest motion after which single precision no longer resolves time; longer runs are divided into
+segments."""
 
 
 @dataclass(frozen=True)
@@ -251,8 +252,9 @@ def plan_segment(scene: Scene, length: float, state: State, steps: StepChoice, *
 
 
 def enough_steps(fastest: Array | np.ndarray, end: Array, chosen: StepChoice | None = None) -> int:
-    """Return a maximum number of steps: 500 for each turn of the `fastest` motion, rad/s, and at least the number of `chosen`
-    equal steps, rounded up to a power of 2.
+    """Return a maximum number of steps, a power of 2.
+
+    It is at least 4096 plus 500 for each turn of the `fastest` motion, rad/s, and at least the number of `chosen` equal steps.
 
     The number can be a static argument of a program; with powers of 2, few programs are compiled. **Raises** `InputError` for a
     run that would need too many steps.

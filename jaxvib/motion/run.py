@@ -118,10 +118,11 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
       transformation
 
     The `error` is the largest error of a state in the window: displacements relative to the largest displacement, velocities
-    relative to the largest velocity, angles in rad, speeds of loads relative to the rotor speed.
+    relative to the largest velocity (both at least to their natural unit, see `Tolerance`), angles in rad, speeds of loads
+    relative to the rotor speed.
 
-    - It is estimated as a fraction of the difference from a run with larger steps, or as twice this difference if an effect is
-      not `smooth`, or if the acceleration of a drive jumps and the steps are equal; rounding errors are added
+    - It is estimated as a fraction of the difference from a run with larger steps, or as twice this difference if an effect or
+      a drive is not smooth, or if the acceleration of a drive jumps and the steps are equal; rounding errors are added
     - A motion whose phase is not determined has a large error, but its amplitudes may be exact
     """
 
@@ -300,8 +301,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
         **Returns** `Spectrum`; for several segments its figure is a waterfall diagram, with resonances marked.
 
-        **Raises** `InputError` for more segments than the samples allow, and for several segments if the run kept only its
-        window or fewer than 3 states for each turn of the rotor, and for a run that failed.
+        **Raises** `InputError` for a run that failed, for more segments than the samples allow, and for several segments if the
+        run kept only its window, or if it kept fewer than 3 states for each turn of the rotor.
         """
         self._require_end()
         return spectrum_of(self.scene, self.window, self.trajectory, parts)

@@ -75,14 +75,14 @@ def simulate(
     - `estimate`: True to estimate the `error` of the run by a second run with larger steps, which needs about half as many
       evaluations. The default is True, but False under a JAX transformation and with a step size controller of diffrax
     - `stepsize_controller`: choice of the steps, see below
-    - `solver` and `adjoint` of diffrax. The default solver is `Rodas4` for scenes in which drag or damping causes a decay 100
-      times as fast as the motion (not under a JAX transformation), otherwise the method of Dormand and Prince of order 8:
-      `UnrolledDopri8`, or `LoopDopri8` for large scenes and under JAX transformations. The default adjoint gives reverse
-      derivatives of exactly the steps that were taken. Forward derivatives, `diffrax.ForwardMode()`, take less time for up to
-      about ten parameters
-    - `max_steps`: the run fails after this number of steps; default: 500 for each turn of the fastest motion, 2^20 under a JAX
-      transformation of the scene, and at least the number of `EqualSteps`. A reverse derivative stores a time for each of these
-      steps: use a smaller value for large batches
+    - `solver` and `adjoint` of diffrax. The default solver is `Rodas4` if drag, damping or a motor causes a decay 100 times as
+      fast as the motion and the `State` has at most 64 entries (not under a JAX transformation). Otherwise it is the method of
+      Dormand and Prince of order 8: `UnrolledDopri8` for up to 8 entries, `LoopDopri8` for more entries and under JAX
+      transformations. The default adjoint gives reverse derivatives of exactly the steps that were taken. Forward derivatives,
+      `diffrax.ForwardMode()`, take less time for up to about ten parameters
+    - `max_steps`: the run fails after this number of steps; default: at least 500 for each turn of the fastest motion (16 times
+      as many for `Rodas4`), 2^20 under a JAX transformation of the scene, and at least the number of `EqualSteps`. A reverse
+      derivative stores a time for each of these steps: use a smaller value for large batches
     - `progress_meter` of diffrax, which shows the finished share of the time
     - `throw`: True to raise `ComputationError` if the run fails; otherwise, and under a JAX transformation, its status shows
       the failure
@@ -103,8 +103,8 @@ def simulate(
       a contact with a `Stop` or a `LoadContact` that has damping begins, and its force jumps. Second derivatives
       (`jax.hessian`) exist for scenes whose forces and torques are smooth
     - In single precision, the default methods of order 8 keep angles within one turn during the integration, and angles of the
-      window are relative to the number of turns at its beginning. Runs of one exciter of more than 20,000 turns at constant
-      speed that keep only a window are divided into segments. Long runs therefore keep their phase
+      window are relative to the number of turns at its beginning. Runs of one exciter at constant speed that keep only a
+      window are divided into segments of up to 20,000 turns of the fastest motion. Long runs therefore keep their phase
 
     **Raises** `InputError` for values that are not allowed, `ComputationError` for a run that does not finish.
 

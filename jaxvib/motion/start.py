@@ -172,8 +172,8 @@ def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> Sta
 
         c = p' - w axis x (p + r n),    s = - w axis . n
 
-    p is the position of the centre of a load, r its radius and n the normal of its contact; w is the rotor speed. c is the slip
-    and s the drilling spin.
+    p is the position of the centre of a load, r its radius and n the normal of its contact; w is the rotor speed, and axis the
+    unit vector along the axis of the rotor. c is the slip and s the drilling spin.
 
     **Arguments**
 

@@ -1,1 +1,1 @@
-"""Small linear algebra, roots and Fourier interpolation on plain arrays."""
+"""Numerical methods on plain arrays: small linear algebra, roots, extrema, Fourier interpolation, sines, noise."""

@@ -66,8 +66,7 @@ def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents],
 
 
 def batch_last(function: Callable[[X], Out], batched: Callable[[X, Batched], Out]) -> Callable[[X], Out]:
-    """Return a function that computes `function`, by `batched` under `vmap`. JAX batches its derivatives of any kind as
-    usual.
+    """Return `function` with a rule for batches: under `vmap`, `batched` computes it. JAX batches its derivatives as usual.
 
     JAX makes the batch the first axis of the state of a loop. `batched` may make the batch the last axis: every number of the
     program is then a vector over the batch, contiguous in memory.

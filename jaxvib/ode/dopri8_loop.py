@@ -83,7 +83,7 @@ class LoopDopri8(AbstractDopri8):
         return _WITH_TANGENTS if self.tangents else _WITHOUT_TANGENTS
 
     def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> _Known:
-        """Initial state of the method, without a known stage."""
+        """Return the initial state of the method, without a known stage."""
         return (jnp.zeros_like(ravel(y0)), jnp.asarray(0)) if self.reuse else None
 
     def advance(

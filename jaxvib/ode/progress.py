@@ -40,7 +40,7 @@ class ProgressBar(diffrax.AbstractProgressMeter):
     """Progress bar of a run, in steps of one percent."""
 
     def init(self) -> Array:
-        """State of the meter: the progress shown last."""
+        """Return the state of the meter, the progress that is shown: 0."""
         return jnp.array(0.0)
 
     def step(self, state: Array, progress: RealScalarLike) -> Array:

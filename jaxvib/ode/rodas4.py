@@ -100,7 +100,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         return 4
 
     def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Array, args: Args) -> None:
-        """Initial state of the method, which is empty."""
+        """Return the initial state of the method, None."""
 
     def func(self, terms: Terms, t0: RealScalarLike, y0: Array, args: Args) -> Array:
         """Return the rates."""

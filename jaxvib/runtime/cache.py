@@ -1,4 +1,4 @@
-"""Folder in which compiled programs are cached on disk."""
+"""Folder in which traced and compiled programs are cached on disk."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _program_folder: list[Path] = []
 
 @validated
 def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bool = False) -> Path:
-    """Cache compiled programs on disk; another process with the same computation then neither traces nor compiles it.
+    """Cache programs on disk. Another process that runs the same program then neither traces nor compiles it.
 
     - There are two caches: jaxvib's own cache of traced programs in `folder/programs`, and JAX's compilation cache of compiled
       programs in `folder` itself (`jax_compilation_cache_dir` is not changed if it is already set)
@@ -34,7 +34,7 @@ def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bo
 
     **Arguments**
 
-    - `folder`, which is created if it does not exist; default: JAX's compilation cache if it is set, otherwise
+    - `folder`, which is created if it does not exist; default: that of JAX's compilation cache if it is set, otherwise
       `$XDG_CACHE_HOME/jaxvib`, otherwise `~/.cache/jaxvib`
     - `only_if_unset`: True keeps a folder that was chosen before
 

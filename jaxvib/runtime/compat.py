@@ -88,8 +88,8 @@ def traced(value: object) -> bool:
 
 
 def inner_value(tracer: object) -> object | None:
-    """Return the next inner value of `tracer`, the one whose derivative or batch it represents. This value may be a tracer
-    too. None for a tracer of `jit`."""
+    """Return the value whose derivative or batch a `tracer` represents; None for a tracer of `jit`. The value may be a tracer
+    too."""
     kind = type(tracer).__name__
     return getattr(tracer, {"JVPTracer": "primal", "LinearizeTracer": "primal", "BatchTracer": "val"}.get(kind, ""), None)
 

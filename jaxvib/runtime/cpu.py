@@ -28,9 +28,9 @@ def prepare_cpu(devices: int | None = 1) -> str:
     """Set XLA's flags in the environment, before JAX computes anything.
 
     With jax before 0.12 the first use of a public name of jaxvib calls this function, unless JAXVIB_AUTOMATIC=off in the
-    environment: without `xla_cpu_small_while_loop_byte_threshold` XLA's CPU backend runs the body of all but the smallest loops
-    as a chain of small functions, and time integration takes many times as long; the time for steady states hardly changes.
-    From 0.12 on XLA needs no flag, and jaxvib does not call this function. The flags, in `XLA_FLAGS`:
+    environment. Without the first of the flags below, XLA's CPU backend runs the body of all but the smallest loops as a chain
+    of small functions. Time integration then takes many times as long; the time for steady states hardly changes. From 0.12 on
+    XLA needs no flag for this, and jaxvib does not call this function. The flags, in `XLA_FLAGS`:
 
     - `xla_cpu_small_while_loop_byte_threshold=1000000000`, jax before 0.12: compiles a whole time loop into one function
     - `--xla_cpu_use_fusion_emitters=false`, jax before 0.11: a code generator that needs two thirds of the compile time
@@ -47,7 +47,7 @@ def prepare_cpu(devices: int | None = 1) -> str:
     **Arguments**: `devices`: number of CPU devices, at least 1; typical: 1 (the default); None: the number of cores that this
     process may use.
 
-    **Returns** the flags. **Raises** `InputError` if JAX has computed already, so that they would have no effect, or for a
+    **Returns** the flags. **Raises** `InputError` if JAX has computed already, because flags then have no effect, and for a
     number of devices below 1.
 
     >>> import jax.numpy as jnp, jaxvib as jv

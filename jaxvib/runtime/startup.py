@@ -16,8 +16,9 @@ from jaxvib.runtime.cpu import has_flags, limit_blas_threads, prepare_cpu
 def start() -> None:
     """Call `prepare_cpu()` and `use_cache()`, unless they were called before or JAXVIB_AUTOMATIC=off in the environment.
 
-    The first use of a public name of jaxvib, other than errors and these two functions, and the first part of a scene call
-    `start`. It issues a warning
+    `prepare_cpu` is called only with versions of XLA that need its flags. The function `start` is called by the first use of a
+    public name of jaxvib, other than errors and names of `jaxvib.runtime`, and when the first part of a scene is made. It
+    issues a warning
 
     - if JAX has already begun to compute, because XLA's options then have no effect
     - if programs cannot be cached

@@ -67,8 +67,11 @@ _MAX_WINDOW_TURNS = 256
 
 
 class _Tolerance(WrappedController):
-    """Step size controller with errors relative to the norm of a complex vector, because its real or imaginary part is often
-    0."""
+    """Step size controller with errors relative to the largest entry of a block of variables, such as all parts of Y.
+
+    An error relative to each entry alone would be too strict, because the real or imaginary part of an amplitude is often 0.
+    `blocks`: the number of variables in each block; only absolute errors count in the last one, the phases.
+    """
 
     controller: diffrax.AbstractStepSizeController
     blocks: tuple[int, ...] = eqx.field(static=True)

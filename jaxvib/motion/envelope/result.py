@@ -91,7 +91,7 @@ _OFFSET = "no spring returns the machine to its place: amplitudes include its di
 
 
 def _moves_without_spring(scene: Scene) -> bool:
-    """Return True if a machine can move without a spring."""
+    """Return True if a machine can move without the force of a spring."""
     eigenvalues = np.linalg.eigvalsh(np.asarray(scene.machine.carrier().stiffness))
     return bool(eigenvalues[0] <= np.finfo(eigenvalues.dtype).eps ** 0.75 * max(eigenvalues[-1], 0.0))
 
@@ -101,8 +101,8 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
 
     Returned by `envelope`. `ellipse` and `deck` describe the motion of points by the mean of the amplitudes over the window.
 
-    The amplitude is the largest |q|. If a machine can move without a spring, it includes the displacement from the start, which
-    remains; the amplitude of `simulate` is half of the range of q.
+    The amplitude is the largest |q|. If a machine can move without the force of a spring, the displacement from the start
+    remains and is included in the amplitude, whereas the amplitude of `simulate` is half of the range of q.
 
     **Attributes**: those of `AbstractMeasured`, and
 

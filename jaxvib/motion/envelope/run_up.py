@@ -34,7 +34,7 @@ _SAMPLES = 4096
 """Number of stored times of a run-up, from which peaks are read."""
 
 _START_ANGLES = 8
-"""Number of runs with different initial angles for each motor of `_turned_motors`."""
+"""Number of initial angles, and of runs, for each motor of `_turned_motors`."""
 
 _LIFTING_SHARE = 0.02
 """Relative difference between the least torque and the torque that lifts an unbalance up to which they count as equal; the
@@ -165,8 +165,8 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
 
     - `scene` as for `envelope`, with at least one motor
     - `until`, s or text: end of the run; an exciter that has not passed by then is regarded as caught; typical: 5 to 60
-    - `least`: True to search for `least_torque` by bisection, in about 16 runs, to 1 %, between 1/64 and 64 times the torque.
-      The search assumes that a motor that passes also passes with more torque
+    - `least`: True to search for `least_torque` between 1/64 and 64 times the torque, to 1 %, in up to 13 more runs. The search
+      assumes that a motor that passes also passes with more torque
 
     The peaks of several exciters depend on the angles between them when they reach the resonance. The starting angles and the
     weight of the unbalances, which averaging omits, determine these angles. Peaks are therefore the largest ones of several
