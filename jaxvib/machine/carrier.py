@@ -332,8 +332,8 @@ class Machine(Part):
         return None
 
     def require_valid(self) -> None:
-        """**Raises** `InputError` for arrays that were replaced and do not fit together. By default no array is examined: the
-        constructor is called again with the new values."""
+        """**Raises** `InputError` for arrays that were replaced and do not fit together. By default nothing is examined here,
+        because `validate_scene` calls the constructor again with the new values."""
 
     @property
     def has_foundation(self) -> bool:
@@ -342,7 +342,7 @@ class Machine(Part):
 
     @property
     def body_count(self) -> int:
-        """Number of bodies on which a point is given by (x, y)."""
+        """Number of bodies; 1 for every machine other than a network of bodies in a plane."""
         return 1
 
     def require_body(self, body: int) -> int:

@@ -337,7 +337,13 @@ def build_kind(table: object, section: str, kinds: Mapping[str, Callable[..., T]
 
 
 def build_part(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
-    """Return `build(**values)`. **Raises** `InputError` for an unknown or missing name, as `section.name`."""
+    """Return the part that the constructor `build` makes of the fields of a table.
+
+    Tables in these fields (supports, bodies, a drag from its cause, a mass from its material, a drive within a drive) are
+    replaced by their parts or values first.
+
+    **Raises** `InputError` for an unknown or missing field, which the message names as `section.name`.
+    """
     parameters = inspect.signature(build).parameters
     prefix = f"{section}." if section else ""
     for name in values:

@@ -1,4 +1,4 @@
-"""Loads on a circle: balls, rollers and pendulums."""
+"""Base class of loads, and loads on a circle: balls, rollers and pendulums."""
 
 import abc
 import math
@@ -24,8 +24,9 @@ BALL_RADIUS = unit("m", low=0.0, open_low=True, words="radius of each {load}")
 class NormalForce(NamedTuple):
     """Normal force N = `static_normal_force` + `normal_force_per_acceleration` . a of each load on its track.
 
-    a is the acceleration of the point that carries the load. `static_normal_force` (count,) is in N, and
-    `normal_force_per_acceleration` (horizontal, up) in kg, (count,) each.
+    a is the acceleration of the point that carries the load. `static_normal_force` (count,), N, is the value of N at a = 0: it
+    contains the centrifugal force and the weight. `normal_force_per_acceleration` is in kg, two arrays (count,) for horizontal
+    and up.
     """
 
     static_normal_force: Array

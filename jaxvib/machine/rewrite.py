@@ -28,9 +28,9 @@ _DIGITS = 8
 def rewrite_scene(text: str, scene: Scene) -> str:
     """Return the text of a scene file with the numbers of another scene of the same kind.
 
-    Comments, order and units stay. A changed number has 8 digits, and a comment with its old value. A number that differs from
-    its default and is not in the text is added in a new line. If the text cannot be changed in this way, for example because
-    the scene has other effects, the result is `scene_to_toml(scene)`.
+    Comments, order and units stay. A changed number has at most 8 digits, and a comment with its old value. A number that
+    differs from its default and is not in the text is added in a new line. If the text cannot be changed in this way, for
+    example because the scene has other effects, the result is `scene_to_toml(scene)`.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
@@ -41,7 +41,7 @@ def rewrite_scene(text: str, scene: Scene) -> str:
     read, new = tomllib.loads(text), tomllib.loads(scene_to_toml(scene))
     try:
         old = tomllib.loads(scene_to_toml(scene_from_toml(text)))
-    except ValueError:  # a text that refers to another file, which would not be found from another folder
+    except ValueError:  # the text refers to a file of torques, and the folder of this file is not known here
         return scene_to_toml(scene)
     section: _Path = ()
     counts: dict[_Path, int] = {}

@@ -57,6 +57,7 @@ class Exciter(Part):
     - an effect that acts on the whole machine
     - a direction other than +1 or -1
     - an exciter with neither loads nor an unbalance
+    - an `unbalance_mass` without an `unbalance`
     - the rotor of a motor with less inertia than its unbalance alone, m r^2 = S^2/m
 
     >>> import jaxvib as jv
@@ -163,7 +164,11 @@ def unbalance(*, force: Number, at: Number) -> Array:
 
 
 def read_unbalance(drive: Drive, unbalance: Number | None, unbalance_mass: Number | None) -> tuple[Array | None, Array | None]:
-    """Return the unbalance S and its mass m. **Raises** `InputError` if the rotor has less inertia than S^2/m."""
+    """Return the unbalance S, kg m, and its mass m, kg, as arrays; None for a value that is absent.
+
+    **Raises** `InputError` for a mass without an unbalance, values that are not allowed, and a motor with less inertia than
+    S^2/m.
+    """
     if unbalance_mass is not None and unbalance is None:
         raise InputError("unbalance_mass", f"is {quoted(unbalance_mass)} without an unbalance; give unbalance=..., in kg m")
     try:
@@ -273,7 +278,7 @@ class Scene(Part):
     def all_effects(self) -> tuple[Effect, ...]:
         """Effects on the whole machine and on every rotor."""
         groups = self.effects, *(exciter.effects for exciter in self.exciters)
-        # Within `equinox.tree_at` an empty tuple is a leaf.
+        # `equinox.tree_at` evaluates this property on a scene in which it has replaced each empty tuple by a leaf.
         return tuple(effect for group in groups if isinstance(group, tuple) for effect in group)
 
     @property
@@ -336,7 +341,9 @@ class Scene(Part):
         return shapes_of(self.machine, self.exciter.place)[1]
 
     def replace(self, **parts: Any) -> Scene:
-        """Return the scene with other `parts`: its `machine`, or the `loads`, `drive` or `effects` of its only exciter.
+        """Return a scene of one exciter with other `parts`: `machine`, `loads`, `drive` or `effects`.
+
+        `effects` replaces all effects: those on the whole machine, and those on the rotor and its loads.
 
         >>> import jaxvib as jv
         >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -374,7 +381,8 @@ def _require_stations(levers: Sequence[Array | None], loads: Loads | None) -> No
 
 
 def _require_fit(machine: Machine, exciter: Exciter) -> None:
-    """**Raises** `InputError` for loads or effects that do not fit the machine."""
+    """**Raises** `InputError` for an effect that does not fit the machine, the loads or the drive, and for loads whose mass or
+    drag would be lost in rounding errors."""
     loads = exciter.loads
     for effect in exciter.effects:
         tilts = any(term.about_tilts for term in terms_of([effect], RotorImbalance))

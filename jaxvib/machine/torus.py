@@ -34,9 +34,9 @@ class TorusBalls(Loads):
         N = m (B f'^2 sin a + rho a'^2 - n . (acceleration of the mount + g e))
 
     - w is the rotor speed, g the acceleration of gravity, and e the unit vector against gravity
-    - A ball rolls without sliding and without drilling spin. Its rotation adds the inertia kappa - 1 and the terms with w,
-      which do no work. Because of these terms the rotation contributes B f' (f' - w) instead of B f'^2; the centrifugal force
-      on a ball that turns with the tube is then that of its mass alone
+    - A ball rolls without sliding and without drilling spin. Its rotation adds the inertia (kappa - 1) m and the terms with w,
+      which do no work. In the second equation the contribution of the rotation is then - (2/5) m B f' (f' - w) cos a. It is 0
+      for a ball that turns with the tube (f' = w), so that the centrifugal force on this ball is that of its mass alone
     - The acceleration of the wall when w changes is neglected, as in the gyroscopic matrix of a rotor
     - A ball on the equator moves like a ball in a plane track of radius R + rho
 

@@ -128,7 +128,7 @@ the farthest support."""
 
 _MAX_RADIUS, _MAX_SAG, _MIN_MASS = 5.0, 1.0, 10.0
 """Largest usual radius of loads, m, largest usual sag of a machine under its own weight, m, and smallest mass, kg, of machines
-whose sag is examined. Machines with dimensionless parameters have masses of about 1."""
+whose sag and motor power are examined. Machines with dimensionless parameters have masses of about 1."""
 
 
 _MAX_SUPPORT_DISTANCE = 100.0
@@ -231,7 +231,7 @@ def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
 
 
 def first_moment(exciter: Exciter) -> Array | None:
-    """Return |S + sum M e exp(i angle)| of the unbalance and the static imbalances, kg m; None without them."""
+    """Return the modulus of the vector sum of the unbalance S and the static imbalances M e, kg m; None if there are none."""
     terms = static_imbalances(exciter.effects)
     if not terms:
         return exciter.unbalance
@@ -241,7 +241,8 @@ def first_moment(exciter: Exciter) -> Array | None:
 
 
 def start_notes(scene: Scene, exciters: Iterable[int] | None = None) -> list[str]:
-    """Return a sentence for the motors that cannot turn their hanging unbalances over the top, one for all with equal torques.
+    """Return sentences about the motors that cannot turn their hanging unbalances over the top. Motors with equal torques share
+    one sentence.
 
     Motors whose torque at rest changes over time, such as those of converters, are not judged. `exciters`: numbers, from 0, of
     the exciters to judge; default: all.

@@ -73,8 +73,8 @@ class TorqueTable(Motor):
 
     @property
     def dips(self) -> int:
-        """Largest possible number of dips (local minima) of the torque: each needs two points between the first and the last
-        point."""
+        """Largest possible number of dips (local minima) of the torque, at most 4: each needs two points between the first and
+        the last point."""
         return min((self.speeds.shape[0] - 2) // 2, _MAX_DIPS)
 
     def torque(self, speed: Array) -> Array:

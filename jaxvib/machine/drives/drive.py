@@ -163,7 +163,8 @@ class Directed(Drive):
 
 
 class IdealDrive(Drive):
-    """Drive that prescribes the rotor speed as a function of time. A new ideal drive is a subclass with three methods.
+    """Drive that prescribes the rotor speed as a function of time. A new ideal drive is a subclass with the three methods
+    `speed_at`, `angle_at` and `acceleration_at`.
 
     >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
     >>> class Approach(jv.IdealDrive):

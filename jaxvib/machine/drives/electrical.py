@@ -53,7 +53,7 @@ class NamePlateMotor(Motor):
       of Kloss's formula; typical: 1.8 to 2.8
 
     **Raises** `InputError` for a wrong unit, a value out of bounds, a rated speed that needs more than 48 pole pairs or a
-    breakdown slip of 1 or more, and a `starting_ratio` that is below that of Kloss's formula or above `breakdown_ratio`.
+    breakdown slip of 1 or more, and a `starting_ratio` that is below that of Kloss's formula or not below `breakdown_ratio`.
 
     >>> import jaxvib as jv
     >>> motor = jv.NamePlateMotor("4 kW", "1440 rpm", breakdown_ratio=2.8, inertia="0.02 kg m^2")
@@ -140,7 +140,7 @@ class NamePlateMotor(Motor):
 
 
 def _require_starting_ratio(ratio: float, low: float, high: float) -> None:
-    """**Raises** `InputError` for a starting torque below that of Kloss's formula or above the breakdown torque."""
+    """**Raises** `InputError` for a starting torque below that of Kloss's formula or not below the breakdown torque."""
     if not low * (1.0 - 1e-6) <= ratio < high:
         problem = (
             f"is {ratio:.4g}; it must be at least {low:.4g}, that of Kloss's formula, and below breakdown_ratio {high:.4g}"

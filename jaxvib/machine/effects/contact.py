@@ -53,7 +53,7 @@ class LoadContact(Effect):
     - `restitution` e in place of the damping, above 0, up to 1; typical: 0.3 to 0.9
 
     **Raises** `InputError` for values that are not allowed, and for both damping and restitution. A scene raises it for loads
-    without a ball radius, and for loads that differ if there is a restitution.
+    without a ball radius, and for loads of unequal mass if there is a restitution.
 
     >>> import jaxvib as jv
     >>> float(jv.LoadContact(stiffness=1e6).stiffness)

@@ -78,7 +78,8 @@ class DryFriction(Effect):
     - `width`, rad/s: range of sliding speeds over which the sign is smoothed, see `sliding_sign`; typical: 0.01 (the default)
       to 1. A smaller width is more exact and needs more steps
 
-    **Raises** `InputError` for values that are not allowed.
+    **Raises** `InputError` for values that are not allowed. A scene raises it for loads without bearings: balls and rollers,
+    and loads that do not move on a circle.
 
     >>> import jaxvib as jv
     >>> jv.DryFriction(0.0015, diameter="12 mm").reaction

@@ -19,7 +19,8 @@ Side = Literal["above", "below", "both"]
 
 
 class _Support(Effect):
-    """Support on the foundation at a platform, or around a rotor's axis at a distance from its centre of mass."""
+    """Support on the foundation at a platform, or around a rotor's axis at a distance from its centre of mass. A subclass may
+    also act between two platforms."""
 
     repeatable = True
     platform: eqx.AbstractVar[int | None]
@@ -209,7 +210,7 @@ class FrictionSupport(_Support):
     - Coulomb friction is the limit of a small `width`. An oscillation with the largest speed v loses less energy by the share
       (pi^2/24) (width/v)^2, 0.41 (width/v)^2
     - A machine that would stick under the force f < F creeps at the speed width artanh(f/F)
-    - A free vibration on a spring k decays by 4 F/k per period
+    - The amplitude of a free vibration on a spring k decreases by 4 F/k per period
 
     **Arguments** (SI, or strings with a unit)
 

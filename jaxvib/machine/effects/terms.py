@@ -32,7 +32,8 @@ Resistance: TypeAlias = Callable[[Loads, Coordinates, Coordinates], Coordinates]
 @final
 @dataclass(frozen=True)
 class GravityField:
-    """Uniform gravity, which changes the normal forces of loads. Its force on the loads themselves is a `LoadPotential`.
+    """Uniform gravity, which changes the normal forces of loads and exerts torques on unbalances and static imbalances. Its
+    force on the loads themselves is a `LoadPotential`.
 
     **Attributes**: `axis` of a load's position against which gravity acts (0 horizontal, 1 up, 2 along the rotor's axis); `g`,
     m/s^2.

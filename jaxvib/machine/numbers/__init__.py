@@ -36,7 +36,7 @@ class NumberSpec(NamedTuple):
     - `bounds` of each entry
     - `words`: name of the parameter in text for users
     - `each`: kind of part to which each entry of an array belongs, such as "platform"; "" for a single number
-    - `typical`: typical magnitude in SI of a number that may have either sign; None if its lower bound is 0
+    - `typical`: typical magnitude in SI, the scale of a number whose value is 0; needed for numbers that may be negative
     - `electrical`: True for the frequency of a supply, which tables show in Hz
     """
 

@@ -73,7 +73,8 @@ class MatrixMachine(Machine):
     def require_valid(self) -> None:
         """**Raises** `InputError` for replaced arrays whose shapes do not fit, and for an indefinite mass or stiffness matrix.
 
-        The symmetric parts of the matrices are examined, because their entries are replaced one by one.
+        Only the symmetric parts of the matrices are examined, because a sweep or a design may change one of two symmetric
+        entries without the other.
         """
         size, rows = self.places_rows.shape[-1], self.foundation
         for name in ("mass", "damping", "stiffness", "gyroscopic"):
@@ -162,7 +163,10 @@ def from_matrices(
 
 
 def _lowest_modes(mass: Array, stiffness: Array, number: int) -> Array:
-    """Return the lowest real normal modes (nd, number or more), with the modal masses 1: all of equal natural frequencies."""
+    """Return the lowest real normal modes (nd, `number` or more), with the modal masses 1.
+
+    There are more than `number` if further modes have the same natural frequency as the last one.
+    """
     square, inverse = relative_to(mass, stiffness)
     squares, modes = hermitian_modes(square)
     equal = when_known(lambda values: _number_of_equal(values, number), squares)

@@ -20,7 +20,7 @@ from jaxvib.units import Number, Numbers, count
 class Platforms(Machine):
     """Platforms that translate vertically, on supports and with links between them.
 
-        M_i y_i'' + b_i y_i' + k_i y_i + sum_j [b_ij (y_i' - y_j') + k_ij (y_i - y_j)] = force of loads on platform `exciter`
+        M_i y_i'' + b_i y_i' + k_i y_i + sum_j [b_ij (y_i' - y_j') + k_ij (y_i - y_j)] = force of the exciters on platform i
 
     y_i is the upward displacement from static equilibrium, m. Constructors: `one_mass`, `two_mass`, `three_mass`, `network`.
 
@@ -30,7 +30,7 @@ class Platforms(Machine):
     - `stiffness` (n,), N/m, and `damping` (n,), N s/m, of the supports
     - `link_stiffness` (L,), N/m, and `link_damping` (L,), N s/m
     - `links`: the pair of platforms that each link joins, numbered from 1
-    - `exciter`: the number of the platform that carries the exciter
+    - `exciter`: the number of the platform that carries the exciter, unless `Exciter(at=)` names another one
 
     Source: Filimonikhin et al. 2022, equations (1)-(39) for one, two and three masses.
     """
@@ -66,7 +66,7 @@ class Platforms(Machine):
         )
 
     def mount(self, at: Place = None) -> Mount:
-        """Return the vertical motion of the exciter's platform, `at` its number."""
+        """Return the mount on the platform with the number `at`, which moves vertically; None is the platform `exciter`."""
         return Mount(rows=(self.rows_at(self.exciter if at is None else at, "at"),), axes=(1,))
 
     def support_rows(self) -> tuple[Array, Array]:
