@@ -109,7 +109,8 @@ def branches(
     least: Number | None = None,
     accuracy: float | None = None,
 ) -> Branches | ExactBranches:
-    """Return the branch n(Omega) of jams of coincident loads with all its folds, for light loads or, with `exact`, for any.
+    """Return the branch n(Omega) of jams of coincident loads with all its folds, for light loads or, with `exact`, for loads of
+    any mass.
 
         n(Omega) = Omega + (mean braking torque of the vibration on the loads) / sum b_W R^2      (light loads, no dry friction)
 
@@ -128,8 +129,15 @@ def branches(
       the rotor speed is below this resonance
     - `accuracy` of the rotor speeds, relative, with `exact`; typical: 1e-4 to 1e-8 (the default; in single precision 1e-3)
 
-    **Returns** `Branches`, or `ExactBranches` if `exact`. **Raises** `InputError` for loads without drag, fewer than 2 points,
-    a speed that is not positive, and an accuracy that the precision does not allow.
+    **Returns** `Branches`, or `ExactBranches` if `exact`.
+
+    **Raises** `InputError` for
+
+    - scenes that `jam_modes` does not accept; `exact` accepts machines whose coordinates couple through the rotor speed, but no
+      imbalance
+    - fewer than 2 points, and a speed that is not positive
+    - an accuracy that the precision does not allow
+    - `least` or `accuracy` without `exact`
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

@@ -152,14 +152,14 @@ class VibrationMeasures(Readable):
     - `acceleration` (nt,), amplitude in g; typical: 2 to 6 for screens
     - `velocity` (nt,), m/s root mean square; typical: 50 to 300 mm/s
     - `exciter_force`, N zero to peak: resultant of the centrifugal forces
-    - `transmissibility`: foundation force divided by `exciter_force`; inf if the centrifugal forces cancel, NaN if one of both
-      forces is unknown
+    - `transmissibility`: foundation force divided by `exciter_force`; inf if the centrifugal forces cancel, NaN if one of the
+      two forces is unknown
     - `foundation_load` (directions,), N zero to peak: force on the foundation in each direction, across and up for a body in a
       plane or a rotor
     - `static_deflection` (nt,), m: downward displacement of each coordinate (of x: to the left) under the weight of machine
-      and loads, NaN and 0 as in `weight_deflection`; typical: 5 to 30 mm for screens
-    - `static_load` (ns,), N: weight that each support carries, negative if a support on the foundation is pulled up; NaN if the
-      supports cannot carry the weight, and if the directions of the coordinates are unknown
+      and loads, 0 for a platform that no support carries; typical: 5 to 30 mm for screens
+    - `static_load` (ns,), N: weight that each support carries, negative if a support on the foundation is pulled up. It and
+      `static_deflection` are NaN if the supports cannot carry the weight, or if the directions of coordinates are unknown
     - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on a support.
       They are NaN, as is `foundation_load` in two directions, for a scene with supports that are effects (`CubicSupport`,
       `Stop`, `FrictionSupport`), and for matrices without a foundation
@@ -197,7 +197,7 @@ class VibrationMeasures(Readable):
 
     @property
     def isolation_efficiency(self) -> Array:
-        """Share of the exciter's force that does not reach the foundation, 1 - transmissibility; below 0 if that is above 1."""
+        """Share of the exciter's force that does not reach the foundation, 1 - transmissibility; it may be negative."""
         return 1.0 - self.transmissibility
 
     def notes(self) -> list[str]:
@@ -305,8 +305,8 @@ def vibration_measures(
     - `motion` of the scene: a jam of light loads such as `jam_modes(scene).select(3)` or `phase_jams(scene).select(0)`, an
       exact jam such as `jam_orbit(scene, mode=3)` (whose supports and points move with its first harmonic), or the
       `vibration()` of a run, of an envelope, of a synchronous regime or of a response
-    - `at`: point of a deck, (x, y) of the body number `body`, m, or a list of points; default: its centre of mass; typical:
-      both ends of the deck
+    - `at`: point of a deck, (x, y) of the body with the number `body`, m, or a list of points; default: the body's centre of
+      mass; typical: both ends of the deck
     - `slope` of the deck, rad or text from x anticlockwise; typical: "-15 deg" to 0 (the default)
     - `layer`: width, m, height, m, and bulk density, kg/m^3, of the material on the deck, for the throughput; typical:
       ("1.5 m", "55 mm", "1600 kg/m^3")
@@ -578,7 +578,7 @@ def conveying_speed_at(amplitude: Array, w: Array, slope: Array) -> Array:
     begin = -jnp.arccos(1.0 / g)
 
     def height(phase: Array) -> Array:
-        """Height of the particle above the deck, divided by the amplitude, times the throw number, divided by phase^2."""
+        """Return the height of the particle above the deck, relative to the amplitude, times G / phase^2."""
         return (-g * jnp.sin(begin) * phase - phase**2 / 2.0 - g * (jnp.cos(begin + phase) - jnp.cos(begin))) / phase**2
 
     full = jnp.asarray(2.0 * np.pi, g.dtype)

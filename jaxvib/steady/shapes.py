@@ -68,9 +68,12 @@ class ModeShapes(Result):
 def mode_shapes(scene: Scene) -> ModeShapes:
     """Return the natural frequencies and mode shapes of the machine with its loads, without damping and with the rotor at rest.
 
-        K X = w^2 (M + sum_j m_j B^T B) X
+        K X = w^2 (M + sum_j m_j B_j^T B_j) X
 
-    **Arguments**: `scene`; only its machine and its loads are used.
+    m_j are the masses of the loads and of the unbalances that have an `unbalance_mass`; B_j maps the coordinates to the
+    displacement of the point that carries the mass.
+
+    **Arguments**: `scene`; only its machine and these masses are used.
 
     **Returns** `ModeShapes`; typical: frequencies of 10 to 100 rad/s for platforms, 100 to 500 rad/s for rotors.
 

@@ -40,8 +40,9 @@ class CharacteristicSpeeds(Result):
 
     **Attributes** (nd coordinates)
 
-    - `resonances` (nd,): poles of the receptance without damping, at which loads change from gathering to balancing
-    - `additional` (nd - 1,): its zeros, at which they change back; these are the resonances of the machine with its mount fixed
+    - `resonances` (nd,): poles of the receptance without damping; above them loads balance, below them they gather
+    - `additional` (nd - 1,): zeros of the receptance without damping; above them loads gather, below them they balance. They
+      are the resonances of the machine with its mount fixed
     - `shapes` (nd, nd): the mode shapes of the resonances, one column each, with unit modal mass and an arbitrary sign
     - `damped_resonances` (nd,) and `damped_additional` (nd - 1,): the same changes of sign with the machine's damping
     - `coordinates`: the names of the rows of `shapes`

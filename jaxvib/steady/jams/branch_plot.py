@@ -74,7 +74,9 @@ def plot_branch(
     modes: np.ndarray | None = None,
     resonances: np.ndarray | None = None,
 ) -> Drawn:
-    """Plot load speed, amplitudes (zero to peak) and foundation force over the rotor speed; stable solid, unstable dashed.
+    """Plot load speed, amplitudes (zero to peak) and foundation force over the rotor speed.
+
+    Stable parts are solid lines, unstable parts dashed lines.
 
     **Arguments**
 

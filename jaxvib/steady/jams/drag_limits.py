@@ -88,7 +88,8 @@ def drag_limits(scene: Scene, *, phases: bool = False) -> DragLimits:
     change the limits, see `jam_modes`.
 
     - For equal loads at one point of the machine no other arrangement can jam at a larger drag: the torques of all loads have
-      the sum (w^4/2) |sum_j S_j exp(i a_j)|^2 Im h, whose modulus is largest for equal angles
+      the sum (w^4/2) |sum_j S_j exp(i a_j)|^2 Im h, whose modulus is largest for equal angles a_j. S_j = m_j R_j is the
+      unbalance of a load, and h is the receptance of the point that carries the loads, for a rotating force
     - Loads at several points of a rotor, or unequal loads, jam at unequal phases. With `phases`, `factor` is the largest one
       of all phases that a search finds
 

@@ -66,9 +66,10 @@ def rotor_speed_at(model: ExcitedModel, omega: Array, speed: Array | None = None
 
         n(w) = w - S w^2 Im(e^H B Y(w)) / (2 sum_j b_Wj R_j^2)
 
-    with Y from `JammedModel.displacement`: the torque of the drag balances the mean torque of the vibration. The formula is
-    explicit in `omega` and single-valued through the folds. If the rotor speed couples the carrier's coordinates, Y is computed
-    at the rotor speed `speed`.
+    S is the unbalance of the loads, and Y are the complex amplitudes of the carrier (`JammedModel.displacement`). B^T e is the
+    direction of the loads' force on the coordinates (`force_direction`). The formula states that the torque of the drag
+    balances the mean torque of the vibration. It is explicit in `omega` and single-valued through the folds. If the rotor speed
+    couples the carrier's coordinates, Y is computed at the rotor speed `speed`.
 
     Dry friction with the coefficient mu2 in a bearing of diameter d adds the torque mu2 (d/2) N sign(n - w) of each load to the
     drag; n is then the root of this balance of torques between w and the value above, with N = m R w^2. The weight of the loads
@@ -199,8 +200,12 @@ def branch_root(
 
 
 class Pieces(NamedTuple):
-    """Monotone pieces of a branch: load speeds and rotor speeds at their ends and mode numbers, (2 nd + 1,) each, two more for
-    each extra peak; resonances and folds."""
+    """Monotone pieces of a branch between its folds.
+
+    **Attributes**: load speeds `low` and `high` and rotor speeds `speed_low` and `speed_high` at the ends of each piece, rad/s,
+    and its number `mode`, (2 nd + 1,) each, with two more entries for each peak that the branch may have in addition to those
+    of the resonances (`extra_peaks`); `resonances` (nd,), rad/s; the `folds`.
+    """
 
     low: Array
     high: Array
@@ -300,9 +305,9 @@ def grid_near_poles(model: LinearModel, per_side: int, highest: Array | None = N
     """Return a grid of load speeds for the search for folds, and the resonances; only the resonances have derivatives.
 
     The grid has `per_side` points on each side of each pole s of det(K + s^2 M + s C) = 0, with a density that follows the
-    width of its peak. It reaches five times the largest |s|, and at least the speed `highest`. Undamped resonances are not
-    sufficient: a strong damper between two platforms locks them into one body, whose sharp peak is at neither of their
-    resonances.
+    width of its peak. It reaches five times the largest |s|, and at least the speed `highest`. A grid that is dense only near
+    the undamped resonances would miss peaks: a strong damper between two platforms locks them into one body, whose sharp peak
+    is at none of the undamped resonances.
     """
     resonances, _ = model.modes()
     fixed = jax.lax.stop_gradient(resonances)

@@ -289,15 +289,16 @@ def jam_modes(scene: Scene) -> JamModes:
       piece that falls from it, and mode 2 nd + 1 is beyond the last resonance. Mode 3 is therefore the jam just below the
       second resonance, even if the first one is damped so much that modes 1 and 2 have vanished
     - Rising pieces (odd modes) are stable by slope, falling ones are not
-    - If the branch has more peaks than resonances, the lowest peaks, each of which covers a narrow range of rotor speeds, are
-      ignored
+    - If the branch has more peaks than resonances, the smallest ones are ignored: those whose rotor speed is hardly above that
+      of the neighbouring minimum
     - An imbalance of the rotor (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force rotates at the rotor
       speed, that of the loads at the load speed. At this order the imbalance therefore exerts no mean torque on the loads.
       The amplitudes and the foundation force are those caused by the loads only. If the contribution of the imbalance matters,
       use `simulate`
 
-    **Arguments**: `scene` with a drive of constant speed and loads with drag; typical: loads of 0.1 % to 5 % of the machine's
-    mass. The relative error of the result is proportional to the mass of the loads, see `jam_orbit`.
+    **Arguments**: `scene` with loads that have drag, and a drive of prescribed speed, of which only the working speed matters;
+    typical: loads of 0.1 % to 5 % of the machine's mass. The relative error of the result is proportional to the mass of the
+    loads, see `jam_orbit`.
 
     Resonances whose distance is smaller than their bandwidth have one common peak of the branch and one pair of modes, with
     the number of the resonance nearest to the peak; the status of the other modes is `absent`, and `unresolved` lists them.
@@ -307,10 +308,11 @@ def jam_modes(scene: Scene) -> JamModes:
 
     **Raises** `InputError` for
 
-    - loads without drag or at different stations
-    - a machine whose coordinates couple through the rotor speed
+    - loads without drag, at different stations, or not on a circle
+    - a machine whose coordinates couple through the rotor speed (`rotor`), and a body in a plane, which turns with the housing
+      of its exciter
     - a motor in place of a prescribed speed
-    - effects that this function does not include (`CubicSupport`, `Stop`, `FrictionSupport`)
+    - effects that this function does not include, such as `CubicSupport`, `Stop`, `FrictionSupport` and `Sliding`
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

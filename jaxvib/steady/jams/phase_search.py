@@ -86,10 +86,10 @@ class PhaseJams(AbstractPhaseJam):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot the load speeds over the drag, from a 30th of the scene's to 30 times it, for each pattern of these
-        jams.
+        """Plot the load speeds over the drag, from 1/30 to 30 times the drag of the scene, for each pattern of these jams.
 
-        Colours show the arrangement of the loads; stable solid, unstable dashed, the jams themselves as points.
+        Colours show the arrangement of the loads. Stable parts are solid lines, unstable parts dashed lines, and the jams of
+        the scene are points.
         """
         from jaxvib.draw.results import drag_diagram  # slow import
 
@@ -131,8 +131,8 @@ def phase_jams(
       multiple of their drag, from `starts` random sets of phases and some regular ones. If this multiple passes 1 between two
       load speeds, a jam lies between them, and Newton's method solves for its speed and phases (`phase_jam`)
     - Jams that differ by a common rotation of all loads, or by an exchange of equal loads, count as one
-    - Loads that turn with the rotor and balance it are left out. So are jams of two equal loads at one point of the machine at
-      the speed at which its response lags by 90 degrees, which `synchronous_regimes` lists
+    - Loads that turn with the rotor and balance it are left out. Two equal loads at one point of the machine also have a jam at
+      the speed at which the response of the machine lags by 90 degrees; it is left out here, and `synchronous_regimes` lists it
     - Loads count as points: their `ball_radius` is not used, so that loads at one angle have the unbalance N m R. `jam_modes`
       places them side by side
     - An imbalance of the rotor (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force rotates at the rotor
@@ -347,7 +347,7 @@ class PhaseBranch(Result):
         )
 
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot the speeds of loads and rotor over the drag; stable solid, unstable dashed.
+        """Plot the speeds of loads and rotor over the drag: stable parts as solid lines, unstable parts as dashed lines.
 
         The drag is in N s/m, or a multiple of the scene's drag if the loads have different drags.
         """

@@ -24,8 +24,9 @@ from jaxvib.steady.outcome import REFUSED
 from jaxvib.units import count, known_number
 
 _MAX_INTEGRATION_STEPS = 2**17
-"""Maximum number of integration steps in a turn; beyond it no multipliers are computed. The fastest motion of the carrier is
-then about 3e4 times as fast as the loads, and an orbit would take seconds to hours."""
+"""Maximum number of integration steps over the span of the collocation grid (a period, or half a period with half-turn
+symmetry); beyond it no multipliers are computed. The fastest motion of the carrier is then 1.5e4 to 4e4 times as fast as the
+loads, and an orbit would take seconds to hours."""
 
 
 class OrbitStatus(eqx.Enumeration):
@@ -63,8 +64,9 @@ class Orbit(Result):
     - `stable`: True if small deviations of the loads from this motion decay (`multiplier` < 1 - `multiplier_error`) and the
       loads do not separate
     - `multiplier`: largest modulus of the non-trivial Floquet multipliers; `multiplier_error`: its estimated numerical error
-    - `multipliers`: all Floquet multipliers, complex; those of loads that separate from each other are the last ones
-    - `trivial`: computed value of the multiplier of a shift in time, which is exactly 1
+    - `multipliers`: the Floquet multipliers, complex, without the trivial one; those of loads that separate from each other are
+      the last ones
+    - `trivial`: computed value of the trivial multiplier, that of a shift in time; its exact value is 1
     - `deviation_harmonics` (G, J), rad, `displacement_harmonics` (nd, K), m (rad for tilts), `force_harmonics` (nb, K), N: the
       c_k. Loads that have equal parameters have one deviation (G = 1), otherwise each has its own (G = count)
     - `deviation_orders` and `orders`: the k of these harmonics

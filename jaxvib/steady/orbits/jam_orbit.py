@@ -90,18 +90,19 @@ def jam_orbit(
     - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-9 (the default; in
       single precision 1e-3). A smaller value costs little, because the error falls exponentially with the number of harmonics
     - `points`: a fixed number of collocation points in place of an accuracy; typical: 12 to 32. They are on half a period if
-      the scene has half-turn symmetry, which gravity and imbalances break, otherwise on a whole period. The time grows at least
-      with the square of this number. Under JAX transformations the values that decide on this number are not known; the default
-      is then 16 on half a period and 33 on a whole period, and the status shows whether it is too small
+      the scene has half-turn symmetry, otherwise (with gravity on the loads) on a whole period. The time grows at least with
+      the square of this number. Under JAX transformations the values that decide on this number are not known; the default is
+      then 16 on half a period and 33 on a whole period, and the status shows whether it is too small
     - `throw`: raise if there is no such motion; otherwise, and under a JAX transformation, the status shows it
 
     **Returns** `Orbit`; its fields have derivatives with respect to every parameter of the scene (implicit function theorem,
     forward and reverse).
 
-    **Raises** `InputError` for wrong arguments, loads without drag, and a `mode` of a machine with gyroscopic coupling, whose
-    resonances depend on the rotor speed; `ComputationError` with the status "absent" or "not_converged". For a machine with
-    gyroscopic coupling use `omega` or `near`. Such a machine may have motions with the same load speed at several rotor speeds;
-    `omega` then gives the motion at the lowest rotor speed.
+    **Raises** `InputError` for wrong arguments, a load without drag, and a `mode` of a machine with gyroscopic coupling, whose
+    resonances depend on the rotor speed; for motors, imbalances of the rotor, nonlinear supports and bodies in a plane;
+    `ComputationError` with the status "absent" or "not_converged". For a machine with gyroscopic coupling use `omega` or
+    `near`. Such a machine may have motions with the same load speed at several rotor speeds; `omega` then gives the motion at
+    the lowest rotor speed.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

@@ -147,7 +147,7 @@ class _Coefficients(NamedTuple):
 
     - `moving` s t, its derivatives `moving1` and `moving2` with respect to theta, and `coupling`, s t minus the part of dry
       friction, (directions, G, P)
-    - `by_angle`, `by_rate` (G, P): derivatives of the torque, divided by I Omega^2
+    - `by_angle` (T_phi + S e.a)/(I Omega^2) and `by_rate` T_rate/(I Omega), (G, P), with the symbols of `floquet`
     """
 
     moving: Array

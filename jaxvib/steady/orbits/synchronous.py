@@ -105,8 +105,9 @@ class SynchronousOrbit(PathsOfPoints, Result):
       directions of the force the root of their summed squares
     - `stable`: True if small disturbances decay, that is `multiplier` < 1 - `multiplier_error`
     - `multiplier`: largest modulus of the non-trivial Floquet multipliers; `multiplier_error`: its estimated numerical error
-    - `multipliers`: all Floquet multipliers, complex; `trivial`: computed value of the multiplier of a shift in time, which is
-      exactly 1; NaN if an ideal drive turns an unbalance, because a shifted motion is then not a solution
+    - `multipliers`: the Floquet multipliers, complex, without the trivial one; `trivial`: computed value of the trivial
+      multiplier, that of a shift in time, whose exact value is 1. It is NaN if an ideal drive turns an unbalance, because a
+      shifted motion is then not a solution
     - `residual` of the equations of motion, relative; `error`: estimated relative error of speed and displacements, and error
       of angles in rad, due to the limited number of harmonics
     - `deviation_harmonics` (bodies, K), rad: alpha_k + psi_k of each load or rotor, `displacement_harmonics` (nd, K), m (rad
@@ -211,7 +212,8 @@ def synchronous_orbit(
       instead prescribes th_k = sigma_k n t (phase 0) and Omega = n
     - the loads, all at one angle, if the rotor is balanced and has an ideal drive: the loads of all exciters jam at one speed
 
-    **Arguments**: `scene` without effects that permit the rotation of loads about their own centres; and
+    **Arguments**: `scene`, whose effects may be gravity, dry and rolling friction, nonlinear supports, and imbalances of rotors
+    without loads; and
 
     - `regime`: a motion of the averaged theory with `speed` and `phases` of all masses, with the loads of each exciter at one
       angle; or these two arguments:

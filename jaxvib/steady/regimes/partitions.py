@@ -71,12 +71,12 @@ class RegimePartitions(Result):
 
     - `status`: a `RegimeSearchStatus`
     - `group` (n, mass): number of the group of each rotating mass, from 0
-    - `speed` (n, mass), rad/s, and `phases` (n, mass), rad, of each rotating mass; the phases are those of a
-      `SynchronousRegime` of its group
+    - `speed` (n, mass), rad/s, and `phases` (n, mass), rad, of each rotating mass; the phases of a group are those of a
+      `SynchronousRegime` of the group
     - `growth` (n,), 1/s: the largest of all groups; `stable` (n,): True if it is negative by more than a rounding
       error
-    - `interaction` (n,): estimated relative error of the differences of the speeds, because groups act on each other; 0 for a
-      single group; typical: 1e-4 to 0.3
+    - `interaction` (n,): estimated relative error of the differences of the speeds; the error arises because groups act on each
+      other. It is 0 for a single group; typical: 1e-4 to 0.3
     - `scene`
     """
 

@@ -23,10 +23,11 @@ _EVEN_SPEEDS, _NEAR_SPEEDS = 200, 40
 """Numbers of speeds at equal distances, and on each side of a resonance or of a drive's working speed."""
 
 MAX_COMPLETE = 6
-"""Largest number of rotating masses for which the search finds all regimes. Their number doubles with each further mass."""
+"""Largest number of rotating masses for which the search finds all regimes. The number of regimes about doubles with each
+further mass."""
 
 _PHASES_PER_UNKNOWN, _MAX_REGULAR_SETS = 24, 64
-"""Random sets of phases for each squared number of unknown phases, and largest number of regular sets."""
+"""Number of random sets of phases divided by the square of the number of unknown phases, and largest number of regular sets."""
 
 _SETS_AT_ONCE = 64
 """Number of sets of phases whose torques are computed in one operation, which limits the memory."""
@@ -38,7 +39,8 @@ _STARTS_PER_PROGRAM = 256
 """Number of starts in one program."""
 
 _MAX_ROUNDS = 3
-"""Number of times that exchanged phases of known regimes are used as starts."""
+"""Largest number of rounds of the search. Rounds after the first start from phases that are related to those of known
+regimes."""
 
 _ITERATIONS = 60
 """Maximum number of steps of Newton's method."""
