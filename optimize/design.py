@@ -53,7 +53,8 @@ class Design:
     catalogues: tuple[Catalogue, ...] = ()
 
     def notes(self) -> list[str]:
-        """Return a sentence for a throw angle that is asked of exciters which all turn in one direction."""
+        """Return a warning if the task contains a throw angle although all exciters turn in one direction; otherwise an empty
+        list."""
         asked = (self.objective, *(held.quantity for held in self.space.held), *(demand.quantity for demand in self.subject_to))
         directions = {exciter.direction for exciter in self.space.scene.exciters}
         if len(directions) > 1 or not any(part.name == "throw_angle" for quantity in asked for part in walk(quantity)):

@@ -54,9 +54,9 @@ def load_design(path: str | Path) -> Design:
     - `[objective]`: the quantity to minimize, or to maximize with `maximize = true`
     - `[search]`: the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`, `polishing`, `searcher`
 
-    A quantity with `tolerances` is a statistic over machines whose parameters deviate within these tolerances: the mean
-    (`statistic = "expected"`) or the value of the worst machine (`"worst"`): the largest value, or the smallest value of a
-    quantity that is maximized or `at_least` a value.
+    A quantity with `tolerances` is a statistic over machines whose parameters deviate within these tolerances. It is the mean
+    (`statistic = "expected"`) or the value of the worst machine (`statistic = "worst"`). The worst value is the largest one,
+    but for a quantity that is maximized or `at_least` a value it is the smallest one.
 
     **Returns** `Design`. **Raises** `InputError` for a file that cannot be read, and for an error in it; the message names the
     field.

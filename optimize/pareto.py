@@ -103,7 +103,8 @@ def pareto(
 
     - `space`: a `DesignSpace`
     - `first` and `second`: the two quantities
-    - `points`: largest number of machines, at least 2; typical: 9 (the default). The time is proportional to it
+    - `points`: largest number of machines, at least 2; typical: 9 (the default). The computing time is proportional to this
+      number
     - `subject_to`, `starts`, `seed`: as for `synthesize`; typical: 32 starts (the default) for each point
 
     **Returns** `Front`, in ascending order of `first`. The front has one machine if this machine has the least values of both.
@@ -140,7 +141,8 @@ def pareto(
             raise KeyboardInterrupt  # a front needs all of its searches
         return refined if not_dominated(np.asarray([values_of(refined), values_of(best)])) == [0] else best
 
-    # The limit excludes only machines that do not have the other quantity. Because of it, all searches share two programs.
+    # This limit excludes only machines that do not have the other quantity. With it, the first two searches have the same form
+    # as the later ones, and all searches share two programs.
     lowest = search_with_limit(first, second, _NO_LIMIT)
     highest = search_with_limit(second, first, _NO_LIMIT)
     (_, worst), (_, least) = values_of(lowest), values_of(highest)

@@ -46,7 +46,7 @@ class SynthesisStatus(eqx.Enumeration):
 class Outcome:
     """Quantities of a machine in one jam mode, or in the working regime of its exciters; NaN if there is no such motion.
 
-    Returned by `Synthesis.before`, `after` and `verified`.
+    Returned by `synthesize` in a `Synthesis`, as `before`, `after` and `verified`.
 
     **Attributes**
 

@@ -108,13 +108,14 @@ class DesignSpace(Readable):
       bounds of 1/2 and 2 times, or 1/10 and 10 times, the present values. More free parameters need more starts
     - `hold`: quantities that keep their value, each in `optimize.hold(...)`, for example a sum (`total`) or a product
       (`product`) of parameters
-    - `ties`: a mapping from the name of a parameter to its source: the name of another parameter (equal values), (name,
-      factor), or (name, "keep") to keep the present ratio of both; the factor -1 mirrors a position; entries of an array that
-      are 0 stay 0, as in `free`
+    - `ties`: a mapping from the name of a parameter to its source. The source is the name of another parameter (equal values),
+      (name, factor), or (name, "keep") to keep the present ratio of both. The factor -1 mirrors a position. Entries of an array
+      that are 0 stay 0, as in `free`
     - `choices`: a mapping from the name of a parameter to its allowed values, such as the springs of a catalogue, or from
-      "loads.count" to allowed numbers of loads; typical: 2 to 20 values. Rows of a catalogue, such as motors, are a mapping
-      from any name to the columns: {"motor": {"drive.speed": ["1450 rpm", "970 rpm"], "drive.inertia": [0.01, 0.02]}}; the
-      values of the first column must differ
+      "loads.count" to allowed numbers of loads; typical: 2 to 20 values. If several values belong together, as those of a
+      motor, the key is any name, and the value is a mapping from parameters to the columns of a catalogue, for example
+      {"motor": {"drive.speed": ["1450 rpm", "970 rpm"], "drive.inertia": [0.01, 0.02]}}. The values of the first column must
+      differ
 
     Names and bounds of `free`:
 

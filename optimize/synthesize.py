@@ -89,8 +89,8 @@ def synthesize(
     - `space`: a `DesignSpace`
     - `objective`: the `Quantity` to minimize, such as `force_per_amplitude(mode=3)`; `-quantity` maximizes
     - `subject_to`: demands such as `[amplitude(mode=3) > "2 mm", power(mode=3) < 500.0]`
-    - `starts`: number of random starts; typical: 32 to 256 (the default). The time is proportional to it; more starts also
-      make it more probable that the lowest minimum is found
+    - `starts`: number of random starts; typical: 32 to 256 (the default). With more starts the lowest minimum is found with a
+      higher probability. The computing time is proportional to this number
     - `seed` of these starts
     - `iterations` of the descent; typical: 50 to 200 (default 100)
     - `rate`: first step of the descent, relative to the range of a free parameter; typical: 0.01 to 0.1 (default 0.05)
@@ -110,9 +110,11 @@ def synthesize(
 
     **Returns** `Synthesis`.
 
-    **Raises** `InputError` for values that are not allowed, and `ComputationError` with the status "no_feasible_start" if there
-    is no random design for which the objective, the held quantities and those of the demands exist, or "contradictory" if no
-    design meets all demands. The message states which quantities do not exist, or which demands are not met, and by how much.
+    **Raises** `InputError` for values that are not allowed, and `ComputationError` with one of two statuses:
+
+    - "no_feasible_start": for none of the random designs do the objective, the held quantities and the quantities of the
+      demands all exist; the message names the quantities that do not exist
+    - "contradictory": no design meets all demands; the message states which demands are not met, and by how much
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -125,7 +127,7 @@ def synthesize(
     >>> best.same, [round(k, 2) for k in best.after.parameters["machine.stiffness"]]     # the optimum has n2 = n1
     (8, [0.11, 0.11])
 
-    Source: the antiphase paper, section 5.1, found there by algebra.
+    Source: the antiphase paper, section 5.1, where the optimum is derived by algebra.
     """
     options = _options(starts, seed, iterations, polishing, rate, searcher)
     demands = _validate_demands(space, objective, subject_to)

@@ -87,7 +87,7 @@ class RotorSamples(NamedTuple):
     """Samples of a rotor.
 
     **Attributes**: `kind` of the channel; `time` (n,), s; `value` (n,), rad or rad/s; `marks` (n,): index of the mark of each
-    pulse, otherwise 0; `spread` (n,): for pulses the speed, rad/s, by which an error of time becomes an error of the angle,
+    pulse, otherwise 0; `spread` (n,): for pulses the speed, rad/s (the ratio of an error of the angle to an error of the time),
     otherwise 1; `scatter`: standard deviation of the values about a smooth curve, divided by `spread` (for pulses in s).
     """
 

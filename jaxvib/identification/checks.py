@@ -172,7 +172,8 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
 
 
 def residual_p_value(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray, fitted_count: int) -> float:
-    """Return the probability that pure noise has vibrations at orders of the rotor speed as strong as those of the residuals.
+    """Return the probability that the vibrations of pure noise at orders of the rotor speed are at least as strong as those of
+    the residuals.
 
     The residuals are whitened by a filter and compared with vibrations at the first orders of the rotor speed in each
     segment of the record, by an F test.

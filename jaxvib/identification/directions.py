@@ -164,10 +164,10 @@ def free_unbalances(problem: Problem) -> list[int]:
 
 
 def in_polar_unbalances(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the information of the data, that of known values, both (p + L, p + L), and the sizes (E,) of the unbalances.
+    """Return the information of the data and that of known values, each (p + L, p + L), and the sizes (E,) of the unbalances.
 
-    The unknowns are those of the fit, but with (logarithm of the size, angle) instead of the components (a, b) of each
-    unbalance. p is the number of nonlinear unknowns, L that of the linear ones.
+    The unknowns are those of the fit, but each unbalance has the unknowns (logarithm of the size, angle) instead of its
+    components (a, b). p is the number of nonlinear unknowns, L the number of linear ones.
     """
     jacobian, sizes = polar_unbalances(fitted.problem, fitted.linear)
     return jacobian.T @ fitted.information @ jacobian, jacobian.T @ fitted.prior @ jacobian, sizes

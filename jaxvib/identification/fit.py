@@ -270,12 +270,12 @@ def prior_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> tupl
 
 
 def joint_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> Equations:
-    """Return the information of the data, that of known values, both (p + L, p + L), and the gradient (p + L,)."""
+    """Return the information of the data and that of known values, each (p + L, p + L), and the gradient (p + L,)."""
     return _joined(problem, x, linear, np.sum(run_equations(problem, x, linear), axis=0))
 
 
 def _joined(problem: Problem, x: np.ndarray, linear: np.ndarray, total: np.ndarray) -> Equations:
-    """Return the normal equations `total` of all runs with those of the known values, as `joint_equations`."""
+    """Return the result of `joint_equations` from the normal equations `total` of all runs."""
     prior, gradient = prior_equations(problem, x, linear)
     return total[:-1, :-1], prior, total[:-1, -1] + gradient
 

@@ -135,9 +135,16 @@ class Samples(eqx.Module):
 
 
 class _Steps(NamedTuple):
-    """Matrices of the steps: `power` exp(A h) (ns, ns), `inputs` (3, ns, E, 2, 2) for the components (a, b) of each unbalance
-    and the two entries of F, `outputs` (C, ns) and `through` (C, E, 2, 2): readings from the state and from F; `scale` s of the
-    state."""
+    """Matrices of the steps.
+
+    **Attributes**
+
+    - `power` (ns, ns): exp(A h)
+    - `inputs` (3, ns, E, 2, 2): change of the state by F at each Gauss point; the last two axes are the components (a, b) of
+      each unbalance and the two entries of F
+    - `outputs` (C, ns) and `through` (C, E, 2, 2): readings from the state and from F
+    - `scale`: frequency s of the state, rad/s
+    """
 
     power: Array
     inputs: Array
@@ -245,8 +252,8 @@ def _march(power: Array, forcing: Array, start: Array) -> tuple[Array, Array]:
 
 
 def _readings(steps: _Steps, force: Array, start: Array) -> tuple[Array, Array]:
-    """Return the derivatives (n, C, ns + 2 E) of the readings with respect to the state at the first sample and the components
-    of the unbalances, and those of the state at the end.
+    """Return derivatives with respect to the state at the first sample and the components of the unbalances: of the readings
+    of a segment (n, C, ns + 2 E), and of the state at the end of the segment (ns, ns + 2 E).
 
     **Arguments**: `start` (ns, ns + 2 E): derivatives of the state at the start of the segment.
     """
@@ -318,8 +325,11 @@ def _forces(samples: Samples, scene: Scene, x: Array, segment: Array) -> tuple[A
 
 
 def _linear_columns(steps: _Steps, samples: Samples):
-    """Return the initial carry of a scan over the segments, and its function, which also returns the linear columns
-    (n, C, ns + 2 E + C) of a segment."""
+    """Return the initial carry and the function of a scan over the segments.
+
+    The function returns the next carry and the columns (n, C, ns + 2 E + C) of a segment: the derivatives of its readings with
+    respect to the linear unknowns.
+    """
     ns, exciters, count = steps.power.shape[0], steps.inputs.shape[2], len(samples.channels)
     size, m = ns + 2 * exciters, samples.taps.shape[0] - 1
     first = jnp.concatenate([jnp.eye(ns), jnp.zeros((ns, 2 * exciters))], axis=1), jnp.zeros((m, count, size))

@@ -24,7 +24,7 @@ _WINDOWS = 128
 """Largest number of segments of a run. A segment has whole turns and gives one amplitude of each channel."""
 
 _PRIOR_WEIGHT = 0.05
-"""Weight of the logarithm of the change of an unknown, relative to that of the logarithm of an amplitude."""
+"""Weight of the change x of an unknown from its first value, relative to the weight of the logarithm of an amplitude."""
 
 
 def amplitudes(

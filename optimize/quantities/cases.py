@@ -60,8 +60,8 @@ class Sampled:
     def factors(self, scene: Scene) -> list[tuple[NamedNumber, np.ndarray]]:
         """Return the factors (samples, entries) of each parameter, with normally distributed deviations from 1.
 
-        Deviations beyond three standard deviations are cut. The factors are a Latin hypercube: the samples of each entry cover
-        its distribution evenly, in an order that is independent of the other entries.
+        The deviations are limited to three standard deviations. The factors are a Latin hypercube: the samples of each entry
+        cover its distribution evenly, in an order that is independent of the other entries.
         """
         random, out = np.random.default_rng(self.seed), []
         normal = NormalDist()
@@ -224,8 +224,8 @@ def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: in
     - `quantity` of each machine
     - `tolerances`: a mapping from the name of a parameter or array of the scene to a relative tolerance (0.05: 5 %), which is
       two standard deviations: 95 of 100 machines are within it. Each entry of an array has an independent, normally distributed
-      error, cut at one and a half tolerances; typical: 0.01 to 0.1 for masses and springs, 0.3 to 0.5 for damping
-    - `samples`: number of random machines; typical: 16 to 256 (default 64). The time is proportional to it
+      error, limited to one and a half tolerances; typical: 0.01 to 0.1 for masses and springs, 0.3 to 0.5 for damping
+    - `samples`: number of random machines; typical: 16 to 256 (default 64). The computing time is proportional to this number
     - `seed` of the random machines (a Latin hypercube)
 
     **Returns** `Quantity`, NaN if it does not exist for one of the machines. **Raises** `InputError` for wrong tolerances.

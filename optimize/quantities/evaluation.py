@@ -1,5 +1,7 @@
-"""Results of a scene from which quantities are computed. Each result is computed once; jams can be followed from those of a
-similar machine."""
+"""Results of a scene from which quantities are computed.
+
+Each result is computed once. The search for a jam can start from the jam of a similar machine.
+"""
 
 from __future__ import annotations
 

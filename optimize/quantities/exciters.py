@@ -307,11 +307,12 @@ def least_torque() -> Quantity:
 
         max_r max_w (w^4/2) sum_ik S_i S_k |A_ik(w)| / sum_i L_i(w),      A = (H^H - H)/(2 i),    w within 10 % of w_r
 
-    The maximum over w is a local one below the no-load speed; if there is none, the ratio at w_r is taken. S_i is the unbalance
-    of exciter i, kg m, L_i(w) the torque of its motor, H(w) the matrix of displacements per centrifugal force of the exciters.
-    The numerator is an upper bound, for any phases, of the mean torque of a steady vibration at the speed w. Only
-    resonances w_r up to 95 % of the lowest no-load speed of the motors count. Rotors of large inertia need this torque in a
-    slow run-up; a fast passage needs less, see `jaxvib.run_up`, which integrates the run-up.
+    S_i is the unbalance of exciter i, kg m, L_i(w) the torque of its motor, N m, and H(w) the matrix of displacements per
+    centrifugal force of the exciters. For any phases of the exciters, the numerator is an upper bound of the mean torque of a
+    steady vibration at the speed w. The maximum over w is a local maximum below the no-load speed; without such a maximum, the
+    ratio at the natural frequency w_r is used. Only natural frequencies up to 95 % of the lowest no-load speed of the motors
+    count. Rotors of large inertia need this torque in a slow run-up. A fast passage needs less; `jaxvib.run_up` integrates the
+    run-up.
 
     **Returns** `Quantity`; typical: 0.1 to 0.8; above 1 the motors are caught by a resonance. A scene with an ideal drive
     raises `InputError` when the quantity is computed.

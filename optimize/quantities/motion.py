@@ -32,9 +32,9 @@ def _times(until: Number, spin_up: Number | None) -> tuple[float, float | None]:
 def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
     """Return the largest foundation force, N, of a run from rest (full equations).
 
-    The force is read at 4000 times of the run. The value is therefore too small by up to a few percent if the run is long and
-    the peak is short, such as the peak of a collision with a `Stop`. The measure `run.peak_force` of sweeps reads each step;
-    its error is that of the steps.
+    The force is evaluated at 4000 times of the run. The value is therefore too small by up to a few percent if the run is long
+    and the peak is short, such as the peak of a collision with a `Stop`. The measure `run.peak_force` of sweeps evaluates the
+    force at each step of the integration and does not have this error.
 
     **Arguments**
 
@@ -63,7 +63,7 @@ def peak_displacement(
     *, until: Number, at: int | Sequence[Number] | None = None, body: int = 0, spin_up: Number | None = None
 ) -> Quantity:
     """Return the largest displacement, m, of a point during a run from rest (full equations), for example while motors pass
-    the resonances. It is read at 4000 times of the run, see `peak_force`.
+    the resonances. It is evaluated at 4000 times of the run, see `peak_force`.
 
     **Arguments**
 

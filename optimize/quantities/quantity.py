@@ -359,9 +359,11 @@ def _constant(value: float, unit: str) -> Combined:
 
 
 def _with_unit(value: Operand, name: str, beside: Operand = "") -> Quantity:
-    """Return a value as a quantity. A number has no unit. A string such as "2 mm" is converted to the SI unit of its dimension;
-    if it is a speed or a frequency ("25 Hz"), and the other operand `beside` of a ratio is one too, to the unit of that
-    operand."""
+    """Return a value as a quantity. A number has no unit.
+
+    A string such as "2 mm" is converted to the SI unit of its dimension. A speed or a frequency ("25 Hz") is converted to the
+    unit of the other operand `beside` of a ratio if this operand is a speed or a frequency too.
+    """
     if isinstance(value, Quantity):
         return value
     if isinstance(value, (str, UnitQuantity)):

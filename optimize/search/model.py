@@ -89,7 +89,7 @@ def at_kink(point: Point, near: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def second_derivatives(problem: Problem, point: Point) -> np.ndarray:
     """Return second derivatives (s, d, me + mi + parts + 1, d) by central differences of first derivatives.
 
-    They are those of held quantities, demands, pieces of the objective, and half the square of the objective, in this order.
+    The order of the functions is: held quantities, demands, pieces of the objective, half the square of the objective.
     """
     s, d = point.z.shape
     moves = _DIFFERENCE_STEP * np.concatenate([np.eye(d), -np.eye(d)])
@@ -117,8 +117,8 @@ def curvatures(
     The second derivatives are projected onto the directions in which active constraints and pieces do not determine the step;
     in the other directions the linear model determines it. If the objective f has one piece and is positive for a design, a
     second set is returned, with (f^2/2)''/f in place of f''. The second set is better if f is the modulus of an almost linear
-    quantity, for example a force that should vanish: the step then leads to the zero at once, whereas the step with f'' does so
-    only from nearby.
+    quantity, for example a force that should vanish. The step with this set then reaches the zero at once, whereas the step
+    with f'' reaches it only from nearby.
 
     **Arguments**: `second`: see `second_derivatives`; `weights` (s, me + mi): multipliers, in units of the objective's `size`
     (s,); `shares` (s, parts) of the pieces of the objective.

@@ -46,8 +46,8 @@ class PredictionStatus(eqx.Enumeration):
         "the model lacks a part; see the notes"
     )
     contradicted = (
-        "the run contradicts the fit: it is of another machine, the machine has changed, or a stated change of it is wrong; "
-        "see the notes, and do not fit both runs together"
+        "the run contradicts the fit: it is of another machine, the machine has changed, or a change stated for the run is "
+        "wrong; see the notes, and do not fit both runs together"
     )
 
 

@@ -173,7 +173,8 @@ def _check_motions(motions: Sequence[_Signal], source: str) -> None:
             if second.channel.kind == fourth.channel.kind and _fits(first, second, fourth) and _fits(third, fourth, second):
                 names = f"{quoted(second.channel.name)} and {quoted(fourth.channel.name)}"
                 raise InputError(
-                    f"{source}: channels {names}", "are swapped: each fits the other's place; exchange their places"
+                    f"{source}: channels {names}",
+                    "are swapped: the readings of each channel fit the place of the other; exchange the places",
                 )
     for one, other in disagreeing:
         factor = factors[one.channel.name, other.channel.name]

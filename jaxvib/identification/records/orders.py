@@ -38,10 +38,10 @@ class ForeignVibration(NamedTuple):
 
 
 def foreign_vibration(values: np.ndarray, angle: np.ndarray, step: float) -> ForeignVibration | None:
-    """Return the vibration that has most of the power of a signal if it is not at the rotor speed, otherwise None.
+    """Return the strongest vibration of a signal if it is not at the rotor speed; otherwise None.
 
-    The spectra over the rotor's angle and over time are compared: a vibration that follows the rotor is a line in the first
-    one, a vibration of constant frequency in the second one.
+    The spectra over the rotor's angle and over time are compared. A vibration that follows the rotor is a line in the first
+    spectrum, and a vibration of constant frequency is a line in the second spectrum.
 
     **Arguments**: `values` (n,), NaN for samples that do not count; `angle` (n,) of the rotor, rad; `step`, s.
 

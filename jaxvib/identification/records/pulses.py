@@ -111,8 +111,8 @@ class PulseFit(NamedTuple):
     """Smooth angle of a rotor, fitted to pulses.
 
     **Attributes**: `spline` of the angle and its errors, see `fit_spline`; `scatter` of the times, s; `angle` (n,), rad, of the
-    pulses; `marks` (n,): index of the mark of each pulse; `speeds` (n,): rough speed at each pulse, rad/s, by which an error of
-    time becomes an error of the angle.
+    pulses; `marks` (n,): index of the mark of each pulse; `speeds` (n,): rough speed at each pulse, rad/s, the ratio of an
+    error of the angle to an error of the time.
     """
 
     spline: Any

@@ -1,10 +1,10 @@
 """Smoothing splines of degree 5 for the angle of a rotor, or for its speed.
 
 The knots are evenly spaced, and their number minimizes the Bayesian information criterion. The second derivative of the angle,
-on which the force of an unbalance depends, is smooth, except at jumps, such as the end of a ramp. A smooth spline would either
-deviate there by several times its stated error, or have so many knots that intervals at low speed contain no pulse. Therefore a
-jump is added if it reduces the criterion. Its knot has the multiplicity 5, so that the slope of the angle may change there too:
-an error of the time of the jump causes such a change.
+on which the force of an unbalance depends, is smooth, except at jumps, such as the end of a ramp. Near a jump a smooth spline
+would either deviate by several times its stated error, or have so many knots that intervals at low speed contain no pulse.
+Therefore a jump is added if it reduces the criterion. Its knot has the multiplicity 5, which allows a change of the slope of
+the angle too: an error of the time of the jump causes such a change.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MAX_JUMPS = 8
 
 _SEARCH_VALUES, _SEARCH_INTERVALS = 4096, (1, 8, 64)
 """Largest number of values in the search of a jump, and numbers of intervals of the splines to which a jump is added: a jump
-between wavy parts is visible with many intervals only, and a weak one with few."""
+between wavy parts is visible with many intervals only, and a weak jump with few intervals only."""
 
 _MIN_PLACES, _MAX_PLACES = 100, 400
 """Smallest and largest number of times at which a jump is tried; within these limits the number is twice that of the

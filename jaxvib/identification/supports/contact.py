@@ -147,7 +147,7 @@ def switched_step(
         which = jnp.argmax(lax.stop_gradient(values))
         slope = rates(*lax.stop_gradient((begin + taken, new, taken, now)))
         rate = jax.jvp(lambda y: wrong(y, presses, fixed[3]), (lax.stop_gradient(new),), (slope,))[1][which]
-        # The correction of the time is 0; its derivative is that of the time of the switch.
+        # The correction has the value 0, but the derivative of the time of the switch.
         correction = (lax.stop_gradient(values) - values)[which] * jnp.where(is_switch, 1.0 / rate, 0.0)
         presses = presses ^ (is_switch & (jnp.arange(presses.size) == which))
         done = jnp.where(is_switch, done + taken + correction, h)

@@ -50,7 +50,9 @@ class Cost(Result):
     **Attributes**
 
     - `quantity`: name of the quantity
-    - `reference`: its reference values; `reference_error`: their relative error
+    - `reference`: its reference values, SI; for a final state the entries divided by their scales (displacements and
+      velocities: the largest modulus at the end of the run; angles: 1 rad; rates: the rotor speed)
+    - `reference_error`: relative error of these values
     - `rows`: a `CostRow` for each tier, method, tolerance and dtype
     - `left_out`: for each tier that cannot compute the quantity, a sentence with the reason
     """

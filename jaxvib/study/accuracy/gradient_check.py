@@ -167,9 +167,9 @@ def check_gradients(
 
         D(h) = (q(p + h p) - q(p - h p)) / (2 h),      E(h) = D(h/r) + (D(h/r) - D(h)) / (r^2 - 1),      r = sqrt 10
 
-    - The best step is the one for which E agrees best with the values for the next larger and the next smaller step. The larger
-      of these two differences is the possible error of E, called noise. Its causes are truncation at large steps, and rounding
-      (at least eps |q|/h) and the tolerance of the quantity itself at small steps
+    - The best step is the step h for which E(h) agrees best with E at the next larger and at the next smaller step. The larger
+      of these two differences is the possible error of E, called noise. At large steps it is caused by truncation, at small
+      steps by rounding (at least eps |q|/h) and by the tolerance of the quantity itself
     - A derivative differs if its distance from E is more than `tolerance` plus three times the noise
     - The status is `chaotic`, even if the routes agree, if two conditions are met: steps of 1e-5 to 1e-7 change the quantity by
       more than a hundredth of the largest change, and a derivative predicts such a change for the smallest step. Disturbances

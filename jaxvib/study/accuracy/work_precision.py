@@ -85,8 +85,8 @@ def work_precision(
       difference from the orbit with 24 (49) points. For other scenes (run-ups, imbalance, loads at different stations), the
       quantity is measured at the end of a run from rest. The reference is then the full equations with a tolerance of 1e-13;
       its error is the difference from a run with a tolerance of 1e-11
-    - "final_state": the state of the full equations at `until`, from rest, by every solver, in double and in single precision.
-      The reference is a run with a tolerance of 1e-13, with the estimated error of this run
+    - "final_state": the state of the full equations at `until`, from rest, by every solver. The reference is a run with a
+      tolerance of 1e-13, with the estimated error of this run
     - "gradient" of the largest amplitude of the jam with respect to the stiffnesses of the machine: implicit derivatives of
       leading order and exact orbit; forward mode, reverse mode and finite differences through time integration
 
@@ -99,13 +99,13 @@ def work_precision(
     - `quantity`: one of `QUANTITIES`, the names above
     - `mode`: a jam mode; default: the second-highest mode that is stable by slope, or the only one (in the highest mode the
       loads turn almost with the rotor)
-    - `until`: end of the runs, s or text; default: 20 times the longest natural period of the carrier. For a jam, the runs are
-      longer: deviations of the start must decay to the tolerance of the run. The largest Floquet multiplier gives the
-      additional time; the total is at most 2000 times the longest natural period
+    - `until`: end of the runs, s or text; default: 20 times the longest natural period of the carrier. For a jam, the default
+      is longer, because deviations of the start must decay to the tolerance of the run. The largest Floquet multiplier gives
+      the additional time; the total is at most 2000 times the longest natural period
     - `tolerances` of time integration, at least one; typical: 1e-3 to 1e-11 (the default)
     - `solvers`: names of methods from `SOLVERS`
-    - `repeats`: number of timings of each method, fewer if a call takes seconds; the shortest time is reported; typical: 3 (the
-      default)
+    - `repeats`: largest number of timings of each method, of which the shortest is reported; no timing begins after 1 s in
+      total; typical: 3 (the default)
     - `progress`: a function that is called with the name of each method and the finished share of all methods (0 to 1); it is
       not called for the "gradient"
 

@@ -137,7 +137,7 @@ class RunComparison(NamedTuple):
         if isinstance(self.start, State):
             with contextlib.suppress(InputError):
                 return with_spin(scene, self.start)
-            # The effects of this scene do not allow the spin in the state, which is of the other scene: replace the spin.
+            # The state belongs to the other scene, and the effects of this scene do not allow its spin: replace the spin.
             start = self.start
             return with_spin(scene, State(start.displacement, start.velocity, start.angle, start.rate, start.rotor))
         if self.start == "turning":

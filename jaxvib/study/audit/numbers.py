@@ -39,12 +39,13 @@ class NumberRow(NamedTuple):
 def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -> list[NumberRow]:
     """Return the dimensionless numbers of effects that `scene` lacks.
 
-    **Arguments**: `values` of the motion; relative `accuracy`, which is the limit of the numbers that are shares.
+    **Arguments**: `values` of the motion; relative `accuracy`: limit of the numbers, except for the filled share of the track,
+    contact and lift, whose limit is 1.
 
     - gravity on the loads: g/(R Omega^2), its share in the normal force of a load on its track
-    - crowding: the share of the track that the diameters of the loads fill, N arcsin(r/R)/pi, and the share of the unbalance
-      that is lost if they lie side by side, 1 - sin(N a)/(N sin a), sin a = r/R. Without a `ball_radius`, r is the radius of
-      steel balls of the same mass
+    - crowding, if the loads have no `ball_radius`: the share of the unbalance that is lost if the N loads lie side by side,
+      1 - sin(N a)/(N sin a), sin a = r/R, where r is the radius of steel balls of the same mass. If the loads do not fit on the
+      track, it is the share of the track that their diameters fill, N arcsin(r/R)/pi
     - contact: diameter of the loads divided by the smallest distance of two loads, if the scene has no contact between loads
     - dry friction divided by viscous friction: friction of a ball bearing, or of steel on steel, divided by the drag torque
       b_W R^2 (n - Omega)

@@ -27,7 +27,8 @@ weak friction this error changed mu1 by 0.4 to 0.9 percent, up to three times th
 
 
 class TurningPoints(NamedTuple):
-    """Turning points of a swing: `time` (K,) s, `angle` (K,) rad, its standard `error` (K,) rad, and a sample's `noise` rad."""
+    """Turning points of a swing: `time` (K,) s, `angle` (K,) rad, its standard `error` (K,) rad, and the standard deviation
+    `noise`, rad, of a sample."""
 
     time: np.ndarray
     angle: np.ndarray
@@ -198,7 +199,7 @@ def _longest_regular_sequence(t: np.ndarray, peaks: list[int]) -> list[int]:
 
 
 def require_uncertainty(instrument: object) -> None:
-    """**Raises** `InputError` for a relative uncertainty of J that is not a number from 0 to 1."""
+    """**Raises** `InputError` for a relative uncertainty of J that is not a number of at least 0 and less than 1."""
     if not isinstance(instrument, (int, float)) or not 0.0 <= instrument < 1.0:
         raise InputError("instrument", f"is {quoted(instrument)}; the relative uncertainty of J is at least 0 and less than 1")
 
@@ -212,14 +213,16 @@ def ten_periods(
         mu1 = J ln(phi_1/phi_11) / (5 T)                                          (small swings)
         mu1 = J [G(phi_1) - G(phi_11)] / (10 T),     G' = sin A / (4 [E/K - cos^2(A/2)]) = 2/A - 5 A/48 - ...
 
-    - Small swings with viscous friction shrink by exp(-mu1 t/(2 J)), hence 2 J ln(ratio)/(10 T)
+    - The amplitude of small swings with viscous friction decays as exp(-mu1 t/(2 J)); the first line follows from this law
     - In one period, a large swing of amplitude A loses an energy of mu1 times the integral of the angular speed over the angle.
       With the complete elliptic integrals K and E of modulus sin(A/2) it follows that A' = -(mu1/J)/G'(A). The second line is
-      the integral of this equation, and it is used here. Beyond 60 deg an error of 0.1 % remains, which the interval includes
+      the integral of this equation. This function computes the second line. Beyond 60 deg an error of 0.1 % remains, which the
+      interval includes
     - Beyond 90 deg the error of the turning points is unknown, and the interval is 0 to infinity; `identify` gives a finite
       interval in this case
-    - Dry friction is neglected: it adds 4 T_f/(pi w A) to mu1 (torque T_f, amplitude A, frequency w), more for smaller swings.
-      `drift` shows this, and the interval then does not contain mu1. `identify` finds the viscous and the dry friction
+    - Dry friction is neglected. If it is present, it increases the result by 4 T_f/(pi w A) (torque T_f of the friction,
+      amplitude A, frequency w), more for smaller swings. The attribute `drift` then differs from 0 by several standard errors,
+      and the interval does not contain mu1. `identify` determines both the viscous and the dry friction
 
     **Arguments**
 
@@ -227,8 +230,8 @@ def ten_periods(
     - `record` of its swing; typical: 10 to 60 s, first amplitude 3 to 30 deg
     - `periods` between the two amplitudes; typical: 10 (the default). More periods average more noise and need a larger first
       swing
-    - `instrument`: relative uncertainty of J, from ruler and scales; its square is added to that of the half-width of the
-      interval; typical: 0.01 to 0.03 (default 0)
+    - `instrument`: relative uncertainty of J, from ruler and scales. The half-width of the interval is
+      sqrt(s^2 + (instrument mu1)^2), where s is the half-width without it; typical: 0.01 to 0.03 (default 0)
     - `turns`: the `turning_points` of the record; default: they are computed
 
     **Returns** `Decrement`; typical: mu1 of 3e-4 to 2e-3 N m s, 0.0015 in the source. **Raises** `InputError` if the record has

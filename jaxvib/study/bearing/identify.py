@@ -60,8 +60,8 @@ class Identified(Result):
       of the instruments; typical: 3e-4 to 2e-3 N m s and 0.001 to 0.005
     - `air` b, N m s^2, and `torque` M, N m: an `Estimate` each, None if it was not requested
     - `correlation` of the errors of mu1 and mu2 (NaN without mu2)
-    - `frequency` of small swings, rad/s; `offset`: the recorded angle of the rest position, rad; `angle` from it, rad, and
-      `rate`, rad/s, at the first sample: an `Estimate` each
+    - `frequency` of small swings, rad/s; `offset`: the recorded angle of the rest position, rad; `angle` from the rest
+      position, rad, and `rate`, rad/s, at the first sample: an `Estimate` each
     - `inertia`, kg m^2: J that follows from the frequency, with the mass, the length and the g of the pendulum
     - `noise`: standard deviation of a sample, rad
     - `pattern`: correlation of neighbouring residuals, 0 for noise
@@ -137,10 +137,11 @@ def identify_bearing(
       Levenberg and Marquardt's method with forward-mode derivatives through the integration
     - The frequency is a free parameter, because the dimensions of a pendulum are never known accurately enough to predict the
       phase of many swings; g is adapted to the frequency. J is taken from `pendulum`; therefore mu1 is proportional to this J
-    - Samples before the release, and samples after the last clear turning point (the pendulum is at rest, or its swing is below
-      the noise), are not used: the position at which it comes to rest is not a smooth function of the friction
-    - `width` is 0.005 of the speed of the smallest swing. This reduces the dry friction of the smallest swing by 0.001 %, and
-      that of larger swings by less
+    - Samples before the release are not used. Samples after the last clear turning point, when the pendulum is at rest or its
+      swing is below the noise, are not used either, because the position at which the pendulum comes to rest is not a smooth
+      function of the friction
+    - `width` is 0.005 of the speed of the smallest swing. In this swing the dry friction then dissipates 0.001 % less energy
+      than with a sudden change of its sign; the difference is smaller for larger swings
 
     **Arguments**
 
@@ -187,8 +188,8 @@ def identify_bearing(
 
 
 def _decay_time(turns: TurningPoints) -> float:
-    """Return the time, s, at which the swing has decayed to a tenth, at least that of the fifth turning point, if
-    there are five.
+    """Return the time, s, at which the swing has decayed to a tenth, but not before the fifth turning point (or the last one,
+    if there are fewer).
 
     **Returns** infinity if the swing does not decay to a tenth.
     """

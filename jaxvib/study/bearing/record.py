@@ -99,8 +99,8 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
     """Read a record from a table of text: CSV, or columns between semicolons, tabs or blanks.
 
     - Lines that begin with # and empty lines are skipped
-    - The first line may have names, with units in it or in the next line: `time (s), angle (deg)`, `t [ms]`, `ANGLE_DEG`;
-      upper and lower case are not distinguished
+    - The first line may contain the names of the columns, for example `time (s), angle (deg)`, `t [ms]` or `ANGLE_DEG`; units
+      can also be in the next line. Upper and lower case are not distinguished
     - Columns with the names time and angle (t, phi, theta, ...) without a unit are in s and rad; other columns need a unit
     - If columns are separated by semicolons, tabs or blanks, numbers may have a decimal comma
 

@@ -105,7 +105,7 @@ class BearingPendulum(Readable):
 
 
 class Friction(NamedTuple):
-    """Coefficients of the torques on a pendulum other than that of gravity.
+    """Coefficients of the torques on a pendulum, except the torque of gravity.
 
     **Attributes**: `viscous` mu1, N m s; `dry` mu2; `air` b, N m s^2; constant `torque` M, N m; None for an absent torque.
     """

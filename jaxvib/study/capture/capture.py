@@ -142,7 +142,7 @@ def moving_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> Sta
 
     **Arguments**: `speed`: (load speed - rotor speed)/(rotor speed), -1 for loads at rest in space; `shift`, rad, of the loads
     along the ring, a scalar or (count,). The angle between neighbouring loads is 2 atan(r/R), as printed in the source of
-    `capture`; that of balls that touch would be 2 asin(r/R).
+    `capture`; the angle between balls that touch is 2 asin(r/R).
 
     **Returns** `State`. **Raises** `InputError` for loads that are not in a torus.
 
@@ -190,7 +190,7 @@ def capture(
     - `speeds`: initial speeds relative to the rotor, in units of the rotor speed, ascending, from -1 (at rest in space) to 0;
       typical: 32 speeds (the default)
     - `turns`: length of each run in turns of the rotor; typical: 1000 to 3000 (default 2000). A capture that needs more turns
-      counts as a failure. The time is proportional to it
+      counts as a failure. The computing time is proportional to `turns`
     - `starts` for each speed; typical: 1 (the default) to 32. In all starts except the first, each load is shifted along the
       ring by its own random angle of up to `spread`
     - `spread`, rad; typical: 1e-3 (the default)

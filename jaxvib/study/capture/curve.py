@@ -33,8 +33,8 @@ class ThresholdCurve(Result):
     - `value` (V,) of the parameter
     - `threshold` and `uncertainty` (V,): see `Capture`; the threshold is -1 if every start was captured, and NaN if not every
       start at the highest speed was captured
-    - `least` (V,): the lowest speed at which a start was captured, NaN if there is none. Between this speed and the threshold,
-      captures and failures alternate
+    - `least` (V,): the lowest speed at which a start was captured, NaN if there is none. If it is below the threshold, both
+      captures and failures occur between this speed and the threshold
     - `last_change` (V,): change of the threshold by the last doubling of the steps
     - `converged` (V,): False if this change was larger than the spacing of the computed speeds
     - `turns` of the rotor of each run

@@ -84,8 +84,8 @@ def criterion_map(
     - `scene` with loads on a circle; exact stability is that of the first arrangement of `balanced_states`
     - `speeds`, rad/s, ascending; typical: 50 to 200 from half the lowest to twice the highest resonance
     - `mass` and `drag`: factors greater than 0, times the mass and the drag of the scene's loads; typical: 0.1 to 10
-    - `steps`: as for `balanced_states(scene).stability`; default: the number that the natural frequencies need. The time is
-      proportional to it
+    - `steps`: as for `balanced_states(scene).stability`; default: the number that the natural frequencies need. The computing
+      time is proportional to this number
 
     **Returns** `CriterionMap`.
 

@@ -73,7 +73,8 @@ def stability_map(
     - `make`: a function that returns the scene for a value of x
     - `values` of x, ascending; typical: 5 to 20
     - `omega`: the lowest and the highest load speed, rad/s; typical: a range about one resonance
-    - `points` of each diagram; typical: 60 to 300 (the default). The time is proportional to it
+    - `points`: number of load speeds in each diagram; typical: 60 to 300 (the default). The computing time is proportional to
+      this number
 
     **Returns** `StabilityMap`. **Raises** `InputError` for an empty list of values, and for values that do not ascend.
 
@@ -115,9 +116,9 @@ def stability_onset(
     points: int = 300,
     accuracy: float = 1e-3,
 ) -> float:
-    """Return the x at which a special point of a kind appears in the exact diagram of `make(x)`, by bisection in log x.
+    """Return the x at which a special point of a given kind appears in the branch diagram of exact jams of the scene `make(x)`.
 
-    If such a point appears at several x in the range, the bisection finds one of these x.
+    The value is found by bisection in log x. If such a point appears at several x in the range, one of these x is found.
 
     Odd jam modes of light loads are stable on their whole range. This function finds, for example, the load mass above which a
     torus bifurcation ends the stable range before the fold, or above which the half-turn symmetry breaks.
@@ -128,11 +129,12 @@ def stability_onset(
     - `kind` of the special point, see `SpecialPoint`
     - `between`: two positive values of x; at the lower value the diagram has no such point, at the higher value it has one
     - `omega`: the lowest and the highest load speed of the search, rad/s
-    - `points` of each diagram; typical: 60 to 300 (the default). The time is proportional to it
+    - `points`: number of load speeds in each diagram; typical: 60 to 300 (the default). The computing time is proportional to
+      this number
     - `accuracy` of x, relative; at least 1e-12; typical: 0.1 to 1e-3 (the default). Each diagram halves the range
 
-    **Returns** x, which is too large by at most `accuracy` (relative). **Raises** `InputError` for an unknown kind, and if the
-    diagrams of both values of `between` have such a point, or neither.
+    **Returns** x, which is too large by at most `accuracy` (relative). **Raises** `InputError` for an unknown kind, and unless
+    the diagram of the lower value of `between` has no such point and that of the higher value has one.
 
     >>> import jaxvib as jv
     >>> def machine(eps):
