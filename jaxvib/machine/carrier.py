@@ -207,9 +207,9 @@ class Carrier(Readable):
     def as_lengths(self, values: Array) -> Array:
         """Return `values` (..., nd) of the coordinates as lengths, m, so that translations and rotations can be compared.
 
-        A rotation is multiplied by the length at which its energy is that of a translation, the square root of the mean moment
-        of inertia divided by the mean mass (of the diagonal of M). The values are returned unchanged if all coordinates have
-        the same unit.
+        A rotation is multiplied by the radius of gyration: the square root of the mean moment of inertia divided by the mean
+        mass, both from the diagonal of M. A rotation and a translation of equal length then have about the same energy. The
+        values are returned unchanged if all coordinates have the same unit.
 
         >>> import jax.numpy as jnp, jaxvib as jv
         >>> springs = [jv.support(at=(x, 0.0), stiffness=(1e4, 1e4), damping=(10.0, 10.0)) for x in (-1.0, 1.0)]

@@ -25,9 +25,9 @@ class TorusBalls(Loads):
 
         p = (B cos f, B sin f, -rho cos a),    B = R + rho sin a,    rho = R_1 - r
 
-    f is the angle about the rotor's axis, a the angle in the cross-section of the tube: 0 at the smallest axial coordinate (the
-    bottom of a level tube), pi/2 at the outer equator. n is the direction from the tube's middle to the ball, kappa = 7/5, and
-    F_f and F_a are the other forces along f and a, such as drag and gravity:
+    f is the angle about the rotor's axis. a is the angle in the cross-section of the tube: 0 at the smallest axial coordinate
+    (the bottom of a level tube), pi/2 at the outer equator. n is the direction from the tube's middle to the ball, and
+    kappa = 7/5. F_f and F_a are the other forces along f and a, such as drag and gravity:
 
         kappa m (B f'' + 2 rho cos a a' f') = (2/5) m w rho cos a a' + F_f
         kappa m (rho a'' - B f'^2 cos a)    = - (2/5) m w B cos a f' + F_a

@@ -90,9 +90,10 @@ def require_double(scene: Scene, purpose: str) -> Scene:
 
 
 def allowed_unknowns(scene: Scene) -> Array | None:
-    """Return a traced Boolean, True if the constructors allow the traced parameters of a scene.
+    """Return a Boolean, True if the constructors allow the traced parameters of a scene.
 
-    None if no parameter is traced; the values are then already validated.
+    The result is None if no parameter is traced, because the values are then already validated. It is also None if the traced
+    values are known, as under `grad` without `jit`, and allowed.
 
     >>> import equinox as eqx, jax, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),

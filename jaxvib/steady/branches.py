@@ -156,7 +156,7 @@ def branches(
 
         return exact_branches(scene, points=points, least=least, most=most, accuracy=accuracy)
     if least is not None:
-        raise InputError("least", "is only for exact=True; leave it out, because branches of light loads begin at speed 0")
+        raise InputError("least", "is only for exact=True; leave it out, because branches of light loads begin near speed 0")
     if accuracy is not None:
         raise InputError("accuracy", "is only for exact=True; leave it out, because branches of light loads are explicit")
     require_drag(jammed_loads(scene))

@@ -303,8 +303,8 @@ def vibration_measures(
 
     - `scene`
     - `motion` of the scene: a jam of light loads such as `jam_modes(scene).select(3)` or `phase_jams(scene).select(0)`, an
-      exact jam such as `jam_orbit(scene, mode=3)` (whose supports and points move with its first harmonic), or the
-      `vibration()` of a run, of an envelope, of a synchronous regime or of a response
+      exact jam such as `jam_orbit(scene, mode=3)`, or the `vibration()` of a run, of an envelope, of a synchronous regime or
+      of a response. For an exact jam, forces on supports and motions of points are those of the first harmonic
     - `at`: point of a deck, (x, y) of the body with the number `body`, m, or a list of points; default: the body's centre of
       mass; typical: both ends of the deck
     - `slope` of the deck, rad or text from x anticlockwise; typical: "-15 deg" to 0 (the default)
@@ -540,7 +540,7 @@ def conveying_speed(amplitude: Array | complex, speed: Number, *, slope: Number 
         G (cos(p + f) - cos p) = -G sin(p) f - f^2/2,    cos p = 1/G, p < 0;
         v = w/(2 pi) [ x'(p) f/w - (x(p + f) - x(p)) - g sin(slope) (f/w)^2 / 2 ]
 
-    A particle leaves the deck when the deck's acceleration reaches that of gravity, at the phase p, flies for the phase f,
+    A particle leaves the deck at the phase p, when the deck's acceleration reaches that of gravity. It flies for the phase f,
     lands without rebound and moves with the deck until the next throw. x is the motion along the deck, G the throw number.
     For motion along a straight line at the angle b to a level deck, v = g f^2 / (4 pi w tan b), the formula of handbooks. Real
     material is slower; typical: 0.7 to 0.9 of v, less in deep or sticky layers.

@@ -48,8 +48,9 @@ def outcome(
     - `throw`: True to raise an error if the name of a known status is among the `failures`
     - `hint`: function from the name of a status to the text that is appended to its message
 
-    **Returns** the result; under a JAX transformation it has the status `refused` and NaN in place of numbers if a parameter
-    of the scene has a value that its constructor would reject, such as a negative stiffness, or if `end` is not positive.
+    **Returns** the result. Under a JAX transformation it has the status `refused` and NaN in place of numbers if a parameter
+    of the scene has a value that the constructor of its part would reject, such as a negative stiffness, or if `end` is not
+    positive.
 
     **Raises** `ComputationError` for a status among the `failures` if `throw` is True.
     """

@@ -161,8 +161,8 @@ class Deck(Result):
     - `points` (n, 2), m, of the body
     - `amplitude` U (n, 2), m: complex amplitudes, horizontal and up
     - `ellipses`: an `Ellipse` whose arrays are (n,)
-    - `motion_spread`: root mean square over the points of |U_p - mean| divided by |mean|; 0 if all points have the same
-      motion; inf if the mean is 0, as for a deck that only turns about its middle; typical: 0.01 to 0.3
+    - `motion_spread`: root mean square of |U_p - mean U| over the points p, divided by |mean U|; typical: 0.01 to 0.3. It is 0
+      if all points have the same motion, and inf if the mean is 0, as for a deck that only turns about its middle
     """
 
     status = Computed.done

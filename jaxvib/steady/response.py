@@ -250,7 +250,8 @@ def response(
 
     - `scene`, whose exciters have an unbalance and no loads; its effects may be gravity, and static and moment imbalances of
       the rotors, which excite the machine as well
-    - `speeds`, rad/s, one or a list; typical: 100 to 1000 values; default: `points` from 0 to `most`, denser near resonances
+    - `speeds`, rad/s, one or a list; typical: 100 to 1000 values; default: `points` speeds from a thousandth of the lowest
+      resonance to `most`, denser near resonances
     - `phases` (exciter,), rad or text, of the unbalances in their directions of rotation, which do not change with the speed;
       default: 0
     - `points`: number of the default speeds; typical: 200 to 2000 (default: 500)

@@ -100,9 +100,10 @@ class Whirl(Result):
     - `forward`: (ns, nd) True if the motion turns with the rotor, False if it turns against the rotor or not at all
     - `straight`: (ns, nd) True if the axis moves on a straight line, which needs different horizontal and vertical supports
     - `directivity`: (ns, nd) (f - b)/(f + b), where the ellipse of the motion is the sum of a forward circle of the radius f
-      and a backward circle of the radius b: 1 for a forward circle, 0 for a straight line, -1 for a backward circle, which no
-      force that turns with the rotor excites. For a rotor that tilts, f and b are root sums of squares over the displacement
-      of the axis, m, and its tilts, rad
+      and a backward circle of the radius b. It is 1 for a forward circle, 0 for a straight line, and -1 for a backward circle.
+      No force that turns with the rotor excites a motion of the directivity -1. For a rotor that tilts, f and b are root sums
+      of squares over the displacement of the axis, m, and its tilts, rad. The directivity of a motion that does not oscillate
+      has no meaning
     - `critical`: the critical speeds
     - `status`: a `WhirlStatus`; motions that are lost in rounding errors are NaN
     """

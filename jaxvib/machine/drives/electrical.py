@@ -52,8 +52,11 @@ class NamePlateMotor(Motor):
     - `starting_ratio`: starting torque (locked rotor) divided by rated torque, M_A/M_N of catalogues; None (the default): that
       of Kloss's formula; typical: 1.8 to 2.8
 
-    **Raises** `InputError` for a wrong unit, a value out of bounds, a rated speed that needs more than 48 pole pairs or a
-    breakdown slip of 1 or more, and a `starting_ratio` that is below that of Kloss's formula or not below `breakdown_ratio`.
+    **Raises** `InputError` for
+
+    - a wrong unit and a value out of bounds
+    - a rated speed that needs more than 48 pole pairs, or a breakdown slip of 1 or more
+    - a `starting_ratio` that is below that of Kloss's formula or not below `breakdown_ratio`
 
     >>> import jaxvib as jv
     >>> motor = jv.NamePlateMotor("4 kW", "1440 rpm", breakdown_ratio=2.8, inertia="0.02 kg m^2")

@@ -66,9 +66,10 @@ class DryFriction(Effect):
       fixed and the rotating frame)
     - `"steady"`: N = m R speed^2, as printed for loads that turn with the rotor
 
-    Viscous bearing friction is the loads' `drag`, mu1 = b_W R^2; typical: 3e-4 to 2e-3 N m s. |N| is computed as N times the
-    sign that N has in the motion without this friction. This sign is wrong only if |N| is smaller than mu2 times the other
-    forces on the load; the error of |N| is then also smaller than this product.
+    Viscous bearing friction is the loads' `drag`, with mu1 = b_W R^2; typical: 3e-4 to 2e-3 N m s.
+
+    |N| is computed as N times the sign that N has in the motion without this friction. This sign is wrong only if |N| is
+    smaller than mu2 times the other forces on the load; the error of |N| is then also smaller than this product.
 
     **Arguments** (SI, or strings with a unit)
 

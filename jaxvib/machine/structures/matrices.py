@@ -120,9 +120,9 @@ def from_matrices(
     - `mass` M and `stiffness` K (nd, nd), symmetric, M positive definite, K without negative eigenvalues
     - `damping` C (nd, nd), real; for the structural damping of a finite-element model give an equivalent viscous damping
     - `gyroscopic` G (nd, nd), skew-symmetric: the factor of the rotor speed n in the equation; None without a rotor
-    - `places`: a list of points to which exciters can be attached, numbered from 1 in `Exciter(at=)`. Each is a list of the
-      indices of its coordinates, [up], [horizontal, up] or [horizontal, up, rotation], or a matrix (1 to 3, nd) that gives its
-      displacement from q; all places have the same number of directions
+    - `places`: a list of points to which exciters can be attached, numbered from 1 in `Exciter(at=)`. A place is a list of the
+      indices, from 0, of its coordinates: [up], [horizontal, up] or [horizontal, up, rotation]. It can also be a matrix (1 to
+      3, nd) that gives the displacement of the place from q. All places have the same number of directions
     - `foundation`: (T_K, T_C), two arrays (nb, nd): the force on the foundation is T_K q + T_C q', up (nb = 1) or horizontal
       and up (nb = 2); default: the force is unknown, and results that depend on it are NaN
     - `reduce`: largest number of coordinates; typical: 6 to 20 (default: 12); None keeps all. If the last mode has the same
@@ -130,8 +130,12 @@ def from_matrices(
 
     **Returns** `MatrixMachine`.
 
-    **Raises** `InputError` for matrices of other shapes, values that are complex or not finite, an asymmetric or indefinite
-    mass or stiffness matrix, a gyroscopic matrix that is not skew-symmetric, and coordinates that do not exist.
+    **Raises** `InputError` for
+
+    - matrices of other shapes, and values that are complex or not finite
+    - an asymmetric or indefinite mass or stiffness matrix
+    - a gyroscopic matrix that is not skew-symmetric
+    - coordinates that do not exist
 
     >>> import jaxvib as jv, numpy as np
     >>> chain = 4e4 * (2 * np.eye(30) - np.eye(30, k=1) - np.eye(30, k=-1))

@@ -145,11 +145,13 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
         Re(e^H A(w) e) = Re(b^H [K - w^2 (M_S - i G) + i w C]^-1 b)
 
     M_S = M + sum m_j B^T B is the mass matrix with the loads. Without the gyroscopic matrix G the mean is the real part of the
-    trace of A. Without damping, its poles are the eigenvalues of K y = w^2 (M_S - i G) y, and its zeros are those of the same
-    problem on b^H y = 0 (the mount fixed); poles and zeros interlace. With damping, its sign changes are bracketed on a grid
-    between the lowest and the highest undamped resonance: outside this range damping cannot change the sign, because
-    Re(b^H D^-1 b) = y^H (K - w^2 (M_S - i G)) y, where D is the matrix in brackets and y = D^-1 b. A damper between the
-    exciter's platform and the foundation changes none of these speeds, because it adds only to the imaginary part of 1/A.
+    trace of A. Without damping, the poles of the mean are the eigenvalues of K y = w^2 (M_S - i G) y, and its zeros are those
+    of the same problem on b^H y = 0 (the mount fixed). Poles and zeros interlace.
+
+    With damping, the sign changes of the mean are bracketed on a grid between the lowest and the highest undamped resonance.
+    Outside this range damping cannot change the sign, because Re(b^H D^-1 b) = y^H (K - w^2 (M_S - i G)) y, where D is the
+    matrix in brackets and y = D^-1 b. A damper between the exciter's platform and the foundation changes none of these speeds,
+    because it adds only to the imaginary part of 1/A.
 
     **Returns** `CharacteristicSpeeds`; every speed has exact derivatives with respect to every parameter of the scene,
     forward and reverse, finite for equal resonances and for links without stiffness (0 for a resonance at speed 0).

@@ -211,9 +211,11 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
     **Returns** `BalancedStates`.
 
-    **Raises** `InputError` for loads that do not run on a circle, for loads in more than two planes, and for loads in one plane
-    if the imbalance tilts the rotor (a moment imbalance, or a static imbalance at another point of the axis): loads in one
-    plane cannot cancel it.
+    **Raises** `InputError` for
+
+    - loads that do not run on a circle, and loads in more than two planes
+    - loads in one plane if the imbalance tilts the rotor, because they cannot cancel it: a moment imbalance, or a static
+      imbalance if the loads are not in the plane of the rotor's centre of mass
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -339,9 +341,13 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
 
     **Returns** `BalancedStability`.
 
-    **Raises** `InputError` for angles at which the loads do not cancel, for a machine that can drift, for effects that disturb
-    the balanced motion (gravity), for a rotor so slow that the steps of a turn cannot resolve the vibration of a weakly damped
-    carrier, and for the reasons of `balanced_states`; `ComputationError` with its status if the loads cannot cancel.
+    **Raises** `ComputationError` with the status of `balanced_states` if the loads cannot cancel, and `InputError` for
+
+    - angles at which the loads do not cancel
+    - a machine that can drift
+    - effects that disturb the balanced motion (gravity)
+    - a rotor so slow that the steps of a turn cannot resolve the vibration of a weakly damped carrier
+    - the scenes that `balanced_states` does not accept
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)

@@ -52,8 +52,11 @@ class Folds(Readable):
 
 
 class DraggedModel(JammedModel):
-    """Model of a scene with jammed loads at the rotor's working speed, whose branch is the factor of the drag over the load
-    speed: the loads jam at a load speed if their drag is multiplied by this factor."""
+    """Model of a scene with jammed loads at the rotor's working speed.
+
+    Its branch is not a rotor speed but a factor of the drag as a function of the load speed: the loads jam at this load speed
+    if their drag is multiplied by the factor.
+    """
 
     @property
     def highest_speed(self) -> Array:
@@ -72,9 +75,9 @@ def rotor_speed_at(model: ExcitedModel, omega: Array, speed: Array | None = None
     couples the carrier's coordinates, Y is computed at the rotor speed `speed`.
 
     Dry friction with the coefficient mu2 in a bearing of diameter d adds the torque mu2 (d/2) N sign(n - w) of each load to the
-    drag; n is then the root of this balance of torques between w and the value above, with N = m R w^2. The weight of the loads
-    is neglected, because its effect on N averages to zero over a turn unless the weight exceeds N. An imbalance of the rotor
-    acts at the frequency n and not at w, and has no effect here.
+    torque of the drag, with the normal force N = m R w^2. n is then the speed at which all torques balance; it lies between w
+    and the value of the formula. The weight of the loads is neglected, because its effect on N averages to zero over a turn
+    unless the weight exceeds N. An imbalance of the rotor acts at the frequency n and not at w, and has no effect here.
 
     For a model with unbalances instead of loads (`UnbalancedModel`) the value returned is not a speed but the torque of the
     vibration divided by that of the motors; for a `DraggedModel` it is the factor of the drag. Two motions merge at the folds
@@ -202,9 +205,13 @@ def branch_root(
 class Pieces(NamedTuple):
     """Monotone pieces of a branch between its folds.
 
-    **Attributes**: load speeds `low` and `high` and rotor speeds `speed_low` and `speed_high` at the ends of each piece, rad/s,
-    and its number `mode`, (2 nd + 1,) each, with two more entries for each peak that the branch may have in addition to those
-    of the resonances (`extra_peaks`); `resonances` (nd,), rad/s; the `folds`.
+    **Attributes**: those of the pieces have 2 nd + 1 entries, and two more for each of the `ExcitedModel.extra_peaks`
+
+    - `low` and `high`: load speeds at the ends of each piece, rad/s
+    - `speed_low` and `speed_high`: rotor speeds at these ends, rad/s
+    - `mode`: number of the jam mode of each piece
+    - `resonances` (nd,), rad/s
+    - `folds` between the pieces
     """
 
     low: Array
@@ -265,8 +272,8 @@ def piece_modes(cuts: Array, exists: Array, resonances: Array) -> Array:
 def sampled_modes(omega: np.ndarray, speeds: np.ndarray, resonances: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the pieces of a branch n(Omega) with the samples `omega` and `speeds` (P,).
 
-    **Returns** the indices of all its folds; those of the folds between pieces, ascending, P for folds that do not exist; and
-    the mode number of each piece.
+    **Returns** the indices of the samples at all folds; the indices of the samples at the folds between pieces, ascending, with
+    P for folds that do not exist; and the mode number of each piece.
     """
     nd, rising = resonances.shape[0], np.diff(speeds) > 0.0
     folds = 1 + np.flatnonzero(rising[1:] != rising[:-1])[: 4 * nd]

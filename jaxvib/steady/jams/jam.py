@@ -188,8 +188,9 @@ class JamModes(AbstractJam):
     def select(self, mode: int, *, throw: bool = True) -> Jam:
         """Return the jam mode with number `mode`.
 
-        **Raises** `InputError` for a number outside 1 .. 2 nd + 1, `ComputationError` (status "absent") if it does not exist at
-        this rotor speed; with `throw=False`, and under a JAX transformation, the status states this and no error is raised.
+        **Raises** `InputError` for a number outside 1 .. 2 nd + 1, and `ComputationError` (status "absent") for a mode that
+        does not exist at this rotor speed. With `throw=False`, and under a JAX transformation, only the status shows that the
+        mode does not exist.
         """
         return entry(self, Jam, self.row(mode, throw=throw))
 
@@ -300,8 +301,8 @@ def jam_modes(scene: Scene) -> JamModes:
     typical: loads of 0.1 % to 5 % of the machine's mass. The relative error of the result is proportional to the mass of the
     loads, see `jam_orbit`.
 
-    Resonances whose distance is smaller than their bandwidth have one common peak of the branch and one pair of modes, with
-    the number of the resonance nearest to the peak; the status of the other modes is `absent`, and `unresolved` lists them.
+    Resonances whose distance is smaller than their bandwidth have one common peak of the branch and one pair of modes, which
+    belongs to the resonance nearest to the peak. The status of the other modes is `absent`, and `unresolved` lists them.
 
     **Returns** `JamModes`; derivatives of every field with respect to every parameter of the scene are exact (implicit
     function theorem), forward and reverse. `vmap` over scenes computes the jams at many rotor speeds at once.
@@ -415,8 +416,8 @@ def jam_at(
 def _can_stay_together(model: JammedModel, omega: Array, rotor_speed: Array, displacement: Array) -> Array | bool:
     """Return True if the torque of the vibration can balance the drag of every load; always True for equal loads.
 
-    This is the case if the torque of the vibration on each load at its best phase, S w^2 |e^H B Y| / 2, reaches the torque
-    b_W R^2 (n - w) of its drag and that of its dry friction. The vibration is largest for coincident loads.
+    S w^2 |e^H B Y| / 2 is the largest torque of the vibration on a load, that at its best phase. It must reach the sum of the
+    torques of the drag, b_W R^2 (n - w), and of the dry friction of this load. The vibration is largest for coincident loads.
     """
     loads = model.loads
     if loads.alike:

@@ -127,9 +127,10 @@ def phase_jams(
 
         b_W R^2 (n - Omega) = mean braking torque of the vibration on load j,  for every load j, solved for Omega and the phases
 
-    - At each of many load speeds, closer together near resonances, the search finds phases at which all loads need the same
-      multiple of their drag, from `starts` random sets of phases and some regular ones. If this multiple passes 1 between two
-      load speeds, a jam lies between them, and Newton's method solves for its speed and phases (`phase_jam`)
+    - The search computes, at each of many load speeds, the phases at which all loads need the same multiple of their drag. It
+      starts from `starts` random sets of phases and some regular ones. If this multiple passes 1 between two load speeds, a jam
+      lies between them, and Newton's method solves for its speed and phases (`phase_jam`). The load speeds are closer together
+      near resonances
     - Jams that differ by a common rotation of all loads, or by an exchange of equal loads, count as one
     - Loads that turn with the rotor and balance it are left out. Two equal loads at one point of the machine also have a jam at
       the speed at which the response of the machine lags by 90 degrees; it is left out here, and `synchronous_regimes` lists it

@@ -135,7 +135,7 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
 
     At many load speeds the equations are solved for the phases at which all loads need the same multiple of their drag. Each
     pattern is followed to the neighbouring load speeds. If this multiple crosses 1 between two speeds, a jam lies between, and
-    the interval is narrowed down. Points whose multiple is near 1 are starts too, and so are the mirror images of all starts:
+    the interval is narrowed down. Points whose multiple is near 1 are starts too. The mirror images of all starts are added:
     of two patterns that are nearly mirror images of each other, Newton's method often misses the one with steeper slopes.
     """
     speeds, at_speeds, row, factor, angles = solved_phases(balance, phases)

@@ -121,9 +121,10 @@ def exact_branches(
 
     Each point is solved separately at its own load speed; therefore folds need no continuation. Special points are bracketed by
     the points of the diagram and then computed as roots of functions of the growth factors s_i of disturbances. The s_i are the
-    Floquet multipliers of a period, or, if the motion has the half-turn symmetry, the eigenvalues of the map from a disturbance
-    to the disturbance half a period later, rotated by half a turn. Coincident loads have two sets of s_i: those of disturbances
-    that keep the loads coincident, and those of disturbances that separate them. The special points are the roots
+    Floquet multipliers of a period. If the motion has the half-turn symmetry, they are instead the eigenvalues of the map from
+    a disturbance to the disturbance half a period later, rotated by half a turn. Coincident loads have two sets of s_i: those
+    of disturbances that keep the loads coincident, and those of disturbances that separate them. The special points are the
+    roots
 
     - of dn/dOmega: fold
     - of prod (1 - s_i s_j) over pairs of the first set: torus

@@ -98,11 +98,14 @@ def jam_orbit(
     **Returns** `Orbit`; its fields have derivatives with respect to every parameter of the scene (implicit function theorem,
     forward and reverse).
 
-    **Raises** `InputError` for wrong arguments, a load without drag, and a `mode` of a machine with gyroscopic coupling, whose
-    resonances depend on the rotor speed; for motors, imbalances of the rotor, nonlinear supports and bodies in a plane;
-    `ComputationError` with the status "absent" or "not_converged". For a machine with gyroscopic coupling use `omega` or
-    `near`. Such a machine may have motions with the same load speed at several rotor speeds; `omega` then gives the motion at
-    the lowest rotor speed.
+    **Raises** `ComputationError` with the status "absent" or "not_converged", and `InputError` for
+
+    - wrong arguments
+    - loads without drag, at different stations, or not on a circle
+    - a motor, an imbalance of the rotor, nonlinear supports and bodies in a plane
+    - a `mode` of a machine with gyroscopic coupling, whose resonances depend on the rotor speed. Use `omega` or `near` instead.
+      Such a machine may have motions with the same load speed at several rotor speeds; `omega` then gives the motion at the
+      lowest rotor speed
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

@@ -125,9 +125,11 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
     **Returns** `SynchronizationLimit`; an end without a fold is NaN and has the status "not_found" or "no_effect". The motion
     can lose its stability before its fold.
 
-    **Raises** `InputError` for a name that the scene does not have, the name of an array, the speed of one of several ideal
-    drives with unbalances, and scenes in which neither the speed nor a phase is free; `ComputationError` if the scene has no
-    such motion.
+    **Raises** `ComputationError` if the scene has no such motion, and `InputError` for
+
+    - a name that the scene does not have, and the name of an array
+    - the speed of one of several ideal drives with unbalances
+    - scenes in which neither the speed nor a phase is free
 
     >>> import jaxvib as jv
     >>> springs = [jv.support(at=(x, 0.0), stiffness=(4e5, 4e5), damping=(2e3, 2e3)) for x in (-1.0, 1.0)]

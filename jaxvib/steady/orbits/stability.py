@@ -56,7 +56,7 @@ class Floquet(NamedTuple):
       span of the collocation grid, without the trivial root of a shift in time. The span is a period, and the roots are the
       Floquet multipliers. If the motion has the half-turn symmetry, the span is half a period, the disturbance at its end is
       rotated by half a turn, and the multipliers are the squares of the roots
-    - `inner` (2, P): growth factors of the distance of two coincident loads while all other parts do not move, over the same
+    - `inner` (2, P): growth factors of the distance of two coincident loads while nothing else is disturbed, over the same
       span; None for a single load
     - `trivial` (P,): the trivial root, which is 1 except for the error of the integration
     """
@@ -259,7 +259,7 @@ class _Disturbances(NamedTuple):
 
     @staticmethod
     def relative_motion(c: _Coefficients, x: Array, x1: Array) -> Array:
-        """Return the second derivative of the angle between loads of one body, with the carrier at rest."""
+        """Return the second derivative of the angle between loads of one body, which does not disturb the carrier."""
         return c.by_rate[:, None] * x1 + c.by_angle[:, None] * x
 
     def along_orbit(self, grid: Grid, harmonics: Harmonics) -> Array:
@@ -298,8 +298,8 @@ def floquet(
 
     T_phi, T_rate and T_a are the derivatives of T with respect to the angle and the speed of the body, and to the acceleration
     a of the mount, on which T depends if there is dry friction. phi, e, t, a and these derivatives are those of the periodic
-    motion; the disturbance of a is Omega^2 B q''. Loads of one body that separate (sum d_j = 0) leave the carrier at rest: they
-    obey the second equation without its last term. Loads that lie side by side are pressed together and do not separate.
+    motion; the disturbance of a is Omega^2 B q''. Loads of one body that separate (sum d_j = 0) do not disturb the carrier:
+    they obey the second equation without its last term. Loads that lie side by side are pressed together and do not separate.
 
     All orbits are integrated with equal steps of the same length by Dormand and Prince's method of order 8 or, if `implicit`,
     by `radau.transition`, which resolves any drag of the loads and any damping of the carrier.

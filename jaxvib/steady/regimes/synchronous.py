@@ -310,12 +310,13 @@ def synchronous_regimes(
       drag on a load. An ideal drive prescribes the angle Omega t of its unbalance, and Omega is then the speed of this drive
     - n is the mean of the rotors' speeds, anticlockwise positive; the gyroscopic matrix G is 0 for most machines
     - Regimes that differ by the same shift of all phases or by an exchange of equal exciters, such as mirror images, are listed
-      once; of a family of regimes one member is listed, with the status `degenerate`
+      once. One member of a family of regimes is listed, with the status `degenerate`
     - If the forces of the masses cancel, for example those of two equal unbalances of one direction and one axis in antiphase,
       the status is `no_vibration`
     - Stability is the growth of small disturbances of amplitudes, speeds and phases together, see `averaged_field`
-    - The relative error of the torques is of the order S^2/(2 M I) with the inertia I of a rotor; close to the parameters at
-      which two regimes exchange their stability, the error of the phases is some tenths of a radian
+    - The relative error of the torques is of the order S^2/(2 M I), where M is the mass of the machine and I the inertia of a
+      rotor. Close to the parameters at which two regimes exchange their stability, the error of the phases is some tenths of a
+      radian
     - In this approximation exciters with different speeds do not act on each other. `masses` selects a group that turns at one
       speed; `regime_partitions` returns the motions of all divisions into such groups
     - With more than 6 masses the number of regimes, most of them unstable, is too large for a complete list. The starts then
