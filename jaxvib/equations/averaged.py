@@ -79,8 +79,8 @@ AVERAGED_TERMS = (GravityField, LoadPotential)
 """Terms that the averaged equations include: potentials, whose mean torque is 0."""
 
 LATE = 1e30
-"""Time after all changes of the drives, s, at which steady motions are computed. It is finite, because derivatives of products
-with an infinite time are NaN also where they are not selected."""
+"""Time after all changes of the drives, s, at which steady motions are computed. It is finite, because the derivatives of a
+product with an infinite time are NaN, even in the branch of a `where` that is not selected."""
 
 _MIN_DAMPING = 1e-9
 """Decay rate, relative to the speed, below which a motion is not called stable: smaller computed rates can be rounding

@@ -127,7 +127,7 @@ class Dynamics(eqx.Module):
         return [group.each(function, *of_group) for group, *of_group in zip(self.groups, *values, strict=True)]
 
     def _fenced(self, parts: list[T], unforced: Array) -> list[T]:
-        """Return parts of the groups with fences, if there are any."""
+        """Return parts of the groups, with fences if `has_fences` is True."""
         if not self.has_fences or all(len(group.members) == 1 for group in self.groups):
             return parts
         one = hidden_one(unforced[0])
@@ -183,7 +183,7 @@ class Dynamics(eqx.Module):
             return [[jnp.sum(self.rows[k] * carrier) for k in block] for block in blocks], carrier
 
         def row_coupling(i: int, k: int) -> Array | float:
-            """Return the acceleration of row i per that of row k due to the added mass, which acts within an exciter."""
+            """Return the acceleration of row i per that of row k by the added mass, which couples rows of one exciter only."""
             return sum(self.accelerance[i, j] * weights[j][k] for j in block_of_row[k])
 
         n, free = ends[-1], times(self.rows, unforced)
@@ -206,7 +206,7 @@ class Dynamics(eqx.Module):
         ends = np.cumsum([w.shape[0] * w.shape[1] for w in weights])
 
         def weighted(x: Array) -> Array:
-            """Return W x of the added mass W, which acts within an exciter, for x (nP, k)."""
+            """Return W x for x (nP, k) and the added mass W, which couples rows of one exciter only."""
             blocks = (block.reshape(*w.shape[:2], -1) for w, block in zip(weights, jnp.split(x, ends[:-1]), strict=True))
             products = (jnp.sum(w[..., None] * x[:, None], axis=2) for w, x in zip(weights, blocks, strict=True))
             return jnp.concatenate([product.reshape(-1, x.shape[1]) for product in products])

@@ -109,7 +109,7 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     """Return the kinetic and potential energy of a state, J.
 
         E = q'.M q'/2 + q.K q/2 + sum_j [ m_j |B_j q' + p_j'|^2/2 + (kappa_j - 1) m_j |p_j'|^2/2 + V_j(u_j) ] + V(q)
-            + theta' d'(theta).P q' + I_r theta'^2/2 + S g sin(theta)
+            + theta' d'(theta).P q' + I_r theta'^2/2 + g d_up(theta)
             + sum_j [ (kappa_j - 1) m_j (|c_j|^2/2 - p_j'.c_j) + I_j s_j^2/2 ]
 
     - q are the coordinates of the carrier with the mass matrix M and the stiffness matrix K
@@ -117,8 +117,8 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
       factor kappa_j (7/5 for balls); B_j q is the displacement of this point
     - theta is the angle of the rotor, and P q the displacement of its axis
     - V_j and V are the potentials of the effects on the loads and on the supports
-    - d(theta) is the vector of the unbalance S of the rotor and of its other imbalances; d' is its derivative with respect to
-      theta
+    - d(theta) is the vector of the unbalance of the rotor and of its other imbalances, d_up its upward component, and d' the
+      derivative with respect to theta
     - I_r is the inertia of a motor's rotor (an ideal drive has none); g is the gravity in the plane of the rotor
     - the terms of the loads and of the rotor are added over all exciters
     - c is the sliding velocity of a load's contact point and s its spin about the contact normal; each is 0 unless an effect
@@ -215,15 +215,15 @@ def _load_energies(
 def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     """Return the power input by the rotor, and the power that dampers, drag and friction dissipate, W.
 
-        P_in = speed T,    T = sum_j M_j + d'(theta).P q'' + S g cos(theta)  (ideal drive),    the motor's torque otherwise
+        P_in = speed T,    T = sum_j M_j + d'(theta).P q'' + g d_up'(theta)  (ideal drive),    the motor's torque otherwise
         P_diss = q'.C q' + sum_j M_j (speed - phi_j') + power of effects
         M_j = b_W R^2 (speed - phi_j') + friction
 
     - M_j is the torque of the rotor on load j with the angle phi_j, the drag b_W and the radius R; `friction` is the torque of
       contact friction
-    - T is the torque with which an ideal drive turns its rotor against the loads, the unbalance S with the other imbalances (d,
-      see `energy`) and the weight of the unbalance; g is the gravity in the plane of the rotor
-    - q are the coordinates of the carrier with the damping matrix C; P and theta as in `energy`
+    - T is the torque with which an ideal drive turns its rotor against the loads, the unbalance with the other imbalances, and
+      their weight; g is the gravity in the plane of the rotor
+    - q are the coordinates of the carrier with the damping matrix C; d, P and theta as in `energy`
     - `speed` is the rotor speed. If the housing of the drive turns with the machine, the speed in P_in is that of the
       rotor relative to the housing
     - the effects that dissipate power are those on supports, contacts between loads, and resistances to the motion of the loads

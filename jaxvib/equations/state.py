@@ -46,8 +46,8 @@ class ExciterState(Readable):
 
     - `angle` and `rate`: a tuple of (count,) arrays, one for each coordinate of a load: for loads on a circle ((phi_1, ...),)
       in rad and rad/s; () without loads
-    - `rotor`: the rotor's angle and speed, rad and rad/s, if a motor drives it, followed by the states of the motor, such as
-      currents, which tables and datasets of a run contain as `motor_state`; None under an ideal drive
+    - `rotor`: if a motor drives the rotor, its angle, rad, its speed, rad/s, and the states of the motor, such as currents
+      (`motor_state` in tables and datasets of a run); None under an ideal drive
     - `spin` of the loads if effects permit it, see `Spin` and `with_spin`; otherwise None
 
     >>> import jax.numpy as jnp, jaxvib as jv

@@ -73,7 +73,7 @@ class EnsembleStatus(eqx.Enumeration):
     detached = "the run reached its end, but a load lost contact with its track; the equations keep it on the track"
     not_finite = "the motion grew without bounds"
     refused = REFUSED
-    not_resolved = "steps too long for motions that decay fast, by drag of the loads, by damping or by a motor: use more steps"
+    not_resolved = "the steps are too long for a fast decay, by drag of the loads, damping or a motor: use more steps"
 
 
 class Ensemble(Result):

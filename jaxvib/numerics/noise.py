@@ -56,7 +56,7 @@ class Noise(NamedTuple):
 
 
 def resampled(noise: Noise, ratio: float) -> Noise:
-    """Return noise with the same spectral density at a sampling step that is `ratio` times as long, without outliers.
+    """Return noise with the same spectral density at a sampling step that is `ratio` times as long. The result has no outliers.
 
     Above the highest frequency of the given noise, its density is that at this frequency. The coefficients follow from the
     covariances at the new step by the Yule-Walker equations.
