@@ -56,7 +56,8 @@ def foundation_force(scene: Scene, state: State) -> Array:
     - `scene`: supports of the machine and effects that are supports (`CubicSupport`, `Stop`, `FrictionSupport`) are included
     - `state` of the scene; typical: displacements of 0.1 to 10 mm
 
-    **Returns** an array, N: one entry (up) for platforms, two (horizontal, up) for rotors and bodies in a plane.
+    **Returns** an array, N: one entry (up) for platforms, two (horizontal, up) for rotors and bodies in a plane; NaN for
+    `from_matrices` without a `foundation`.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -68,7 +69,8 @@ def foundation_force(scene: Scene, state: State) -> Array:
     Source: the antiphase paper, equation (7).
     """
     require_motion(scene := validate_scene(scene), state, "state")
-    return assemble(scene).foundation_force(jnp.asarray(state.displacement), jnp.asarray(state.velocity))
+    model = assemble(scene)
+    return model.known_force(model.foundation_force(jnp.asarray(state.displacement), jnp.asarray(state.velocity)))
 
 
 @validated

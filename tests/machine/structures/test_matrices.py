@@ -304,6 +304,7 @@ def test_forces_on_an_unknown_foundation_are_nan():
     assert np.all(np.isnan(run.window.foundation_force)) and np.isnan(run.foundation_force) and np.isnan(run.largest_force)
     assert np.all(np.isfinite(run.amplitude)) and np.isfinite(run.drift)
     assert "foundation force unknown" in run.summary()
+    assert np.all(np.isnan(jv.foundation_force(scene, jv.initial_state(scene))))
     jam = jv.jam_modes(scene)
     assert np.all(np.isnan(jam.foundation_force)) and float(amplitude(mode=5)(scene)) == float(jam.amplitude[jam.row(5), 0])
     for quantity in (foundation_force(mode=5), transmissibility(mode=5).named("share of the force")):
