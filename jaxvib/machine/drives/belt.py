@@ -7,7 +7,7 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drives.controlled import SwitchedOff
-from jaxvib.machine.drives.drive import INERTIA, Drive, Motor, MotorWrapper
+from jaxvib.machine.drives.drive import INERTIA, Motor, MotorWrapper
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 
@@ -84,11 +84,3 @@ class BeltDrive(MotorWrapper):
     def supply_frequency(self) -> Array | None:
         """Return the angular frequency of the motor's supply, rad/s, if the torque depends on its phase; otherwise None."""
         return self.motor.supply_frequency()
-
-    def settled(self) -> Drive:
-        """Return the drive with the motor in its final state."""
-        return eqx.tree_at(lambda drive: drive.motor, self, self.motor.settled())
-
-    def at_working_speed(self) -> Drive:
-        """Return the drive with the motor at its working speed."""
-        return eqx.tree_at(lambda drive: drive.motor, self, self.motor.at_working_speed())

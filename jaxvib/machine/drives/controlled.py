@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -307,14 +306,6 @@ class Converter(MotorWrapper):
         """Return the times of the jumps of the reference."""
         return self.reference.jump_ts()
 
-    def settled(self) -> Drive:
-        """Return the converter at the working speed. **Raises** `InputError` if the reference comes to rest."""
-        return Converter(self.motor, cast(IdealDrive, self.reference.settled()))
-
-    def at_working_speed(self) -> Drive:
-        """Return the converter at the working speed."""
-        return Converter(self.motor, cast(IdealDrive, self.reference.at_working_speed()))
-
 
 class SpeedControl(Motor):
     """Motor whose torque is controlled so that its speed follows a reference (proportional and integral, with a limit).
@@ -400,14 +391,6 @@ class SpeedControl(Motor):
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the times of the jumps of the reference."""
         return self.reference.jump_ts()
-
-    def settled(self) -> Drive:
-        """Return the drive with the working speed as its reference. **Raises** `InputError` if the reference comes to rest."""
-        return eqx.tree_at(lambda drive: drive.reference, self, self.reference.settled())
-
-    def at_working_speed(self) -> Drive:
-        """Return the drive with the working speed as its reference."""
-        return eqx.tree_at(lambda drive: drive.reference, self, self.reference.at_working_speed())
 
 
 def _require_ideal(reference: object) -> None:

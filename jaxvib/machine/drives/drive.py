@@ -1,6 +1,8 @@
 """Drives of the rotor: ideal drives with a prescribed speed, and motors of limited power."""
 
 import abc
+import dataclasses
+from collections.abc import Callable
 from typing import ClassVar, cast
 
 import equinox as eqx
@@ -97,11 +99,17 @@ class Drive(Part):
     def settled(self) -> "Drive":
         """Return the drive in its final state: an ideal drive at its working speed, and a motor that is switched off at some
         time as one that is off from the start."""
-        return self
+        return self._with_changed_parts(lambda part: part.settled())
 
     def at_working_speed(self) -> "Drive":
         """Return the drive with its prescribed speed, if it has one, at the working speed, even if the rotor comes to rest."""
-        return self
+        return self._with_changed_parts(lambda part: part.at_working_speed())
+
+    def _with_changed_parts(self, change: Callable[["Drive"], "Drive"]) -> "Drive":
+        """Return the drive after a `change` of the drives that it contains, such as the reference of a converter."""
+        names = [field.name for field in dataclasses.fields(self) if isinstance(getattr(self, field.name), Drive)]
+        changed = [change(getattr(self, name)) for name in names]
+        return eqx.tree_at(lambda drive: [getattr(drive, name) for name in names], self, changed) if names else self
 
 
 class Directed(Drive):
