@@ -14,7 +14,7 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.display import shown_unit
 from jaxvib.errors import InputError, quoted, written
-from jaxvib.results.fields import Labels, columns, labels_of
+from jaxvib.results.fields import Labels, columns, labels_of, one_unit
 
 
 @validated
@@ -76,7 +76,10 @@ def main_axis(result: eqx.Module) -> str:
 
 
 def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict[str, np.ndarray]:
-    """Return the columns of the table of `write_csv` by their headers. **Raises** `InputError` for an unknown axis."""
+    """Return the columns of the table of `write_csv` by their headers. **Raises** `InputError` for an unknown axis.
+
+    The first columns are the labels of the axis, if it has labels, and the units of coordinates whose units differ.
+    """
     labels = labels_of(result)
     units = labels.get("unit", ())
     table: dict[str, np.ndarray] = {}
@@ -90,7 +93,7 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
             continue
         for place in np.ndindex(values.shape[1:]):
             places = [_label(labels, a, k, n) for a, k, n in zip(axes[1:], place, values.shape[1:], strict=True)]
-            column_unit = _own_unit(unit, axes[1:], place, units)
+            column_unit = _own_unit(unit, axes, place, units)
             head, column = " ".join([name, *filter(None, places)]), values[(slice(None), *place)]
             if display and column_unit and np.issubdtype(column.dtype, np.inexact):  # real and imaginary part have one unit
                 largest = float(np.max(np.abs(column), initial=0.0, where=np.isfinite(column)))
@@ -105,7 +108,9 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
             raise InputError("result", f"{problem}jax.tree.map(lambda x: x[0], result), or use to_xarray()")
         known = sorted({axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes)})
         raise InputError("axis", f"is {quoted(axis)}; the axes of {type(result).__name__} are: {', '.join(known) or 'none'}")
-    return table
+    named = (axis, "unit") if axis == "coordinate" and len(set(units)) > 1 else (axis,)
+    rows = len(next(iter(table.values())))
+    return {name: np.array(labels[name]) for name in named if len(labels.get(name, ())) == rows} | table
 
 
 def _label(labels: Labels, axis: str, k: int, n: int) -> str:
@@ -115,11 +120,12 @@ def _label(labels: Labels, axis: str, k: int, n: int) -> str:
 
 
 def _own_unit(unit: str, axes: tuple[str, ...], place: tuple[int, ...], units: Sequence[str]) -> str:
-    """Return the unit of the coordinate at `place` from a unit such as "m or rad"."""
-    choices = unit.split(" or ")
-    if len(choices) == 2 and "coordinate" in axes and units:
-        return choices[("m", "rad").index(units[place[axes.index("coordinate")]])]
-    return unit
+    """Return the unit of a column, at one `place` of the `axes` after the first, from a unit such as "m or rad".
+
+    In a table along the coordinates it is their common unit; if their units differ, `unit` is returned.
+    """
+    is_of_one = "coordinate" in axes[1:] and len(units) > 0
+    return one_unit(unit, [units[place[axes.index("coordinate") - 1]]] if is_of_one else units)
 
 
 def _shown(value: np.generic, decimal_comma: bool) -> str:

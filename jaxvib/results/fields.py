@@ -165,7 +165,7 @@ def to_xarray(result: eqx.Module) -> xarray.Dataset:
     for name, axes, value, unit in columns(result):
         extra = value.ndim - len(axes)
         batch = ("batch",) if extra == 1 else tuple(f"batch_{k + 1}" for k in range(extra))
-        attributes = {"units": _one_unit(unit, labels.get("unit", ()))} if unit else {}
+        attributes = {"units": one_unit(unit, labels.get("unit", ()))} if unit else {}
         variables[name] = ((*batch, *axes), value, attributes)
     data = xr.Dataset(variables)
     known = {axis: list(names) for axis, names in labels.items() if data.sizes.get(axis) == len(names) and axis not in data}
@@ -202,7 +202,7 @@ def labels_of(result: eqx.Module) -> Labels:
     return labels
 
 
-def _one_unit(unit: str, units: Sequence[str]) -> str:
+def one_unit(unit: str, units: Sequence[str]) -> str:
     """Return the common unit of all coordinates from a unit such as "m or rad"; return it unchanged if their units differ."""
     choices = unit.split(" or ")
     alike = len(choices) == 2 and len(set(units)) == 1

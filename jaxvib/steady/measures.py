@@ -27,7 +27,7 @@ from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import bracketed_root
-from jaxvib.results.fields import in_unit
+from jaxvib.results.fields import in_unit, names_along
 from jaxvib.results.readable import Readable
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import Jam
@@ -192,8 +192,8 @@ class VibrationMeasures(Readable):
     throw_number: Array | None = eqx.field(metadata=in_unit(""), default=None)
     conveying_speed: Array | None = eqx.field(metadata=in_unit("m/s"), default=None)
     throughput: Array | None = eqx.field(metadata=in_unit("kg/s"), default=None)
-    coordinates: tuple[str, ...] = eqx.field(static=True, default=())
-    directions: tuple[str, ...] = eqx.field(static=True, default=())
+    coordinates: tuple[str, ...] = eqx.field(static=True, default=(), metadata=names_along("coordinate"))
+    directions: tuple[str, ...] = eqx.field(static=True, default=(), metadata=names_along("direction"))
 
     @property
     def isolation_efficiency(self) -> Array:

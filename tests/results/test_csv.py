@@ -52,10 +52,22 @@ def test_complex_numbers_have_two_columns_and_statuses_names(tmp_path):
     columns = table(modes, "mode", tmp_path / "modes.csv")
     for k in range(2):
         for word, part in (("real", np.real), ("imaginary", np.imag)):
-            column = columns[f"{word} displacement {k + 1} (m or rad)"].astype(float)
+            column = columns[f"{word} displacement y{k + 1} (m)"].astype(float)
             np.testing.assert_allclose(column, part(modes.displacement[:, k]), rtol=1e-8)
     np.testing.assert_allclose(columns["omega (rad/s)"].astype(float), modes.omega, rtol=1e-8)
     assert columns["status"].tolist() == status_names(modes.status).tolist() and len(set(columns["status"])) == 2
+
+
+def test_rows_of_coordinates_begin_with_their_names(tmp_path):
+    scene = jv.Scene(TWO_MASSES, LOADS, jv.ConstantSpeed("60 rad/s"))
+    for result in (jv.jam_modes(scene).select(3), jv.jam_orbit(scene, mode=3)):
+        columns = table(result, "coordinate", tmp_path / "jam.csv")
+        assert next(iter(columns)) == "coordinate" and columns["coordinate"].tolist() == ["y1", "y2"]
+        np.testing.assert_allclose(columns["amplitude (m)"].astype(float), result.amplitude, rtol=1e-8)
+    run = jv.simulate(jv.Scene(ROTOR, LOADS, jv.ConstantSpeed("60 rad/s")), until=0.2)
+    columns = table(run, "coordinate", tmp_path / "rotor.csv")
+    assert list(columns)[:2] == ["coordinate", "unit"] and columns["unit"].tolist() == ["m", "m", "rad", "rad"]
+    assert "amplitude (m or rad)" in columns
 
 
 def test_truth_values_are_ones_and_zeros(tmp_path):

@@ -17,7 +17,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns, validate_scene
 from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
 from jaxvib.numerics.roots import bracketed_root
-from jaxvib.results.fields import in_unit
+from jaxvib.results.fields import in_unit, names_along
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.units.known import when_known
@@ -55,7 +55,7 @@ class CharacteristicSpeeds(Result):
     shapes: Array = eqx.field(metadata=in_unit("", "coordinate", "resonance"))
     damped_resonances: Array = eqx.field(metadata=in_unit("rad/s", "resonance"))
     damped_additional: Array = eqx.field(metadata=in_unit("rad/s", "zero"))
-    coordinates: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="coordinate"))
+    coordinates: tuple[str, ...] = eqx.field(static=True, metadata=names_along("coordinate"))
 
     @property
     def status(self) -> CriterionStatus:

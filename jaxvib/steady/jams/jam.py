@@ -25,7 +25,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import known_root
-from jaxvib.results.fields import in_unit, part
+from jaxvib.results.fields import in_unit, names_along, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import status_names
 from jaxvib.runtime.programs import cached
@@ -87,8 +87,8 @@ class AbstractJam(Result):
     displacement: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
     amplitude: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
     foundation_force: Array = eqx.field(metadata=in_unit("N", "*"))
-    coordinates: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
-    units: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+    coordinates: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True, metadata=names_along("coordinate"))
+    units: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True, metadata=names_along("unit"))
 
 
 class Jam(AbstractJam):

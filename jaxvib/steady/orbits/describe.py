@@ -15,7 +15,7 @@ from jaxvib.errors import InputError
 from jaxvib.numerics.extrema import greatest
 from jaxvib.numerics.fourier import Grid, deviation_synthesis, grid_of, synthesized
 from jaxvib.numerics.sincos import sine_and_cosine
-from jaxvib.results.fields import in_unit
+from jaxvib.results.fields import in_unit, names_along
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.orbits.solve import Harmonics, Parameter, PeriodicSolution, branch_tangent, harmonics_of, periodic_motion
@@ -94,8 +94,8 @@ class Orbit(Result):
     offsets: Array = eqx.field(metadata=in_unit("rad", "load"))
     deviation_orders: tuple[int, ...] = eqx.field(static=True, metadata=in_unit("", "deviation_orders"))
     orders: tuple[int, ...] = eqx.field(static=True, metadata=in_unit("", "orders"))
-    units: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="unit"))
-    coordinates: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="coordinate"))
+    units: tuple[str, ...] = eqx.field(static=True, metadata=names_along("unit"))
+    coordinates: tuple[str, ...] = eqx.field(static=True, metadata=names_along("coordinate"))
 
     @property
     def harmonics(self) -> int:
