@@ -1,4 +1,4 @@
-"""The command line."""
+"""Start of the command `jaxvib`, and its response to interrupts (Ctrl-C)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LATER = 0.05
 
 
 _USING_INTERRUPTS = ("optimize", "sweep", "explore")
-"""Commands that handle an interrupt as an exception: they print the result found so far, or end a server."""
+"""Commands that handle an interrupt as an exception: they report what is finished, or end a server."""
 
 
 def main() -> None:

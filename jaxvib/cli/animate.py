@@ -24,19 +24,30 @@ if TYPE_CHECKING:
 )
 @click.option("--begin", help="First time of the animation, such as 4.5s [four vibration periods before the end].")
 @click.option("--end", help="Last time of the animation [end of the run].")
-@click.option("--seconds", help="Duration of the animation, s [about 11 frames for each turn of the rotor].")
+@click.option(
+    "--seconds", help="Duration of the animation, s, at most 600 frames [about 11 frames for each turn of the rotor]."
+)
 @click.option("--fps", type=int, default=20, show_default=True, help="Frames per second.")
-@click.option("--magnify", type=float, help="Magnification of displacements, relative to the circle of the loads [automatic].")
+@click.option(
+    "--magnify", type=float, help="Factor by which displacements are drawn larger than the circle of the loads [automatic]."
+)
 @click.option("--width", type=float, default=6.4, show_default=True, help="Width of the animation, in hundreds of pixels.")
-@click.option("--format", "kind", type=click.Choice(["gif", "html", "both"]), default="both", show_default=True)
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(["gif", "html", "both"]),
+    default="both",
+    show_default=True,
+    help="Format of the file.",
+)
 @shared
 def animate(
     source: Path, until: str | None, start: Start | None, mode: int | None, kind: str, output: Output, **options: Any
 ) -> None:
     """Make an animation of the moving machine in slow motion: animation.gif and animation.html, in --out or the current folder.
 
-    SOURCE is a run.npz of `jaxvib simulate`, or its folder, or a scene file. With --until the scene is simulated first; with
-    --mode the animation shows its exact jam."""
+    SOURCE is a file run.npz of `jaxvib simulate`, the folder of such a file, or a scene file. For a scene file, --until
+    simulates the scene first; --mode without --until shows the exact jam."""
     if source.is_dir():
         source = source / "run.npz"
     if source.suffix == ".npz":

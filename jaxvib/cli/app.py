@@ -82,7 +82,9 @@ def _without_effects(scene: Scene, kinds: Sequence[str]) -> Scene:
     return Scene(scene.machine, exciters=exciters, effects=remaining(scene.effects))
 
 
-WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave out an effect of SCENE, such as gravity.")
+WITHOUT = click.option(
+    "--without", multiple=True, metavar="EFFECT", help="Leave out an effect of SCENE, such as gravity; repeatable."
+)
 """Option of commands that do not support every effect."""
 
 
@@ -115,8 +117,8 @@ TOLERANCE = click.option(
     "tolerances",
     multiple=True,
     metavar="NAME=PERCENT",
-    help="Show the ranges of the results for machines within tolerances, repeatable: stiffness=5%, damping=30%, "
-    "material=0..20kg (on platform or body 1).",
+    help="Show the ranges of the results for machines within this tolerance, such as stiffness=5%, damping=30%, "
+    "material=0..20kg (on platform or body 1); repeatable.",
 )
 """Option of commands that show ranges over machines within tolerances."""
 
@@ -176,7 +178,7 @@ def tolerance_table(ranges: Sequence[ToleranceRange], tolerances: Sequence[str])
         unit, factor = shown_unit(entry.unit, max(abs(entry.design), abs(entry.high)))
         values = [f"{factor * x:.4g}" for x in (entry.design, entry.low, entry.high, entry.worst)]
         rows.append([f"{entry.words}, {unit}".rstrip(", "), *values, f"{100.0 * entry.share:.3g} %"])
-    head = ["light loads", "design", "95 % from", "to", "worst", "machines that have or meet it"]
+    head = ["light loads", "design", "95 % from", "to", "worst", "share with this quantity, or meeting the demand"]
     return table(f"machines with {', '.join(tolerances)}", head, rows)
 
 
@@ -299,6 +301,8 @@ def app() -> None:
     """Simulate and design vibration machines that work on the Sommerfeld effect.
 
     Begin with: jaxvib new two-mass > machine.toml (or linear-screen, feeder, rotor: see jaxvib new --help)
+
+    In the help of a command, the text in square brackets after the description of an option is its default.
     """
 
 

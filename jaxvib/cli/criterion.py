@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @app.command("criterion")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--check", is_flag=True, help="Add the exact boundaries, from Floquet multipliers of the full equations.")
+@click.option("--check", is_flag=True, help="Also compute the speeds at which balanced motion is stable by the full equations.")
 @WITHOUT
 @shared
 def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output) -> None:
@@ -109,7 +109,7 @@ def balance(
     """List the arrangements in which the loads of SCENE balance its rotor, and their exact stability at the rotor speed;
     --out adds a figure.
 
-    The loads run in one plane or at two stations. The stability follows from the Floquet multipliers of the full equations."""
+    The loads must be in one plane or at two stations. The stability follows from Floquet multipliers of the full equations."""
     from jaxvib.units import number  # slow import, which --help does not need
 
     loaded = loaded_scene(scene, without, speed)

@@ -14,7 +14,8 @@ from jaxvib.errors import InputError, quoted
 
 SEPARATION = click.option(
     "--separation",
-    help="Initial angle between neighbouring loads, such as '3 deg'; 0 for equal angles [loads in contact, or 1 deg].",
+    help="Initial angle between neighbouring loads, such as '3 deg' [at rest: side by side if the ball_radius is given, "
+    "otherwise 1 deg; in a jam: 0, for `settle` 1 deg].",
 )
 
 
@@ -64,8 +65,8 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
         multiple=True,
         expose_value=False,
         callback=store_value,
-        help="Point of the deck of a body in a plane for stroke, throw and conveying speed, m, such as 1.5,0.1, repeatable "
-        "[centre of mass].",
+        help="Point of the deck of a body in a plane, m, such as 1.5,0.1, for which stroke, throw and conveying speed are "
+        "computed; repeatable [centre of mass].",
     )
     layer = click.option(
         "--layer",
@@ -97,7 +98,7 @@ def measures_of(scene: jv.Scene, motion: jv.Jam | jv.PhaseJam | jv.Orbit | jv.Vi
 
 
 def deck_of_options() -> dict[str, Any]:
-    """Return the values of the options --deck (`at`, a list of points), --slope and --layer that the user gave."""
+    """Return the given options of the deck by name: --deck (`at`, a list of points), --slope and --layer."""
     return dict(click.get_current_context().meta.get(_DECK_KEY, {}))
 
 
@@ -176,7 +177,7 @@ def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, o
 
 
 def measures_document(run: jv.Run | jv.Envelope, measures: jv.VibrationMeasures | None) -> dict[str, object]:
-    """Return the measures of a run, or the reason for which it has none, for a document."""
+    """Return, for a document, the measures of a run, or the reason why it has none."""
     return {"no_vibration": run.no_vibration} if measures is None else {"measures": measures.document()}
 
 

@@ -27,7 +27,11 @@ _KIND_OF_OPTION = {
 @click.option("--to", type=click.Choice(_KINDS), required=True, help="Format of the file.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), required=True, help="Path of the file to write.")
 @click.option("--fmi", type=click.Choice(["2.0", "3.0"]), help="Version of an FMU [2.0].")
-@click.option("--drive", type=click.Choice(["scene", "input"]), help="Drive of the rotor in an FMU [the drive of SCENE].")
+@click.option(
+    "--drive",
+    type=click.Choice(["scene", "input"]),
+    help="Drive of the rotor in an FMU: that of SCENE, or inputs of the FMU [scene].",
+)
 @click.option("--source-only", is_flag=True, default=None, help="Do not compile an FMU.")
 @click.option("--mode", type=int, help="Jam mode about which the state space is linearized [the machine at rest].")
 @click.option(

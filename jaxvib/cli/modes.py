@@ -59,7 +59,9 @@ def modes(
             "--phases", "cannot be combined with --exact; jams with unequal phases are computed for light loads only"
         )
     if tolerances and (exact or phases or loaded.mounting.axes != (1,)):
-        raise InputError("--tolerance", "is for light loads on platforms that stay together; leave it or the other option out")
+        raise InputError(
+            "--tolerance", "is for light, coincident loads on platforms; leave it out, or leave out --exact and --phases"
+        )
     require_tolerances(loaded, tolerances)
     if exact:
         _print_exact_jams(loaded, csv, output)

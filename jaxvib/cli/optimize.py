@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 @click.option(
     "--searcher", type=click.Choice(["gradients", "cma"]), help="Method: Adam from many starts, or CMA-ES [as in DESIGN]."
 )
-@click.option("--resume", type=click.Path(path_type=Path), help="search.npz of an earlier search of this design to continue.")
+@click.option(
+    "--resume", type=click.Path(path_type=Path), help="File search.npz of an earlier search of this design, which is continued."
+)
 @click.option("--no-verify", is_flag=True, help="Skip the verification by an exact periodic motion and time integration.")
 @TOLERANCE
 @shared

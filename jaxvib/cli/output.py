@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 
 _COMMA = "jaxvib.decimal_comma"
-"""Name of the option in the context of click."""
+"""Key of the value of --decimal-comma in the context of click."""
 
 DECIMAL_COMMA = click.option(
     "--decimal-comma",
     is_flag=True,
     expose_value=False,
     callback=lambda context, _, value: context.meta.update({_COMMA: value}),
-    help="Write decimal commas, and semicolons between columns, into the CSV file.",
+    help="Write decimal commas, and semicolons between columns, in the CSV file.",
 )
 """Option of commands that write a CSV file, for `Output.csv` and `Output.table`."""
 
@@ -43,7 +43,7 @@ DECIMAL_COMMA = click.option(
 def csv_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of commands that have curves: --csv and --decimal-comma."""
     path = click.Path(path_type=Path, dir_okay=False)
-    return click.option("--csv", type=path, help="Write the curves into this CSV file.")(DECIMAL_COMMA(command))
+    return click.option("--csv", type=path, help="Write the curves to this CSV file.")(DECIMAL_COMMA(command))
 
 
 SECONDS_BETWEEN_LINES = 10.0

@@ -110,8 +110,9 @@ def test_settle_and_growth_pass_their_options(typed, tmp_path, monkeypatch):
     assert "--tolerance is for jams; these loads are unsettled" in typed("settle", "machine.toml", "--tolerance", "mass=5%")[2]
     code, _, err = typed("growth", "machine.toml", "--until", "4s", "--segments", "5")
     assert code == 2 and "segments is 5; at least 8 are needed" in err
-    code, _, err = typed("growth", "machine.toml", "--until", "4s", "--start", "spin_up")
-    assert code == 2 and "start is 'spin_up'" in err
+    for command in (("settle", "machine.toml"), ("growth", "machine.toml", "--until", "4s")):
+        code, _, err = typed(*command, "--start", "spin_up")
+        assert code == 2 and "'spin_up' is not one of 'rest', 'jam'" in err
 
 
 @pytest.mark.parametrize("command", ["simulate", "settle", "envelope", "growth", "run-up-map"])

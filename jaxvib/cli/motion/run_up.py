@@ -39,7 +39,7 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
 @app.command("run-up-map")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--until", required=True, help="End time of each run-up, such as 6s.")
-@click.option("--drag", "drags", multiple=True, help="Drag of the loads, such as '0.5 N s/m', repeatable [value of SCENE].")
+@click.option("--drag", "drags", multiple=True, help="Drag of the loads, such as '0.5 N s/m'; repeatable [value of SCENE].")
 @click.option("--starts", type=int, help="Number of random sets of initial angles [one set: loads side by side at the bottom].")
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random angles.")
 @SEPARATION

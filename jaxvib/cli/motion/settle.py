@@ -34,15 +34,15 @@ from jaxvib.cli.document import (
 from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
 
-_START = click.option(
-    "--start", type=click.Choice(["rest", "jam", "spin_up"]), help="Initial state [jam with --mode, else rest]."
-)
+_START_HELP = "Initial state [jam with --mode, otherwise rest]."
+_START = click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), help=_START_HELP)
+_START_AT_FULL_SPEED = click.option("--start", type=click.Choice(["rest", "jam"]), help=_START_HELP)
 _MODE = click.option("--mode", type=int, help="Number of the jam mode near which the run starts.")
 
 
 @app.command("settle")
 @click.argument("scene", type=click.Path(path_type=Path))
-@_START
+@_START_AT_FULL_SPEED
 @_MODE
 @SEPARATION
 @click.option(
@@ -123,7 +123,7 @@ def envelope(
 @app.command("growth")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--until", required=True, help="Duration of the whole run, such as 60s.")
-@_START
+@_START_AT_FULL_SPEED
 @_MODE
 @SEPARATION
 @SPEED

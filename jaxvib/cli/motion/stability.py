@@ -38,7 +38,7 @@ _POINTS_OPTION = click.option(
 @app.command("stability-map")
 @click.argument("scene", type=click.Path(path_type=Path))
 @_VARY
-@click.option("--value", "values", multiple=True, required=True, help="Value of the parameter with its unit, repeatable.")
+@click.option("--value", "values", multiple=True, required=True, help="Value of the parameter with its unit; repeatable.")
 @_OMEGA
 @_POINTS_OPTION
 @WITHOUT

@@ -26,11 +26,20 @@ if TYPE_CHECKING:
     help="Duration of the run if no jam is compared, such as 20s [100 periods of the lowest natural frequency, plus twice the "
     "duration of a run-up].",
 )
-@click.option("--start", type=click.Choice(["rest", "turning"]), help="Initial state of a run, in place of a jam.")
+@click.option(
+    "--start",
+    type=click.Choice(["rest", "turning"]),
+    help="Compare a run from this initial state in place of a jam; turning: loads evenly spread, at the rotor speed.",
+)
 @click.option(
     "--add-missing/--no-add-missing", default=True, show_default=True, help="Also add each effect that the scene does not have."
 )
-@click.option("--tiers/--no-tiers", default=True, show_default=True, help="Compare all tiers.")
+@click.option(
+    "--tiers/--no-tiers",
+    default=True,
+    show_default=True,
+    help="Compare all tiers: leading order, averaged equations, exact orbit, full equations.",
+)
 @click.option(
     "--repeats", type=click.IntRange(min=0), default=3, show_default=True, help="Number of timings; the fastest is reported."
 )
@@ -51,7 +60,7 @@ def audit(
     output: Output,
     **options: Any,
 ) -> None:
-    """List how much each effect and each tier changes the results of SCENE, and how much computing time each of them needs.
+    """List how much each effect and each tier (method) changes the results of SCENE, and the computing time of each.
 
     The list shows which effects are negligible or missing. The effects of the scene are removed one at a time, and effects that
     the scene lacks are added one at a time, with typical values. --out adds the figure."""

@@ -27,9 +27,10 @@ if TYPE_CHECKING:
     type=float,
     default=-1.0,
     show_default=True,
-    help="Lowest initial speed relative to the rotor, divided by the rotor speed.",
+    help="Lowest initial speed of the balls relative to the rotor, divided by the rotor speed: -1 for balls at rest, 0 for "
+    "balls that turn with the rotor.",
 )
-@click.option("--to", "high", type=float, default=0.0, show_default=True, help="Highest initial speed, like --from.")
+@click.option("--to", "high", type=float, default=0.0, show_default=True, help="Highest initial speed, as for --from.")
 @click.option("--speeds", type=click.IntRange(min=2), default=32, show_default=True, help="Number of initial speeds.")
 @click.option(
     "--starts",

@@ -30,7 +30,7 @@ _SOLVERS = ("default", "Tsit5", "Dopri8")
     "transients decay].",
 )
 @click.option(
-    "--solver", "solvers", type=click.Choice(_SOLVERS), multiple=True, help="Method of time integration, repeatable [all]."
+    "--solver", "solvers", type=click.Choice(_SOLVERS), multiple=True, help="Method of time integration; repeatable [all]."
 )
 @click.option(
     "--repeats", type=click.IntRange(min=1), default=3, show_default=True, help="Number of timings; the fastest is reported."

@@ -54,7 +54,10 @@ def _with_options(tables: Tables, given: Mapping[str, str | bool | None]) -> Tab
 @_with_number_options
 @click.option("--columns", "record__columns", help="Names of the columns of time and angle, such as 't,phi'.")
 @click.option(
-    "--dry/--no-dry", "identify__dry", default=None, help="Identify the dry friction mu2 as well as the viscous friction mu1."
+    "--dry/--no-dry",
+    "identify__dry",
+    default=None,
+    help="Identify the dry friction mu2 in addition to the viscous friction mu1.",
 )
 @click.option("--air/--no-air", "identify__air", default=None, help="Identify the quadratic drag of the air as well.")
 @click.option("--torque/--no-torque", "identify__torque", default=None, help="Identify a constant torque as well.")
@@ -63,10 +66,12 @@ def _with_options(tables: Tables, given: Mapping[str, str | bool | None]) -> Tab
 def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Identify parameters of a machine from recorded runs, or the friction of a bearing from a recorded swing.
 
-    RECORD is an identification file (TOML) that names a scene file, recorded runs and their channels; --out adds the fitted
-    scene (found.toml), the figure and the fit (fit.npz). For a bearing, RECORD is a CSV file of time and angle of a pendulum
-    whose swing on the bearing decays, or a measurement file (TOML) that names the CSV file; options replace the values in the
-    measurement file, and --out adds the figure and the fit (fit.csv)."""
+    For a machine, RECORD is an identification file (TOML) with the names of a scene file, of recorded runs and of their
+    channels. --out adds the fitted scene (found.toml), the figure and the fit (fit.npz).
+
+    For a bearing, RECORD is a CSV file with the time and the angle of a pendulum, whose swing on the bearing decays, or a
+    measurement file (TOML) with the name of the CSV file. Options replace the values in the measurement file. --out adds the
+    figure and the fit (fit.csv)."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.machine.files import read_toml

@@ -14,15 +14,16 @@ from jaxvib.errors import InputError
 
 @app.command("plan")
 @click.argument("identification", type=click.Path(path_type=Path))
-@click.option("--fit", type=click.Path(path_type=Path), help="A fit.npz of `jaxvib identify`, in place of a new fit.")
+@click.option("--fit", type=click.Path(path_type=Path), help="File fit.npz of `jaxvib identify`, in place of a new fit.")
 @shared
 def plan(identification: Path, fit: Path | None, output: Output) -> None:
-    """Rank the candidate runs of an IDENTIFICATION file by the reduction of the expected errors of its unknown parameters per
-    minute of test.
+    """Rank the candidate runs of an IDENTIFICATION file: the best one most reduces the expected errors of the unknown
+    parameters per minute of test.
 
-    The file names the runs so far, as for `identify`, and each [[candidate]]: a ramp, a dwell or a coast-down, other places of
-    sensors, or changed parameters of the machine, such as an added mass. With the table [limits], the curve of speed over time
-    of the best candidate is optimized for the smallest expected errors."""
+    The file names the runs recorded so far, as for `identify`, and has a table [[candidate]] for each run that could be
+    recorded next: a ramp, a dwell or a coast-down, other places of sensors, or changed parameters of the machine, such as an
+    added mass. With the table [limits], the speed of the best candidate over time is optimized for the smallest expected
+    errors."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.display import speed_text
