@@ -1,10 +1,11 @@
 """Gain by each technique of the integration engine: time without it, as a multiple of the time with it.
 
-    python benchmarks/ablation.py [--quick] [--only WORD ...]
+    python benchmarks/ablation.py [--quick] [--only GROUP ...]
 
-Every trick is switched off alone, in one process; times are CPU times, second call, compile time apart. The tricks and
-the reasons for them stand in jaxvib/ode/README.md. Scenes: the two-mass machine of the antiphase paper with one load (6
-numbers in a state) and, for what is looped over stages, a two-mass machine with three balls (10 numbers).
+Each technique is switched off alone, in the same process. The times are CPU times of a second call; the time of the first call,
+which includes compilation, is printed separately. The techniques and their reasons are explained in jaxvib/ode/README.md. The
+scenes are the two-mass machine of the antiphase paper with one load (6 numbers in a state) and, for steps that are a loop over
+their stages, a two-mass machine with three balls (10 numbers).
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ OFF: dict[str, Callable[[], Any]] = {
 
 
 def ended(s: jv.Scene, start: jv.State, steps: int, step: float, batch: bool, solver: Any = None) -> jv.State:
-    """The state after so many equal steps."""
+    """Return the state after a number of equal steps."""
     packed = PackedSystem(jv.vector_field(s), start, batch=batch)
     ended = diffrax.diffeqsolve(
         packed.term,
@@ -77,7 +78,7 @@ def ended(s: jv.Scene, start: jv.State, steps: int, step: float, batch: bool, so
 
 
 def runs(s: jv.Scene, start: jv.State, steps: int, step: float, batch: int) -> Callable[[], Any]:
-    """One run, or so many together at rotor speeds apart."""
+    """Return a function that computes one run, or a batch of runs at different rotor speeds."""
     if batch == 1:
         call = jax.jit(lambda s: ended(s, start, steps, step, False))
         return lambda: call(s)
@@ -168,7 +169,7 @@ def samples(quick: bool) -> None:
 
 @contextlib.contextmanager
 def checkpointed() -> Iterator[None]:
-    """Derivatives of adaptive steps by diffrax's own adjoint, which chooses the steps anew on the way back."""
+    """Compute derivatives of adaptive steps by diffrax's own adjoint, which chooses the steps again in the reverse pass."""
 
     def plain(inputs: Any, controller: Any, solver: LoopDopri8, *rest: Any) -> diffrax.Solution:
         solver = dataclasses.replace(solver, reuse=False)
@@ -179,7 +180,7 @@ def checkpointed() -> Iterator[None]:
 
 
 def term_by_term() -> Any:
-    """The sums over a step's stages differentiated as they are written."""
+    """Differentiate the sums over the stages of a step as they are written, term by term."""
     written = lambda weights, stages: sum(weights[j] * stages[j] for j in range(len(weights)))  # noqa: E731
     return mock.patch.object(dopri8_loop, "_written_sum", written)
 
@@ -213,7 +214,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     groups = dict(steps=steps, batches=batches, tangents=tangents, samples=samples, gradients=gradients)
     parser.add_argument("--only", nargs="*", choices=list(groups), default=list(groups))
-    parser.add_argument("--quick", action="store_true", help="everything small, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="small problems, as a test of the program")
     options = parser.parse_args()
     print(machine_line())
     for name in options.only:

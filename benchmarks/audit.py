@@ -1,9 +1,10 @@
-"""Audits of four scenes, and the share of gravity in the radial load of pendulums, which a paper says is below 0.5 %.
+"""Audits of four scenes, and the share of gravity in the radial load of pendulums, which is below 0.5 % according to a paper.
 
     python benchmarks/audit.py [--only rotor] [--out FOLDER]
 
-Prints what `jaxvib audit` says of each, and writes FOLDER/audit.json with a figure for each scene. Minutes, most of it
-compiling. The published machine, whose numbers have no dimension, is built with M2S = 100 kg, R = 0.1 m and w = 100 rad/s.
+Prints the results of `jaxvib audit` for each scene, and writes FOLDER/audit.json and a figure for each scene. The run takes
+some minutes, mostly for compilation. The published machine, whose parameters are dimensionless, is built with M2S = 100 kg, R =
+0.1 m and w = 100 rad/s.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from jaxvib.study.capture.capture import moving_state  # noqa: E402
 
 
 def scenes() -> dict[str, tuple[jv.Scene, dict[str, Any]]]:
-    """The four scenes, and how each is asked."""
+    """Return the four scenes with the arguments of their audits."""
     sized: dict[str, Any] = {"mass_scale": 100.0, "frequency_scale": 100.0, "radius": 0.1}
     numbers: dict[str, Any] = {
         "natural": (1 / 3, 1 / 3),
@@ -58,8 +59,11 @@ def scenes() -> dict[str, tuple[jv.Scene, dict[str, Any]]]:
 
 
 def bearing() -> list[tuple[float, float, float]]:
-    """Radial loads of the published rotor's pendulums, which turn evenly at some speeds on a shaft at rest: the speed, the
-    largest change of the radial load by gravity over a turn (`normal_force`), and g/(l Omega^2), percent."""
+    """Return the influence of gravity on the radial loads of the published rotor's pendulums, at several speeds.
+
+    The pendulums turn uniformly on a shaft at rest. Each entry contains the speed, rad/s, the largest change of the radial load
+    by gravity during a turn (`normal_force`), %, and g/(l Omega^2), %.
+    """
     machine = jv.one_mass(mass=1e9, stiffness=1e15, damping=0.0)
     length = float(published_rotor().loads.radius)
     loads = jv.pendulums(count=1, mass=0.05, radius=length, drag=0.0)
@@ -78,11 +82,13 @@ def bearing() -> list[tuple[float, float, float]]:
 
 
 def main() -> None:
-    """Runs them all."""
+    """Run all audits."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out"))
-    parser.add_argument("--only", default="", help="scenes whose names hold one of these words, with commas between")
-    parser.add_argument("--repeats", type=int, default=3, help="timings of a run; 0 for none, which compiles less")
+    parser.add_argument("--only", default="", help="scenes whose names contain one of these words, separated by commas")
+    parser.add_argument(
+        "--repeats", type=int, default=3, help="number of timings of a run; 0 for none, which saves compilation"
+    )
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
     print(machine_line())

@@ -1,10 +1,11 @@
-"""Cost of accuracy in time on four scenes: every tier, method, tolerance and dtype against one reference each.
+"""Cost of accuracy for four scenes: error and time of every tier, method, tolerance and dtype, compared with a reference.
 
     python benchmarks/cost.py [--only jam fold run_up friction gradient] [--quick] [--out FOLDER]
 
-Prints a table for each scene and one for the gradient of the first, and last the README's table of what is cheapest; --out
-adds the figure, cost.png, and the numbers, cost.json. It is what `jaxvib cost` says of one scene file. Times are of a call from
-Python to its answer, compile time apart; the fastest of several counts. About a minute a scene, most of it compiling.
+Prints a table for each scene, as `jaxvib cost` does for a scene file, a table for the gradient of the first scene, and a table
+of the cheapest methods; --out adds the figure (cost.png) and the numbers (cost.json). A time is that of a call from Python
+until its result is available, without compilation, the shortest of several calls. Each scene takes about a minute, mostly for
+compilation.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ COARSE = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
 
 
 def jam() -> jv.Scene:
-    """The two-mass machine of the antiphase paper, far from any fold."""
+    """Return the two-mass machine of the antiphase paper, far from any fold."""
     return published(3.0)
 
 
 def near_a_fold() -> jv.Scene:
-    """The same with lighter loads at a rotor speed 1e-3 below that of the exact fold at the second resonance."""
+    """Return the same machine with lighter loads, at 0.999 times the rotor speed of the exact fold at the second resonance."""
     scene = published(eps=1e-3)
     fold = next(
         point for point in jv.branches(scene, exact=True, least=0.98, most=1.05, points=60).special if point.kind == "fold"
@@ -49,7 +50,7 @@ def near_a_fold() -> jv.Scene:
 
 
 def dry_friction() -> jv.Scene:
-    """A platform shaken by two pendulums whose bearings rub."""
+    """Return a platform with two pendulums whose bearings have dry friction."""
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
     loads = jv.pendulums(count=2, mass=1.0, radius=0.1, drag=0.7)
     return jv.Scene(machine, loads, jv.ConstantSpeed(50.0), (jv.DryFriction(0.1, diameter=0.02), jv.Gravity()))
@@ -74,7 +75,7 @@ SCENES: dict[str, tuple[str, Callable[[], jv.Cost]]] = {
 
 
 def markdown(costs: dict[str, jv.Cost]) -> str:
-    """A line for each scene: the cheapest way to each error."""
+    """Return a table with a line for each scene: the cheapest method for each error."""
     lines = [
         "| scene | " + " | ".join(f"error {error:.0e}" for error in SHOWN_ERRORS) + " |",
         "|---" * (len(SHOWN_ERRORS) + 1) + "|",
@@ -95,7 +96,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", choices=list(SCENES), default=list(SCENES))
     parser.add_argument("--out", type=Path, help="folder for the figure and the numbers")
-    parser.add_argument("--quick", action="store_true", help="two tolerances of one scene, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="two tolerances of one scene, as a test of the program")
     options = parser.parse_args()
     print(machine_line())
     costs: dict[str, jv.Cost] = {}

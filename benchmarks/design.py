@@ -2,11 +2,18 @@
 
     python benchmarks/design.py [--only PART ...]
 
-Parts: `speed` (1000 starts x 500 steps), `rule` (the antiphase rule from 1000 random starts; n2/n1 as damping falls),
-`published` (force per amplitude of the published machine and of the best one, leading order and exact), `three` (the
-anti-resonance rule of three masses), `exact` (an exact-orbit design of 6 numbers), `robust` (a design over 256 samples, judged
-on 10,000 machines it has not seen), `free` (a value with its gradient against the value, and searches without gradients on the
-same problem, at 3 to 100 free numbers). Second calls are timed: programs are there.
+Parts:
+
+- `speed`: time of 1000 starts with 500 steps each
+- `rule`: the antiphase rule from 1000 random starts, and n2/n1 for decreasing damping
+- `published`: force per amplitude of the published machine and of the best machine, by leading order and exactly
+- `three`: the anti-resonance rule of three masses
+- `exact`: a design by exact orbits with 6 free parameters
+- `robust`: a design over 256 samples, evaluated for 10,000 other machines
+- `free`: time of a value with its gradient relative to the value alone, and searches without gradients for the same problem,
+  for 3 to 100 free parameters
+
+Second calls are timed, for which the programs are already compiled.
 """
 
 from __future__ import annotations
@@ -56,7 +63,7 @@ def space_of(damping: float, speed: float = 3.0, free: dict | None = None) -> De
 
 
 def twice(ask: Callable[[], object]) -> tuple[object, float, float]:
-    """The answer, seconds of the first and of the second call."""
+    """Return the result, and the times of the first and of the second call, s."""
     begun = time.perf_counter()
     ask()
     middle = time.perf_counter()
@@ -110,7 +117,7 @@ def published() -> None:
 
 
 def _pressed(scene: jv.Scene) -> complex:
-    """F/d: the force of the springs and dampers on the bed over y1 - y2, complex amplitudes."""
+    """Return F/d, the force of the springs and dampers on the foundation divided by y1 - y2, of complex amplitudes."""
     jam = jv.jam_modes(scene).select(3)
     y, machine = np.asarray(jam.displacement), scene.machine
     supports = np.asarray(machine.stiffness) + 1j * float(jam.omega) * np.asarray(machine.damping)
@@ -118,7 +125,7 @@ def _pressed(scene: jv.Scene) -> complex:
 
 
 def _published(n: float) -> jv.Scene:
-    """n1 = n2 with the budget 2/9 and the jam at 1: the link alone is free."""
+    """Return the machine with n1 = n2, the support budget 2/9 and the jam frequency 1; only the link is then free."""
     space = DesignSpace(
         form(1e-2, n).scene(), {"machine.stiffness[0]": (0.01, 0.3), "machine.link_stiffness": (0.1, 1.0)},
         [hold(jam_frequency(mode=3), 1.0)], ties={"machine.stiffness[1]": "machine.stiffness[0]"},
@@ -182,7 +189,7 @@ def robust() -> None:
 
 
 def free() -> None:
-    """A chain of platforms with all springs free: gradients against differential evolution and CMA-ES."""
+    """Compare gradients with differential evolution and CMA-ES for a chain of platforms in which all springs are free."""
     for size in SIZES:
         value, both = gradient_cost(size)
         print(f"{size} free numbers: a value {value * 1e6:.0f} us, with its gradient {both / value:.2f} times that")

@@ -1,12 +1,12 @@
-"""Everything that speed is claimed of, in one run: ratios at equal achieved error, compile time apart; table and figures of it.
+"""All measurements behind the statements about speed, in one run: ratios of times at equal achieved error, a table, figures.
 
-    pip install numba scipy mujoco jitcode scikit-sundae      # those that are missing are left out
+    pip install numba scipy mujoco jitcode scikit-sundae      # missing packages are left out of the comparison
     python benchmarks/engine.py [--only single ensemble ...] [--quick] [--out FOLDER]
 
-Prints each measurement as it comes and, at the end, the table; first calls, which compile, are apart from later ones. --out
-adds engine.json, the table and the README's figure (as text) in engine.md, the figure of all ratios as engine.png and that of
-the memory of a reverse gradient as memory.png. --quick runs everything small, to see that it runs: its figures say nothing. The
-other benchmarks (cost, rotor, criterion) are commands of their own.
+Prints each measurement when it is finished, and the table at the end. First calls, which include compilation, are separate from
+later calls. --out adds the numbers (engine.json), the table and the README's figure as text (engine.md), the figure of all
+ratios (engine.png) and the figure of the memory of a reverse-mode gradient (memory.png). --quick runs small problems, as a test
+of the program; its numbers have no meaning. The other benchmarks (cost, rotor, criterion) are separate programs.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ GROUPS = dict(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", choices=list(GROUPS), default=list(GROUPS))
-    parser.add_argument("--quick", action="store_true", help="everything small, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="small problems, as a test of the program")
     parser.add_argument("--out", type=Path, help="folder for the table, the figures and the numbers")
     options = parser.parse_args()
     print(machine_line())

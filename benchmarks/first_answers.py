@@ -1,11 +1,11 @@
-"""Time of first answers: in a fresh process with an empty cache, in one with a warm cache, and when asked again.
+"""Time of first results: in a new process with an empty cache of programs, in a new process with a full cache, and repeated.
 
-    python benchmarks/first_answers.py [--only WORD ...]
+    python benchmarks/first_answers.py [--only NAME ...]
 
-Every question is asked from plain Python, without `jit`, in processes of its own; times are seconds beyond importing JAX,
-Equinox and diffrax (what jaxvib itself imports counts), building the scene counted, the second call in milliseconds (the best
-of 5). Scene: the two-mass machine of the antiphase paper with three balls. Commands are timed from their start to their end,
-Python's and JAX's own start counted, on the files of `examples/antiphase`.
+Each function is called from plain Python, without `jit`, in separate processes. The time of the first call, s, includes the
+import of jaxvib and the construction of the scene, but not the import of JAX, Equinox, diffrax and optimistix. The time of a
+repeated call, ms, is the shortest of 5. The scene is a two-mass machine with three balls. The times of commands are those of
+the whole process, including the start of Python and JAX, with the files of `examples/antiphase`.
 """
 
 from __future__ import annotations
@@ -91,21 +91,24 @@ print("TIMES", first, min(again))
 
 
 def asked(name: str, cache: str) -> tuple[float, float]:
-    """Seconds of the first and of a later call in a process of its own."""
+    """Return the times, s, of the first and of a later call in a new process."""
     printed = process([sys.executable, "-c", PRELUDE + QUESTIONS[name] + MEASURE], cache)
     first, again = next(line for line in printed.splitlines() if line.startswith("TIMES")).split()[1:]
     return float(first), float(again)
 
 
 def commanded(name: str, cache: str) -> float:
-    """Seconds that a command takes."""
+    """Return the time of a command, s."""
     begun = time.perf_counter()
     process([sys.executable, "-c", "from jaxvib.cli import main; main()", *COMMANDS[name].split()], cache)
     return time.perf_counter() - begun
 
 
 def process(command: list[str], cache: str) -> str:
-    """Output of a process that starts in the example's folder with this cache. **Raises** `SystemExit` where it fails."""
+    """Return the output of a process that runs in the folder of the example with the given cache.
+
+    **Raises** `SystemExit` if the process fails.
+    """
     ours = ("XLA_FLAGS", "EQX_ON_ERROR", "JAX_COMPILATION_CACHE_DIR")
     clean = {key: value for key, value in os.environ.items() if key not in ours} | {"XDG_CACHE_HOME": cache}
     done = subprocess.run(command, env=clean, cwd=EXAMPLE, capture_output=True, text=True, check=False)

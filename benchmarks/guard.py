@@ -1,12 +1,14 @@
-"""Guard against slowdowns: times of what users wait for, as ratios in one run, beside recorded ones.
+"""Test for slowdowns: times of common functions, as ratios within one run, compared with recorded ratios.
 
     python benchmarks/guard.py [--record] [--limit 3]
 
-Run times are in units of one native run (numba: 5000 steps of Dormand and Prince's method of order 8, two masses and one load),
-first calls in units of what the compiler takes for a small fixed program, both measured here; so the machine hardly matters.
-Fails where a ratio is more than `limit` times the recorded one, of benchmarks/guard.json, and where a small scene falls back
-from the scalar engine to arrays; --record writes that file anew. It says only that something went wrong, not how fast things
-are: the other benchmarks compare at equal errors.
+Run times are divided by the time of one native run (numba: 5000 steps of Dormand and Prince's method of order 8, two masses and
+one load). Times of first calls are divided by the time to compile a small fixed program. Both units are measured in the same
+run; the ratios therefore hardly depend on the computer.
+
+The program fails if a ratio is more than `limit` times the ratio in benchmarks/guard.json, or if a small scene is integrated on
+arrays and not by the scalar engine; --record replaces the file. It only detects slowdowns. The other benchmarks compare times
+at equal errors.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ Call = Callable[[], Any]
 
 
 def platforms(*effects: jv.Effect) -> jv.Scene:
-    """Two platforms with three loads."""
+    """Return two platforms with three loads."""
     machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
     loads = jv.pendulums if effects else jv.balls
     return jv.Scene(machine, loads(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed(120.0), effects)
@@ -56,7 +58,7 @@ def planar(count: int = 2) -> jv.Scene:
 
 
 def chain(n: int) -> jv.Scene:
-    """A chain of n platforms."""
+    """Return a chain of n platforms."""
     machine = jv.network(
         mass=[100.0] * n, stiffness=[2e4] * n, damping=[30.0] * n, links=[(k, k + 1) for k in range(1, n)],
         link_stiffness=[2e5] * (n - 1), link_damping=[30.0] * (n - 1), exciter=n,
@@ -65,7 +67,7 @@ def chain(n: int) -> jv.Scene:
 
 
 def run_of(scene: jv.Scene, until: float, start: Any = "rest") -> Call:
-    """`simulate` as a user calls it, its window measured."""
+    """Return a call of `simulate` that measures the window, as a user writes it."""
     return lambda: jv.simulate(scene, until, start=start, save="window", estimate=False).foundation_force
 
 
@@ -75,11 +77,11 @@ SCALAR_RUNS = {
     "dry friction": lambda: jv.simulate(platforms(jv.DryFriction(0.05, diameter="20 mm")), 0.2, save="window"),
     "planar rotor": lambda: jv.simulate(planar(), 0.2, save="window"),
 }
-"""Runs of small scenes, which must be integrated on single numbers: on arrays they take several times as long."""
+"""Runs of small scenes, which the scalar engine must integrate: on arrays they take several times as long."""
 
 
 def slopes(kind: Callable[..., Any], **options: Any) -> Call:
-    """The end of a run by two numbers."""
+    """Return a call that differentiates the end of a run with respect to two parameters."""
     scene = published()
 
     def end(k: jax.Array) -> jax.Array:
@@ -116,7 +118,7 @@ def many_runs() -> Call:
 
 
 def small_program() -> Call:
-    """Unit of compile times: 120 operations that have nothing to do with jaxvib, compiled anew at each call."""
+    """Return the unit of compile times: a call that compiles 120 operations without jaxvib."""
     matrix = np.eye(7)
 
     def chain(x: jax.Array) -> jax.Array:
@@ -143,7 +145,7 @@ RUNS: dict[str, Callable[[], Call]] = {
     "jam_modes of 20 platforms": lambda: lambda: jv.jam_modes(chain(20)).foundation_force,
     "phase_jams of 8 equal loads": lambda: lambda: jv.phase_jams(planar(8)).omega,
 }
-"""Questions that are timed in units of a native run; the first call of each is not counted."""
+"""Calls whose times are divided by that of a native run; the first call of each is not timed."""
 
 FIRST_CALLS = {
     "jam_modes, first call": lambda: jax.jit(lambda s: jv.jam_modes(s).foundation_force).lower(platforms()).compile() and (),
@@ -155,11 +157,11 @@ FIRST_CALLS = {
         and ()
     ),
 }
-"""Traced and compiled, in units of the small program."""
+"""Calls that trace and compile a function; their times are divided by that of the small program."""
 
 
 def measured() -> dict[str, float]:
-    """Each ratio; the units are measured before and after everything, and the less time of both counts."""
+    """Return all ratios. The units are measured before and after all calls; the shorter time of each is used."""
     scene = published()
     loop, par, y0 = native.single(), native.numbers(scene), flat(thrown())
     unit_run: Call = lambda: loop(y0, float(scene.drive.speed), par, 1000.0, 5000)  # noqa: E731
@@ -184,8 +186,8 @@ def measured() -> dict[str, float]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--record", action="store_true", help="write the ratios of this run as those to compare with")
-    parser.add_argument("--limit", type=float, default=3.0, help="how many times the recorded ratio is too much")
+    parser.add_argument("--record", action="store_true", help="write the ratios of this run to the file of recorded ratios")
+    parser.add_argument("--limit", type=float, default=3.0, help="largest allowed multiple of the recorded ratio")
     options = parser.parse_args()
     print(machine_line())
     found = measured()

@@ -1,4 +1,4 @@
-"""Machines of the papers and the torus paper's tables, which stand beside the tests that compare them with printed numbers."""
+"""Machines of the papers, and the tables of the torus paper, imported from the tests that compare them with printed numbers."""
 
 import pathlib
 import sys

@@ -1,14 +1,18 @@
-"""One run-up of 6 s of the rotor with four pendulums: `simulate` against a compiled native loop at the same achieved error.
+"""One run-up of 6 s of the rotor with four pendulums: `simulate` compared with a compiled native loop at equal achieved error.
 
     python benchmarks/rotor.py [--quick]
 
-The native loop (numba) has the paper's equations written by hand, the pendulums eliminated one by one, 4 equations left; its
-method is Dormand and Prince's pair of order 8(7). Its step control is a PI controller too, in the same units, but one of its
-own: the norm is the root of the mean square (that of `simulate` is the largest part), the powers of the errors of this step and
-the one before are 0.6/8 and 0.2/8 (3/32 and 1/16), and a step grows 10 times at most (5 times). So one tolerance is not one
-error, and times are compared at equal errors. The error of a run is that of the pendulums' angles at its end against the native
-loop at a tolerance of 1e-13. Compile time is told apart; of 5 runs the fastest counts.
---quick runs 2.5 s to three tolerances, to see that it runs: its figures say nothing.
+The native loop (numba) contains the equations of the paper, written by hand; the accelerations of the pendulums are eliminated
+one by one, which leaves 4 equations. Its method is Dormand and Prince's pair of order 8(7). Both programs have a PI controller
+of the step size with the same units, but the controllers differ:
+
+- norm of the error: root of the mean square in the native loop, largest part in `simulate`
+- exponents of the errors of this and of the previous step: 0.6/8 and 0.2/8 in the native loop, 3/32 and 1/16 in `simulate`
+- largest growth of a step: 10 times in the native loop, 5 times in `simulate`
+
+Equal tolerances therefore give different errors, and times are compared at equal errors. The error of a run is the error of the
+pendulums' angles at its end, relative to the native loop with a tolerance of 1e-13. The time is the shortest of 5 runs, without
+compilation. --quick integrates 2.5 s with three tolerances, as a test of the program; its numbers have no meaning.
 """
 
 from __future__ import annotations
@@ -45,7 +49,7 @@ RUNS = 5
 
 @numba.njit(fastmath=True, error_model="numpy")
 def rates(t: float, y: np.ndarray, par: np.ndarray, stations: np.ndarray, out: np.ndarray) -> None:
-    """Equation (1) of the paper: y = (y, z, theta, psi, their rates, four angles, four rates)."""
+    """Compute the rates by equation (1) of the paper: y = (y, z, theta, psi, their rates, four angles, four rates)."""
     mass, inertia, polar, c1, c2, c3, b1, b2, b3, m, length, mu, me, speed, acceleration, g = par
     w, accel = (acceleration * t, acceleration) if t < speed / acceleration else (speed, 0.0)
     end = speed / acceleration
@@ -65,7 +69,7 @@ def rates(t: float, y: np.ndarray, par: np.ndarray, stations: np.ndarray, out: n
         sines[k], cosines[k] = s, c
         rate, st = y[12 + k], stations[k]
         free[k] = (mu * (w - rate) / (m * length) - g * c) / length
-        # Accelerations of the point across and up push back with what is left of the mass along the pendulum.
+        # A pendulum loads its pivot with its mass in the direction of its arm only.
         cc, cs, ss = m * c * c, m * c * s, m * s * s
         left[0, 0] += cc
         left[0, 1] += cs
@@ -106,7 +110,7 @@ def rates(t: float, y: np.ndarray, par: np.ndarray, stations: np.ndarray, out: n
 
 @numba.njit(fastmath=True, error_model="numpy")
 def native(y0: np.ndarray, par: np.ndarray, stations: np.ndarray, end: float, unit: np.ndarray, tolerance: float) -> np.ndarray:
-    """The state at `end`, with a step on the kink of the run-up."""
+    """Return the state at `end`; one step ends at the end of the run-up, where the acceleration of the rotor jumps."""
     y, t, dt = y0.copy(), 0.0, 1e-4
     kink = par[13] / par[14]
     k = np.empty((STAGES, 16))
@@ -122,7 +126,7 @@ def native(y0: np.ndarray, par: np.ndarray, stations: np.ndarray, end: float, un
                 for j in range(i):
                     total += A[i, j] * k[j, n]
                 stage[n] = y[n] + step * total
-            # Just before the kink its own side counts.
+            # A stage at the kink has the acceleration before it.
             at = t + C[i] * step
             if last and t < kink and at >= kink:
                 at = kink * (1.0 - 1e-15)
@@ -149,7 +153,7 @@ def native(y0: np.ndarray, par: np.ndarray, stations: np.ndarray, end: float, un
 
 
 def numbers(scene: jv.Scene) -> tuple[np.ndarray, np.ndarray]:
-    """The scene's numbers as the native loop takes them."""
+    """Return the parameters of the scene in the order of the native loop, and the stations."""
     machine: Any = scene.machine
     loads: Any = scene.loads
     drive: Any = scene.drive
@@ -169,7 +173,8 @@ def numbers(scene: jv.Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, float, Any]:
-    """Seconds of the first call, seconds of the fastest of some further ones, the last result."""
+    """Return the compile time (first call minus the fastest one), s, the time of the fastest of 5 later calls, s, and the last
+    result."""
     begun = time.perf_counter()
     result = call()
     first = time.perf_counter() - begun
@@ -182,9 +187,9 @@ def timed(call: Callable[[], Any]) -> tuple[float, float, Any]:
 
 
 def main() -> None:
-    """Prints the table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="little of it, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="short run, as a test of the program")
     quick = parser.parse_args().quick
     end, tolerances = (2.5, (1e-4, 1e-6, 1e-8)) if quick else (6.0, [10.0**-k for k in range(3, 11)])
     scene = published_rotor(9.2e-4, "uncoupled")
@@ -216,7 +221,7 @@ def main() -> None:
 
 
 def _at(error: float, rows: list[tuple[float, float]]) -> float:
-    """Seconds to an error, between those measured; NaN beyond them."""
+    """Return the time, s, for an error, interpolated between the measured errors; NaN outside them."""
     errors, seconds = (np.log(x) for x in zip(*sorted(rows), strict=True))
     return float(np.exp(np.interp(np.log(error), errors, seconds, left=np.nan, right=np.nan)))
 

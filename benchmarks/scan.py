@@ -1,12 +1,12 @@
-"""Time integration and measurement of scenes of every kind: what takes much longer than its number of operations says.
+"""Search for scenes whose time integration or measurement takes much longer than their number of operations suggests.
 
     python benchmarks/scan.py [--quick] [--only WORD ...]
 
-Scenes are chosen so that every pair of a machine, a load, an effect and a drive stands in one of them. For each: the numbers
-that one evaluation of the field computes, and microseconds of CPU time (second call, compiled) for a step of a run and
-for a sample of the window that is measured, in all and for a thousand of those numbers. Last come the scenes more than 3
-times above the median: such a scene has met something that the compiler does badly. --only takes the scenes in whose name one
-of the words stands.
+The scenes are chosen so that every pair of parts (machine, loads, effects, drive) occurs in one of them. For each scene the
+table contains the number of operations of one evaluation of the equations, and the CPU time, microseconds, of a step of a run
+and of a sample of the measured window, in total and per thousand operations (second call, compiled). Scenes with more than 3
+times the median are listed at the end; the compiler handles an operation in such a scene badly. --only selects the scenes whose
+name contains one of the words.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ DRIVES = {
 
 
 class Cost(NamedTuple):
-    """Cost of a scene: operations of its field, CPU seconds a step and a sample."""
+    """Cost of a scene: operations of its equations, and CPU time of a step and of a sample, s."""
 
     operations: int
     step: float
@@ -94,7 +94,7 @@ class Cost(NamedTuple):
 
 
 def pairwise() -> list[tuple[str, ...]]:
-    """Few combinations in which every two of their parts meet, greedily chosen."""
+    """Return few combinations of parts that contain every pair of parts, by a greedy choice."""
     every = [choice for choice in itertools.product(MACHINES, LOADS, EFFECTS, DRIVES) if allowed(*choice)]
     pairs = {choice: set(itertools.combinations(choice, 2)) for choice in every}
     missing, chosen = set[tuple[str, str]]().union(*pairs.values()), []
@@ -110,7 +110,7 @@ def scene(machine: str, load: str, effect: str, drive: str) -> jv.Scene:
 
 
 def allowed(*choice: str) -> bool:
-    """True if there is such a scene."""
+    """Return True if a scene of these parts is allowed."""
     try:
         scene(*choice)
     except InputError:
@@ -119,7 +119,7 @@ def allowed(*choice: str) -> bool:
 
 
 def operations(jaxpr: core.Jaxpr) -> int:
-    """The numbers that a program computes, inner programs included."""
+    """Return the number of values that a program computes, including inner programs."""
     total = 0
     for equation in jaxpr.eqns:
         inner = equation.params.get("jaxpr")
@@ -148,8 +148,8 @@ def cost(s: jv.Scene, steps: int) -> Cost:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two scenes, to see that it runs")
-    parser.add_argument("--only", nargs="*", default=[], help="words, one of which stands in the name of a scene")
+    parser.add_argument("--quick", action="store_true", help="two scenes, as a test of the program")
+    parser.add_argument("--only", nargs="*", default=[], help="words of which the name of a scene contains one")
     options = parser.parse_args()
     print(machine_line())
     print(f"{'':56} {'operations':>10} {'us/step':>8} {'/1000':>8} {'us/sample':>9} {'/1000':>8}")

@@ -1,12 +1,13 @@
-"""Captures of balls in a torus: 1000 starts of 2000 turns, beside a native loop in the same run; the paper's tables.
+"""Captures of balls in a torus: time of 1000 starts of 2000 turns relative to a native loop; tables of the paper.
 
     pip install numba
     python benchmarks/torus.py [--starts 1000] [--turns 2000] [--share 8] [--tables derived printed "gap lever" contact]
 
-The native loop (parts/native_torus.py) and the engine take the same steps from the same starts; how far apart they end is
-printed. Times are CPU times, of the whole process, since other programs may be running: divide by the number of cores.
-The ratio is measured with a share of the turns. --tables prints the paper's tables by these models, by steps that are doubled
---doublings times at most (some ten minutes of CPU time each).
+The native loop (parts/native_torus.py) and the engine take the same steps from the same starts; the difference of their results
+after three turns is printed. Times are CPU times of the whole process, because other programs may be running; the elapsed time
+is this time divided by the number of cores. The ratio is measured with the number of turns divided by --share. --tables prints
+the tables of the paper for the given models. Their numbers of steps are doubled at most --doublings times, which takes about
+ten minutes of CPU time for each table.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def touching(speed: jax.Array) -> tuple[jv.Scene, jv.State]:
 
 
 def spent(call: Callable[[], Any], rounds: int = 2) -> float:
-    """CPU seconds, the least of so many calls after one that compiles."""
+    """Return the CPU time, s: the shortest of `rounds` calls after a call that compiles."""
     jax.block_until_ready(call())
     found = []
     for _ in range(rounds):
@@ -60,9 +61,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--starts", type=int, default=1000)
     parser.add_argument("--turns", type=int, default=2000)
-    parser.add_argument("--share", type=int, default=8, help="the ratio is measured with this part of the turns")
+    parser.add_argument("--share", type=int, default=8, help="the ratio is measured with the turns divided by this number")
     parser.add_argument("--tables", nargs="*", choices=list(MODELS), default=[])
-    parser.add_argument("--doublings", type=int, default=DOUBLINGS, help="of the tables' steps, at most")
+    parser.add_argument(
+        "--doublings", type=int, default=DOUBLINGS, help="largest number of doublings of the steps for the tables"
+    )
     options = parser.parse_args()
     print(machine_line())
     speeds = np.linspace(-1.0, -0.1, options.starts // 64 * 64)
@@ -78,7 +81,7 @@ def main() -> None:
     def ours(make: Callable[..., Any], until: float, steps: jv.EqualSteps) -> jv.Ensemble:
         return jv.ensemble(make, values, until, stepsize_controller=steps, estimate=False)
 
-    # Before chaos parts them, where balls press on their wall throughout: three turns.
+    # Results are compared after three turns, before chaos separates them, for runs whose balls never leave the wall.
     early = 3.0 * 2.0 * np.pi / omega
     one, other = ours(free, early, jv.EqualSteps(400)), loop(starts, numbers, early, 400)
     pressing = ~np.any(one.detached, axis=1)
