@@ -13,15 +13,17 @@ from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, panels
 def threshold_chart(
     speed: np.ndarray, fraction: np.ndarray, error: np.ndarray | None, threshold: float, *, ax: Axes | None = None
 ) -> Drawn:
-    """Draw the fraction of captured starts over the initial speed, with its standard error unless that is None, and the
-    threshold.
+    """Draw the fraction of captured starts over the initial speed, and the threshold.
+
+    **Arguments** (n speeds): `speed` (n,): initial speed relative to the rotor, divided by the rotor speed; `fraction` (n,) of
+    captured starts; `error` (n,): its standard error, or None; `threshold`: in the unit of `speed`, NaN for none.
 
     >>> import numpy as np
     >>> len(threshold_chart(np.array([-0.5, -0.1]), np.array([0.0, 1.0]), np.array([0.1, 0.1]), -0.3).axes)
     1
     """
     figure, (axis,) = panels(1, size=(7.0, 3.4), ax=ax)
-    label = "share"
+    label = "fraction"
     if error is not None:
         low, high = np.clip([fraction - error, fraction + error], 0.0, 1.0)
         axis.fill_between(speed, low, high, color=COLORS[0], alpha=0.2, lw=0.0)
@@ -37,7 +39,11 @@ def threshold_chart(
 def curve_chart(
     value: np.ndarray, threshold: np.ndarray, uncertainty: np.ndarray, least: np.ndarray, *, ax: Axes | None = None
 ) -> Drawn:
-    """Draw thresholds of capture over the varied parameter, with their uncertainty, and the lowest captured speeds.
+    """Draw thresholds of capture over a varied parameter, with their uncertainty, and the lowest captured speeds.
+
+    **Arguments** (n values): `value` (n,) of the parameter; `threshold` (n,), NaN if starts at the highest speed were not
+    captured; `uncertainty` (n,); `least` (n,): the lowest initial speed from which a start was captured. Speeds are relative to
+    the rotor, divided by the rotor speed.
 
     >>> import numpy as np
     >>> len(curve_chart(np.arange(2.0), np.array([-0.5, np.nan]), np.array([0.1, np.nan]), np.array([-0.6, -0.2])).axes)

@@ -59,8 +59,8 @@ def branch_diagram(
 
     - `rotor_speed` (n,), `omega` (n,): rotor speed and load speed, rad/s, drawn in `unit`
     - `stable` (n,): True if stable; `stability_text`: how stability is determined, written below the figure
-    - `amplitude` (n, nd): amplitudes, m, drawn in mm or µm, or rad, drawn in mrad, if `units` (nd,) contains "rad"; `units`
-      None: all m
+    - `amplitude` (n, nd): amplitudes, m (drawn in mm or µm) or rad (drawn in mrad)
+    - `units` (nd,): "m" or "rad" for each coordinate; None: all m
     - `force` (n,): foundation force, N
     - `resonances`: resonances, rad/s, drawn as horizontal lines
     - `modes` (n,): numbers of the jam modes, written on the line of the working speed
@@ -258,7 +258,7 @@ def segments(stable: np.ndarray) -> list[tuple[slice, bool]]:
 
 
 def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", ax: Axes | None = None) -> Drawn:
-    """Draw a bar from 1 to after/before on a logarithmic axis for each (name, before, after), with both values beside it.
+    """Draw, for each (name, before, after), a bar from 1 to after/before on a logarithmic axis, with both values beside it.
 
     A quantity without a finite, positive ratio has no bar, only its values.
     """
@@ -336,10 +336,13 @@ def regime_chart(
     unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
-    """Draw the fractions of regimes as stacked bars, and the load speeds, over their drag.
+    """Draw the shares of regimes as stacked bars, and the load speeds, over the drag of the loads.
 
-    `drag` (n,) is in N s/m, `shares` are fractions (n,) by regime, and `omega` (n, starts) and `rotor_speed` are in rad/s,
-    drawn in `unit`.
+    **Arguments** (n drags)
+
+    - `drag` (n,), N s/m
+    - `shares`: for each regime, the fraction (n,) of the starts that end in it
+    - `omega` (n, starts), `rotor_speed`: load speed of each start and rotor speed, rad/s, drawn in `unit`
 
     >>> import numpy as np
     >>> figure = regime_chart(np.array([1.0, 2.0]), {"jammed": np.array([1.0, 0.5])}, np.ones((2, 3)), 2.0)

@@ -19,7 +19,11 @@ from jaxvib.draw.style import COLORS, MARKERS, STROKES, Look, legend_above, log_
 def tiers_chart(
     mass: np.ndarray, differences: Mapping[str, np.ndarray], stable: np.ndarray, *, ax: Axes | None = None
 ) -> Drawn:
-    """Draw relative differences (n,) by name over the mass of a load (n,) kg; markers are hollow if `stable` (n,) is False."""
+    """Draw relative errors of the leading order over the mass of a load, on logarithmic scales.
+
+    **Arguments** (n masses): `mass` (n,), kg; `differences`: relative differences (n,) from the exact orbit, by the name of the
+    quantity; `stable` (n,): markers are hollow if it is False.
+    """
     figure, (axes,) = panels(1, size=(7.0, 4.0), ax=ax)
     for color, mark, stroke, (name, values) in zip(
         COLORS, MARKERS, itertools.cycle(STROKES), differences.items(), strict=False
@@ -112,8 +116,11 @@ def _cost_panel(axes: Axes, panel: CostPanel, error_levels: Sequence[float], loo
 def convergence_chart(
     harmonics: np.ndarray, error: np.ndarray, estimate: np.ndarray, *, names: Sequence[str], ax: Axes | None = None
 ) -> Drawn:
-    """Draw errors (n, w) for w load speeds over the highest harmonic (n,) on a log scale; the dashed lines are estimates of the
-    errors (n, w)."""
+    """Draw relative errors of the rotor speed over the highest harmonic, on a logarithmic scale.
+
+    **Arguments** (n harmonics, w load speeds): `harmonics` (n,); `error` (n, w), solid lines; `estimate` (n, w) of the errors,
+    dashed lines; `names` (w,) of the load speeds.
+    """
     figure, (axes,) = panels(1, size=(7.0, 4.0), ax=ax)
     floor = np.finfo(float).eps
     for k, (color, name) in enumerate(zip(itertools.cycle(COLORS), names, strict=False)):
@@ -224,8 +231,7 @@ def steps_chart(
     """Draw the relative `difference` (n, k) between central differences and a derivative over the relative `steps` (k,).
 
     Each of n `names` has a line. For each line a ring at the `best` step (n,) shows the extrapolated difference `at_best` (n,),
-    which may lie below the line.
-    A dotted line marks the tolerance. `route`: mode of the derivative, "forward" or "reverse".
+    which may lie below the line. A dotted line marks the tolerance. `route`: mode of the derivative, "forward" or "reverse".
     """
     figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)
     floor = np.finfo(float).eps

@@ -220,11 +220,10 @@ def speeds_chart(
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw speeds (n,) rad/s as labelled points and below them intervals (n, 2) rad/s as bars, one row for each label; the
-    axis is in `unit`.
+    """Draw speeds as labelled points, and below them intervals of speeds as bars, one row for each label.
 
-    `rows` contains (label, speeds), `spans` (label, intervals). Speeds that are not finite are left out. An interval with an
-    infinite end extends to the edge.
+    `rows` contains (label, speeds (n,)), `spans` (label, intervals (n, 2)), in rad/s, drawn in `unit`. Speeds that are not
+    finite are left out. An interval with an infinite end extends to the edge.
 
     >>> import numpy as np
     >>> figure = speeds_chart([("resonances", np.array([1.0, np.nan]))], [("balancing", np.array([[1.0, np.inf]]))])
@@ -363,12 +362,13 @@ def drag_diagram(
 
     **Arguments**
 
-    - `branches`: patterns (name, drag, speed, stable), arrays (n,); patterns of the same name have the same colour
+    - `branches`: lines, each (name of the phase pattern, drag, load speed, True if stable), the last three as arrays (n,);
+      lines of the same name have the same colour
     - `rotor_speed`: rotor speed, rad/s, drawn as a horizontal line
     - `label`: label of the drag axis
     - `at`: drag of the scene, drawn as a vertical line
     - `jams`: jams (speed, stable) at the drag of the scene; unstable ones are hollow
-    - `within`: factor of the range of the axis, from `at` / `within` to `at` x `within`; None: automatic range
+    - `within`: the drag axis is from `at` / `within` to `at` x `within`; None: automatic range
     - `unit`: unit in which speeds, rad/s, are drawn
 
     >>> import numpy as np

@@ -106,7 +106,7 @@ def _to_edges(
 def _cells_path(corners: np.ndarray, chosen: np.ndarray) -> Path:
     """Return one path of all chosen cells (m, n) of a map with the corners (m + 1, n + 1, 2).
 
-    To hatch many cells takes seconds if each has its own path.
+    With a separate path for each cell, hatching of many cells takes seconds.
 
     >>> corners = np.stack(np.meshgrid([0.0, 1.0, 2.0], [0.0, 1.0]), axis=-1)
     >>> _cells_path(corners, np.array([[False, True]])).vertices.tolist()

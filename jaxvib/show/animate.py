@@ -67,21 +67,23 @@ def animate(
 
     - `motion`: a `Run`, or an `Orbit` together with its `scene`
     - `path` of the file: a GIF (".gif") or one HTML page with embedded frames (".html"); None writes no file
-    - `begin`, `end`: the part that is shown, s or text; default: the last four periods of a run, or four periods of an orbit
-    - `seconds`: duration of the animation; typical: 5 to 10; default: a duration with which the rotor turns by about a tenth of
-      a turn between frames, at most 600 frames
+    - `begin`, `end`: first and last time that is shown, s or text; default: the last four periods of the vibration of a run, or
+      four periods of an orbit
+    - `seconds`: duration of the animation; at most 600 frames are possible; typical: 5 to 10; default: a duration with which
+      the rotor turns by about a tenth of a turn between frames
     - `fps`: frames per second; typical: 20 (the default)
-    - `magnify`: magnification of displacements relative to the circle of the loads, which the frame states; typical: 1 to 50;
-      default: a factor with which the largest displacement is clearly visible
+    - `magnify`: magnification of displacements relative to the circle of the loads; a note in the frame states it; typical: 1
+      to 50; default: a factor with which the largest displacement is clearly visible
     - `width` of the frame, inches (100 pixels each); typical: 6.4 (the default). Drawing takes most of the computing time,
       in proportion to `seconds` times `fps`
 
-    **Returns** a matplotlib animation, whose `save` writes further files. The same call gives the same file.
+    **Returns** a matplotlib animation, whose `save` writes further files. Repeated calls give identical files.
 
     **Raises** `InputError` for
 
     - a part of the run that is not stored, or that has too few samples
     - an animation in which loads or rotor would turn by nearly half a turn from one frame to the next
+    - an animation of more than 600 frames, and values of `fps`, `width` and `magnify` that are not possible
     - an orbit without its scene
     - a path whose ending is not that of a GIF or HTML file, or that cannot be written to
 
@@ -102,6 +104,9 @@ def animate(
     speed = _highest_speed(motion, owner)
     turns = speed * (last - first) / (2.0 * np.pi)
     duration = None if seconds is None else float(number(seconds, "s", "seconds", low=0.0, open_low=True))
+    if duration is not None and round(duration * fps) > _MAX_FRAMES:
+        problem = f"is {duration:g} s, which makes {duration * fps:.0f} frames; at most {_MAX_FRAMES} are possible"
+        raise InputError("seconds", f"{problem}; give at most {_MAX_FRAMES / fps:g} s, or a lower fps")
     frames = int(np.ceil(turns / _TURNS_PER_FRAME)) if duration is None else duration * fps
     count = round(float(np.clip(frames, 2, _MAX_FRAMES)))
     if turns / count > _MAX_TURNS_PER_FRAME:

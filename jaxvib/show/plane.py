@@ -15,11 +15,12 @@ from jaxvib.show.view import BODY, FOUNDATION, View, spring_and_damper
 from jaxvib.show.wheel import Pose, Wheel, numbers_of, value_text
 
 _WIDTH = 6.0
-"""Size, in units of the drawing, of the rectangle around all points to which something is attached: the larger of its width and
-1.6 times its height."""
+"""Size, in units of the drawing, of the rectangle around the centre of mass, the supports and the exciters of a body: the
+larger of its width and 1.6 times its height."""
 
 _OUTLINE_MARGIN = 0.32
-"""Distance of the outline of a body from its centre of mass, the points of its supports, and the rims of its exciters."""
+"""Smallest distance of the outline of a body from its centre of mass, from the points of its supports, and from the rims of its
+exciters."""
 
 _SPRING_LENGTH = 1.6
 """Length of a spring from the body to the foundation, in units of the drawing."""
@@ -50,7 +51,7 @@ class _Strut(NamedTuple):
 
 
 class PlaneView(View):
-    """Drawing of a body to scale, with its outline about the points to which something is attached. Springs are not to
+    """Drawing of a body to scale, with an outline around its centre of mass, its supports and its exciters. Springs are not to
     scale."""
 
     def __init__(self, scene: Scene):

@@ -34,21 +34,23 @@ Limits = tuple[float, float, float, float]
 def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) -> Drawn:
     """Draw a scene at rest: its masses, springs, dampers, rotor and loads, with their values and units.
 
-    Platforms are drawn above each other, numbered from the foundation upward, with all their exciters. A rotor is drawn along
-    its axis, a rotor with tilt also from the side. Loads are spread over their circle so that each is visible. Only the loads
-    and their circle are to scale. A body in a plane is drawn to scale, with an outline about the points to which something is
-    attached, and with its springs in their directions.
+    Platforms are drawn above each other, numbered from the foundation upward, with all their exciters. A rotor is drawn as seen
+    along its axis, a rotor with tilt also as seen from the side. Loads are spread over their circle so that each is visible.
+    Only the loads and their circle are to scale. A body in a plane is drawn to scale, with an outline around its centre of
+    mass, its supports and its exciters, and with its springs in their directions.
 
     **Arguments**
 
-    - `scene` with any kind of machine
-    - `deck`: the motion of points of a body in a plane, from `Run.deck`, whose magnified ellipses are drawn; default: none
+    - `scene` of platforms, of a rotor, or of one body in a plane
+    - `deck`: the motion of points of a body in a plane, such as the result of `Run.deck`; the ellipses of the points are drawn,
+      magnified; default: none
     - `ax`: axes to draw onto; default: a new figure
 
     **Returns** a matplotlib figure, or the given `ax`.
 
-    **Raises** `InputError` for an argument that is not a scene, a scene with traced values (within `jit` or `grad`), a
-    rotor with several exciters, or a `deck` on a machine without points (x, y).
+    **Raises** `InputError` for an argument that is not a scene, a scene with traced values (within `jit` or `grad`), a machine
+    that cannot be drawn (such as several bodies in a plane), a rotor with several exciters, or a `deck` on a machine other than
+    a body in a plane.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),

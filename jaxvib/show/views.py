@@ -37,10 +37,10 @@ class Connection(NamedTuple):
 
 
 def order_of_connections(connections: list[Connection], levels: int) -> list[int]:
-    """Return an order of the connections from left to right in which few connections cross other platforms, and the platforms
+    """Return an order of the connections, from left to right, in which few connections cross other platforms and the platforms
     are short.
 
-    Pairs of connections are swapped until no swap is an improvement.
+    Pairs of connections are swapped until no swap is an improvement. `levels` is the number of platforms.
 
     >>> order_of_connections([Connection(0, 1), Connection(0, 2), Connection(1, 2)], 2)
     [0, 2, 1]

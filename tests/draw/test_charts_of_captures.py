@@ -19,7 +19,7 @@ def test_a_share_has_its_error_within_0_and_1():
     assert axis.lines[0].get_xydata().tolist() == [[-0.5, 0.05], [-0.1, 0.9]]
     assert [line.get_label() for line in axis.lines] == ["fraction, with its standard error", "threshold -0.300"]
     plain = threshold_chart(speed, share, None, np.nan).axes[0]
-    assert not plain.collections and [line.get_label() for line in plain.lines] == ["share"]
+    assert not plain.collections and [line.get_label() for line in plain.lines] == ["fraction"]
 
 
 def test_thresholds_show_lower_captures_and_missing_ones():

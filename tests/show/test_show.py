@@ -144,7 +144,7 @@ def test_a_film_is_a_gif_and_a_page_without_requests(run, orbit, tmp_path):
     ("ask", "says"),
     [
         (lambda run, orbit: jv.sketch(3.0), "scene is 3.0; it must be a Scene"),
-        (lambda run, orbit: jax.jit(lambda s: jv.sketch(s) and 0.0)(SCENE), "a drawing needs them"),
+        (lambda run, orbit: jax.jit(lambda s: jv.sketch(s) and 0.0)(SCENE), "a drawing needs their values"),
         (lambda run, orbit: jv.animate(orbit), r"scene is missing; an Orbit does not contain it"),
         (lambda run, orbit: jv.animate(run, scene=SCENE), "scene is only for an Orbit"),
         (lambda run, orbit: jv.animate(SCENE), "it must be a Run or an Orbit"),
@@ -157,6 +157,10 @@ def test_a_film_is_a_gif_and_a_page_without_requests(run, orbit, tmp_path):
             "end turns the rotor by 0.955 turns",
         ),
         (lambda run, orbit: jv.animate(run, seconds=-1.0), "seconds is -1 s; it must be greater than 0"),
+        (
+            lambda run, orbit: jv.animate(run, seconds=40.0),
+            "seconds is 40 s, which makes 800 frames; at most 600 are possible; give at most 30 s, or a lower fps",
+        ),
         (lambda run, orbit: jv.animate(run, fps=0), "fps is 0; it must be a whole number"),
         (lambda run, orbit: jv.animate(run, width=-1.0), "width is -1 inches; it must be from 1 to 50"),
         (lambda run, orbit: jv.animate(run, width=np.inf), "width is inf inches"),

@@ -102,9 +102,9 @@ class Animation(FuncAnimation):
         first.save(path, save_all=True, append_images=others, duration=pause, loop=0, optimize=True, disposal=1)
 
     def _few_colours(self) -> list[Image.Image]:
-        """Return all frames with a common palette, which follows from a few of them, without dithering.
+        """Return all frames with a common palette, which is computed from a few frames, without dithering.
 
-        Parts that do not move are therefore identical in all frames.
+        Parts that do not move therefore have the same pixels in all frames.
         """
         every = list(self.frames())
         some = every[:: max(1, len(every) // 4)]

@@ -45,7 +45,10 @@ class Text(NamedTuple):
 
 
 def _along(start: Point, end: Point, forward: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """Return points at the fractions `forward` of the line from `start` to `end`, at the distances `side` to its left."""
+    """Return points (n, 2) beside the line from `start` to `end`.
+
+    **Arguments**: `forward` (n,): fractions of the line; `side` (n,): distances to the left of the line.
+    """
     a, b = np.asarray(start, float), np.asarray(end, float)
     direction = b - a
     length = np.hypot(*direction)

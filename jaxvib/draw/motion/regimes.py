@@ -31,8 +31,11 @@ class DrawnRegime(NamedTuple):
 
 
 class TorqueCurves(NamedTuple):
-    """Torques (n, count) N m at speeds (n,) rad/s: those of the drives, NaN for ideal ones, and those that the vibration needs
-    at the phases of the first regime."""
+    """Torques on count masses at n speeds.
+
+    **Attributes**: `speed` (n,), rad/s; `driving` (n, count): torques of the drives, N m, NaN for ideal drives; `needed`
+    (n, count): torques that the vibration needs at the phases of the first regime, N m.
+    """
 
     speed: np.ndarray
     driving: np.ndarray

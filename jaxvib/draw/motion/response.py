@@ -35,8 +35,8 @@ def response_chart(
 
     **Arguments** (n speeds, nd coordinates)
 
-    - `curve`: the arrays `speed` (n,) rad/s, `amplitude` and `phase` (n, nd), `foundation_force` (n,) N, `torque` and
-      `motor_torque` (n,) N m
+    - `curve`: the arrays `speed` (n,), rad/s; `amplitude` (n, nd), m or rad; `phase` (n, nd), rad; `foundation_force` (n,), N;
+      `torque` (n,), which the vibration needs, and `motor_torque` (n,), N m
     - `points`: the same arrays for the operating points, and the Boolean array `stable`
     - `folds`: `speed` and `torque` of the folds
     - `resonances` (k,), rad/s, drawn as dotted lines
