@@ -27,7 +27,8 @@ times the value in the file. The arrow keys move a slider by one step; the field
 number."""
 
 _ABOUT_COUNTS = """Each number of loads needs its own compiled program. The programs for the seven numbers closest to the number
-in the file are compiled while the page is open; any other takes one or two seconds the first time and is then stored."""
+in the file are compiled while the page is open. The program for any other number takes one or two seconds the first time, and
+is then stored."""
 
 _ABOUT_LOADS = f"""{_ABOUT_COUNTS}
 
@@ -179,8 +180,11 @@ def heading(scene: Scene) -> str:
 
 
 def diagram(scene: Scene, max_speed: float) -> str:
-    """Draw the branch diagram, with amplitudes and force, of a machine that moves up and down, the Campbell diagram of a rotor,
-    or the working regime of exciters with unbalances over the speed of their motors.
+    """Draw the diagram of a scene.
+
+    It is the branch diagram with amplitudes and force for one exciter with loads on a machine that moves only up and down, and
+    the Campbell diagram if the machine moves in two directions. For other scenes (exciters with unbalances, several exciters),
+    it shows synchronous regimes over the speed of the drives.
 
     **Arguments**: `max_speed`: the highest rotor speed in the diagram, rad/s; the diagram always reaches at least 1.15 times
     the rotor speed of the scene.
@@ -207,8 +211,8 @@ def diagram(scene: Scene, max_speed: float) -> str:
 
 
 def readings(scene: Scene) -> str:
-    """Return the jams at the rotor speed, the critical speeds of a rotor, or the regimes of exciters with unbalances, as text.
-    **Raises** `InputError` like `diagram`."""
+    """Return the results of a scene as text: the jams at the rotor speed, the critical speeds of a rotor, or the synchronous
+    regimes. **Raises** `InputError` like `diagram`."""
     from jaxvib.explore.regimes import regime_readings  # slow import
 
     if not scene.is_plain:
@@ -217,7 +221,7 @@ def readings(scene: Scene) -> str:
 
 
 def modes_of(scene: Scene) -> list[int]:
-    """Return the numbers of the jam modes that `machine` can animate: the modes that are stable by slope.
+    """Return the numbers of the jam modes that `machine` can animate: 1, 3, 5, ..., the modes that are stable by slope.
 
     Modes that exist at the rotor speed of the scene come first, then the modes that do not. In each group the mode at the
     highest resonance comes first, and the mode above all resonances last. The list is empty for a machine that moves in two
@@ -234,8 +238,8 @@ def modes_of(scene: Scene) -> list[int]:
 
 
 def machine(scene: Scene, mode: int | None) -> str:
-    """Return the machine as an SVG figure: moving in the jam mode with that number; if `mode` is None, moving in the first
-    regime of its exciters with unbalances, or at rest if there is none."""
+    """Return the machine as an SVG figure: moving in the first synchronous regime of the list, or in the jam mode with the
+    number `mode`, or at rest if `mode` is None."""
     from jaxvib.explore.regimes import deck_points, regimes_of
     from jaxvib.show.moving import moving_svg, regime_svg, sketch_svg  # slow import
 

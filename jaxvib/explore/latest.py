@@ -12,7 +12,7 @@ _Result = TypeVar("_Result")
 
 
 def keep_latest(function: Callable[[Scene], _Result]) -> Callable[[Scene], _Result]:
-    """Return the function with its latest result stored: another call with the same scene object returns this result.
+    """Return a function that stores its latest result: another call with the same scene object returns the stored result.
 
     >>> calls = []
     >>> read = keep_latest(lambda scene: calls.append(scene) or len(calls))

@@ -115,7 +115,7 @@ def _(mo, numbers):
 
 @app.cell
 def _(mo, figures, scene):
-    # The list has only the existing modes; a machine without jam modes has no list.
+    # The list has all modes that are stable by slope, because other values of the sliders can make each of them exist.
     found = figures.modes_of(scene)
     modes = {str(k): k for k in sorted(found)}
     mode = mo.ui.dropdown(

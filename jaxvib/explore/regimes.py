@@ -1,5 +1,5 @@
-"""Synchronous regimes of exciters with unbalances or with loads that stay together: chart over the speed of the drives, and
-results as text."""
+"""Synchronous regimes of exciters with unbalances, or with loads that stay together: chart over the speed of the drives, and
+text."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _SPEEDS = {1: 61, 2: 61, 3: 25}
 """Number of speeds of the chart for each number of exciters; the time for one speed grows steeply with the number."""
 
 _MAX_LISTED, _MAX_WITH_LOADS = 2, 4
-"""Numbers of exciters, with unbalances and with loads, up to which all regimes are searched for. The search takes too long for
-more."""
+"""Largest numbers of exciters for which all regimes are searched for: without loads, and if at least one exciter has loads. For
+more exciters the search takes too long."""
 
 _MAX_LINES = 12
 """Largest number of regimes in the list."""
@@ -48,8 +48,11 @@ _LEGEND = {"regime": {**_LINE, "color": "black"}, "resonance": _RESONANCE, "work
 
 
 class _Curves(NamedTuple):
-    """Regimes at several speeds of the drives `drive_speed` (n,): rotor or load speed (n,), phases (n, mass), amplitudes
-    (n, nd), force (n,), stability (n,). Values between two curves are NaN."""
+    """Regimes at n speeds of the drives, one or several curves; values between two curves are NaN.
+
+    **Attributes**: `drive_speed` (n,) and `speed` (n,) of the rotors or loads, rad/s; `phases` (n, mass), rad; `amplitude`
+    (n, nd), m or rad; `force` (n,) on the foundation, N; `stable` (n,).
+    """
 
     drive_speed: Array | np.ndarray
     speed: Array | np.ndarray
@@ -71,8 +74,9 @@ def regime_chart(scene: Scene, max_speed: float) -> str:
 
     **Arguments**: `max_speed`: the highest motor speed in the diagram, rad/s.
 
-    **Returns** the text of an SVG file. **Raises** `InputError` for more than three exciters with unbalances, for more than
-    four with loads, and for a scene without averaged regimes; the message names the part of the scene that prevents them.
+    **Returns** the text of an SVG file. **Raises** `InputError` for more than three exciters without loads, for more than four
+    exciters of which one has loads, and for a scene without averaged regimes; the message names the part of the scene that
+    prevents them.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -189,8 +193,8 @@ def _working_regimes(scene: Scene, factors: Array) -> _Curves:
 
 @keep_latest
 def _search(scene: Scene) -> SynchronousRegimes:
-    """Return all regimes of a scene with few exciters; loads of each exciter stay together. **Raises** `InputError` for more
-    exciters with loads among them than `_MAX_WITH_LOADS`."""
+    """Return all regimes of a scene with few exciters, in which the loads of each exciter stay together. **Raises**
+    `InputError` for more than `_MAX_WITH_LOADS` exciters of which one has loads."""
     if not scene.has_loads:
         return jax.device_get(synchronous_regimes(scene))
     if len(scene.exciters) > _MAX_WITH_LOADS:
@@ -206,11 +210,12 @@ def _has_list(scene: Scene) -> bool:
 
 @keep_latest
 def regimes_of(scene: Scene) -> list[SynchronousRegime]:
-    """Return the regimes that the page lists, the stable ones first: at most 12 of all regimes for one or two exciters and for
-    exciters with loads, otherwise the working regime. Loads of each exciter stay together. The list is empty if there is no
-    regime.
+    """Return the regimes that the page lists, the stable ones first; an empty list if there is no regime.
 
-    **Raises** `InputError` for more than four exciters with loads among them.
+    For one or two exciters, and for exciters with loads, these are the first 12 of all regimes in which the loads of each
+    exciter stay together. For three or more exciters without loads it is the working regime alone.
+
+    **Raises** `InputError` for more than four exciters of which one has loads.
     """
     if not _has_list(scene):
         regime = jax.device_get(working_regime(scene, throw=False))
@@ -233,8 +238,8 @@ def deck_points(scene: Scene) -> list[tuple[float, float]]:
 
 
 def regime_readings(scene: Scene) -> str:
-    """Return the regimes as text: speed, stability, margin, phases; of the first one also force, power and motion of the
-    points of `deck_points`.
+    """Return the regimes as text: speed, stability, margin and phases of each; force, power, and the motion of `deck_points`
+    for the first one.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

@@ -63,7 +63,7 @@ def require_free(port: int) -> None:
 
 
 def guarded(page: _Page, token: str, port: int) -> _Page:
-    """Return an ASGI application that forwards only requests of the page at `/token/` to `page`; others receive an empty 404.
+    """Return an ASGI application that forwards only requests to `/token/` from the page itself; others receive an empty 404.
 
     The header Host must name this computer and `port`. This rejects sites whose name points to this computer (DNS rebinding).
     Browsers add the header Origin to requests of other sites and to all websockets; if the header is present, it must agree

@@ -28,13 +28,13 @@ _MACHINE_NUMBERS = ("machine.mass", "machine.stiffness", "machine.link_stiffness
 """Parameters of loads and of a machine that have sliders."""
 
 _EXCITER_NUMBERS = (("loads", "mass"), ("loads", "radius"), ("loads", "drag"), ("unbalance",), ("position",))
-"""Numbers of each of several exciters that have sliders, by their paths."""
+"""Parameters of an exciter that have sliders if the scene is not plain (`Scene.is_plain`), by their paths in the exciter."""
 
 _MACHINE_FIELDS = ("stiffness", "link_stiffness", "angle", "mass", "inertia", "damping", "link_damping")
-"""Fields of a machine, or of its supports and bodies, that have sliders if its exciters have unbalances."""
+"""Fields of a machine, or of its supports and bodies, that have sliders if the scene is not plain (`Scene.is_plain`)."""
 
 _HALF_TURN = 180
-"""Half the range of the slider of an angle, in degrees. Its steps are 1 degree."""
+"""Half the range of the slider of an angle, in degrees; the slider has steps of 1 degree."""
 
 _MAX_SINGLE_SLIDERS = 15
 """Maximum number of sliders for single parameters of a machine. A machine with more parameters has one slider for all of a
@@ -81,7 +81,7 @@ def sliders_of(scene: Scene) -> list[Slider]:
     - masses, springs and dampers of the machine, masses, radii and drags of the loads, unbalances of exciters and torques of
       their motors: a tenth to ten times the scene's values
     - speeds of drives: a hundredth to three times the scene's value
-    - positions of exciters with an unbalance, and angles of supports, in a range around the scene's value
+    - positions of exciters and angles of supports on bodies in a plane, in a range around the scene's value
     - number of loads, if all loads have equal parameters
 
     A parameter that is 0 has no slider, because a factor does not change it.
@@ -112,7 +112,8 @@ def sliders_of(scene: Scene) -> list[Slider]:
 
 
 def _exciter_sliders(scene: Scene, named: Mapping[str, NamedNumber]) -> list[Slider]:
-    """Return the sliders of several exciters: speeds of the drives, loads, unbalances, positions, torques of the motors."""
+    """Return the sliders of the exciters of a scene that is not plain: speeds of the drives, loads, unbalances, positions,
+    torques of the motors."""
     reach = max([0.1, *(float(np.max(np.abs(e.position))) for e in scene.exciters if e.position is not None)])
     sliders = []
     for k in range(len(scene.exciters)):
