@@ -20,8 +20,8 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., object]]] = {
     "effects": EFFECTS,
     "tables": {"exciter": Exciter, "support": support, "body": body},
 }
-"""Parts of a scene, by group and by their name in a scene file; "tables" are those of [[exciters]], [[machine.supports]] and
-[[machine.bodies]]."""
+"""Functions that build the parts of a scene, by group and by the name of the part in a scene file. The group "tables" has the
+contents of [[exciters]], [[machine.supports]] and [[machine.bodies]]."""
 
 
 class Argument(NamedTuple):

@@ -31,9 +31,9 @@ _LIBRARIES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "nu
 class Report:
     """Contents of a page.
 
-    **Arguments**: `title`; `document`: the result as plain values; `units` of its numbers by name; `command` that
-    computed the result; `text` of the result on the terminal; `scene` of the result and a `sketch` of the scene; `figures`:
-    pairs of a name and a figure; `author`.
+    **Arguments**: `title`; `document`: the result as plain values; `units` of its numbers, by name; `command`: the command line
+    that computed the result; `text`: the result as printed on the terminal; `scene` of the result, and a `sketch` of the scene;
+    `figures`: pairs of a name and a figure; `author`.
     """
 
     title: str

@@ -51,8 +51,10 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
 def write_table(
     table: Mapping[str, np.ndarray], path: str | Path, *, decimal_comma: bool = False, unique: bool = False
 ) -> Path:
-    """Write columns by their headers to a CSV file. With `unique`, equal rows that follow each other are one row, because a
-    point at which two pieces of a curve meet occurs twice."""
+    """Write columns, given by their headers, to a CSV file.
+
+    With `unique`, equal rows that follow each other are written once. They occur at points where two pieces of a curve meet.
+    """
     path = Path(path)
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n", delimiter=";" if decimal_comma else ",")
@@ -63,10 +65,10 @@ def write_table(
 
 
 def main_axis(result: eqx.Module) -> str:
-    """Return the most frequent first axis of the arrays of a result; "" if none has an axis.
+    """Return the name of the most frequent first axis of the arrays of a result; "" if no array has an axis.
 
-    If this axis has only one point, as the axis of segments of a single spectrum, return the longest axis with coordinates
-    instead, such as the axis of frequencies, if there is one.
+    If this axis has only one point (such as the axis of segments of a single spectrum), the name of the longest axis with
+    coordinates is returned instead (such as the axis of frequencies), if there is one.
     """
     arrays = [(name, axes, values) for name, axes, values, _ in columns(result) if axes and values.ndim == len(axes)]
     counts = collections.Counter(axes[0] for _, axes, _ in arrays)

@@ -28,8 +28,8 @@ class Share(NamedTuple):
 
     Returned by `estimate_share`.
 
-    **Attributes**: its `value`; `low` and `high`: Wilson's confidence interval of 95 % for the probability; `hits`: number of
-    cases in which the statement is true; `cases`: number of all cases.
+    **Attributes**: `value`: the share, 0 to 1; `low` and `high`: Wilson's confidence interval of 95 % for the probability;
+    `hits`: number of cases in which the statement is true; `cases`: number of all cases.
     """
 
     value: float
@@ -71,7 +71,7 @@ def estimate_share(flags: Any) -> Share:
 
 
 def interval(value: float, error: float, quantile: float, instrument: float) -> Estimate:
-    """Return an estimate with its interval, value +- sqrt((quantile error)^2 + (instrument value)^2).
+    """Return an estimate with its confidence interval, value +- sqrt((quantile error)^2 + (instrument value)^2).
 
     **Arguments**: `value` and its standard `error` from noise; `quantile` of the distribution of the error, such as 1.96;
     `instrument`: relative error of the instruments.

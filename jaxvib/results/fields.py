@@ -81,10 +81,10 @@ def in_unit(unit: str, *axes: str, name: str = "", first: int = 0) -> InUnit:
 
 
 def part(*axes: str, prefix: str = "") -> Part:
-    """Return the metadata of a field that contains another tree of numbers, or a tuple of such trees.
+    """Return the metadata of a field that contains another object with such metadata, or a tuple of such objects.
 
-    **Arguments**: `axes`: names of axes that precede those of the tree; `prefix` of its names in labelled data. The trees of a
-    tuple with several trees are numbered, and each of them has its own axis "load".
+    **Arguments**: `axes`: names of axes that precede the axes of the object; `prefix` of the names of its arrays in labelled
+    data. The objects of a tuple with several objects are numbered, and each of them has its own axis "load".
     """
     return {"part": axes, "prefix": prefix}
 
@@ -155,7 +155,7 @@ def _plain_fields(value: DataclassInstance, infinity: bool) -> dict[str, Plain]:
 def to_xarray(result: eqx.Module) -> xarray.Dataset:
     """Return the numbers of a result as a labelled dataset with units in the attribute "units"; needs the extra `xarray`.
 
-    The axis of an outer `vmap` is called "batch"; several are called "batch_1", "batch_2", ..., the outermost first.
+    The axis of an outer `vmap` is called "batch". Several such axes are called "batch_1", "batch_2", ..., the outermost first.
 
     **Raises** `InputError` if xarray is not installed.
     """

@@ -262,7 +262,7 @@ def _rebuilt(kind: type, fields: Mapping[str, Plain], arrays: Mapping[str, np.nd
 
 
 def _class_named(name: str, base: type) -> Any:
-    """Return the class of a name, from its module or else from the public names of the package.
+    """Return the class with a name in a file, from its module or, if the class has moved, from the public names of the package.
 
     **Raises** `ValueError` for a class that neither package defines, or that is not of the kind of `base`: a named tuple for
     `tuple`, a dataclass for `object`, a status for `equinox.Enumeration`.

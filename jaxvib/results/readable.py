@@ -33,8 +33,8 @@ class Readable(eqx.Module):
     """
 
     def __repr__(self) -> str:
-        """Return a text: the summary of a single result; the values and units of all fields of another object; the shapes of a
-        traced object."""
+        """Return a text: for a single result its summary, for other objects the values and units of all fields, for a traced
+        object the shapes."""
         if not _has_values(self):
             return super().__repr__()
         summary = getattr(self, "summary", None)
@@ -44,8 +44,9 @@ class Readable(eqx.Module):
 
 
 def values_text(values: object, unit: str = "") -> str:
-    """Return numbers of any shape, in the SI `unit`, in their display unit as text: all of up to 12 numbers, otherwise their
-    shape and range.
+    """Return numbers of any shape, given in the SI `unit`, as text in their display unit.
+
+    Up to 12 numbers are all written; of more numbers, the text states the shape and the range.
 
     >>> values_text([[0.01, 0.02], [0.03, float("nan")]], "m"), values_text(np.linspace(0.0, 0.1, 50), "m")
     ('[10, 20], [30, nan] mm', '(50,) from 0 to 100 mm')

@@ -103,7 +103,7 @@ class Result(Readable):
     @final
     @validated
     def to_pandas(self, axis: str | None = None) -> "pandas.DataFrame":
-        """Return the arrays of the result along one axis as a table with a row for each point, as in `write_csv`.
+        """Return the arrays of the result along one axis as a table with a row for each point, with the columns of `write_csv`.
 
         **Arguments**: `axis`: its name, such as "time", "mode" or "rotor_speed"; default: the axis of most arrays.
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxvib.errors import InputError, open_regular, quoted
 
 _MAX_BYTES, _MAX_LINE = 2**29, 10_000
-"""Largest number of bytes of a file (ten million rows of five columns), and of characters of a line."""
+"""Largest number of bytes of a file (about ten million rows of five columns), and of characters of a line."""
 
 _MAX_PREAMBLE = 400
 """Largest number of lines above the header of a table."""

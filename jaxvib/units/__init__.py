@@ -255,7 +255,8 @@ def random_numbers(seed: object) -> np.random.Generator:
 
 
 def validate_tolerance(value: float, name: str, dtype: np.dtype, roundings: float) -> float:
-    """Return a tolerance or an accuracy, which must be at least `roundings` rounding units of the precision `dtype`.
+    """Return a tolerance or an accuracy, which must be less than 1 and at least `roundings` times the machine epsilon of
+    `dtype`.
 
     **Raises** `InputError` for other values.
     """

@@ -53,7 +53,7 @@ _SPELLINGS: dict[str, dict[str, float]] = {
         **dict.fromkeys(("khz", "ks/s", "ksa/s", "ksps", "ksamples/s"), 1e3),
     },
 }
-"""Units in the headers of columns by the SI unit, in lower case; headers may be in upper or lower case."""
+"""Factors to each SI unit, by the spellings of units in headers of columns, in lower case (headers may be in either case)."""
 
 _MULTIPLE = re.compile(r"^(\d+\.?\d*(?:[eE][+-]?\d+)?)\s+([^\s\d/].*)$")
 """Pattern of a multiple of a unit, such as "50 kN"."""

@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def is_known(*trees: PyTree) -> bool:
-    """Return True if no value in the trees is traced. Modules that plan a computation call this function once.
+    """Return True if no value in the trees is traced.
 
     >>> is_known({"mass": 1.0}, None)
     True
@@ -52,9 +52,9 @@ def _plain(leaf: object) -> object:
 
 
 def require_known(tree: PyTree, field: str, caller: str, instead: str) -> None:
-    """Raise `InputError` if a value in `tree` is traced. The message names the argument `field`, the function `caller`, which
-    needs the value in Python, and the remedy `instead`.
+    """Raise `InputError` if a value in `tree` is traced. The message names the argument `field`, the function `caller`,
+    which needs the values, and the remedy `instead`.
     """
     if not is_known(tree):
-        problem = f"contains values that JAX is transforming (jit, grad, vmap, ...), but {caller} needs them in Python"
+        problem = f"contains values that JAX is transforming (jit, grad, vmap, ...), but {caller} needs their values"
         raise InputError(field, f"{problem}; {instead}")

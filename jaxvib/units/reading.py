@@ -89,8 +89,8 @@ _AMBIGUOUS = (
     (re.compile(r"(?<![^\W\d])tons?(?!\w)"), "1000 kg or 907 kg; write t or short_ton"),
     (re.compile(r"(?<![^\W\d])gr(?!\w)"), "grams or grains; write g or grain"),
 )
-"""Names with several meanings: Grad means degrees in German, gon in mathematics and on calculators; pint would read
-`gigaradian`, the ton of the United States, and grains."""
+"""Names with several meanings. "Grad" means degrees in German, and gon in mathematics and on calculators. pint would read
+"Grad" as gigaradian, "grad" as gon, "ton" as the ton of the United States, and "gr" as grain."""
 
 _FACTORS = {
     "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3},
@@ -288,9 +288,9 @@ def unit_ratio(one: str, other: str) -> float | None:
 def in_own_unit(value: str | Quantity, field: str, beside: str = "") -> tuple[float, str]:
     """Return the magnitude in SI and the SI unit of a string or a pint quantity of any dimension; Hz is converted to rad/s.
 
-    A plain number has the unit "". A speed is converted to the unit `beside` of the other operand of a ratio if that is a
-    speed. A value in 1/s or 1/min states neither radians nor revolutions: it is converted to `beside` if that is a speed or a
-    rate; otherwise 1/min is rpm.
+    A plain number has the unit "". In a ratio, `beside` is the unit of the other operand. If it is a speed, a speed is
+    converted to it. A value in 1/s or 1/min states neither radians nor revolutions: it is converted to `beside` if that is a
+    speed or a rate; otherwise 1/min is rpm.
 
     **Raises** `InputError` for other strings, for values that are not finite, and for 1/s beside a speed in rad/s.
 
