@@ -101,7 +101,7 @@ def export_fmu(
     - `scene` to export
     - `path` of the file, ".fmu"
     - `fmi`: version of the standard, "2.0" (the default) or "3.0"
-    - `start`: "rest" (the default) or another name of `simulate` except "spin_up", or a `State`
+    - `start`: "rest" (the default), "jam", or a `State`
     - `mode`: number of the jam mode for `start="jam"`; typical: 1, 3, 5
     - `drive`: "scene" (the default), or "input" for inputs in place of the drive. The inputs are `rotor.speed` and its
       derivative `rotor.acceleration` if the drive is ideal (prescribed motion), and `rotor.torque` if it is a motor
@@ -191,7 +191,8 @@ class _Programs(NamedTuple):
     """Programs in C.
 
     **Attributes**: `rates`: rates and outputs; `tangent`: their directional derivatives with respect to states and inputs,
-    which implicit solvers need often; `full_tangent`: those with respect to parameters, time, states and inputs.
+    which implicit solvers need often; `full_tangent`: their directional derivatives with respect to parameters, time, states
+    and inputs.
     """
 
     rates: CProgram

@@ -72,7 +72,7 @@ class _AppliedForce(Effect):
 
 
 class _SpeedInput(IdealDrive):
-    """Rotor whose angle, speed and acceleration are inputs."""
+    """Drive that prescribes the angle, speed and acceleration which another tool supplies."""
 
     speed: Array
     angle: Array

@@ -161,8 +161,8 @@ def state_space(
     - `scene`: for a model at rest only the machine, the loads, the nonlinear supports and the rotor speed matter, and several
       exciters are allowed
     - `at`: "rest" (the default), or a jam from `jam_modes(scene).select(mode)` or `phase_jams(scene)`
-    - `rotor_speed` n, rad/s, negative if clockwise, for a machine at rest with a gyroscopic matrix (default: the mean speed of
-      the drives); typical: 0 to 500
+    - `rotor_speed` n, rad/s, negative if clockwise, for a machine at rest with a gyroscopic matrix; default: the mean speed of
+      the drives; typical: 0 to 500
 
     **Returns** `StateSpace`.
 

@@ -41,7 +41,7 @@ _HIGHEST_FREQUENCY_RATIO = 1.5
 """Highest default frequency, relative to the highest natural frequency."""
 
 _DIGITS = 5
-"""Significant digits of the default spacing, not more than those of the abscissa in a file."""
+"""Number of significant digits of the default spacing, which is less than that of the abscissa in a file."""
 
 _MAX_UNEVEN = 1e-6
 _MAX_BYTES = 2**28
@@ -123,7 +123,7 @@ def export_uff(
     - `rotor_speed`, rad/s, as in `state_space`; typical: 0 to 500
 
     **Returns** the path. **Raises** `InputError` for frequencies that are not evenly spaced or not positive, for accelerations
-    of a run, which are not stored, and for a path that cannot be written to.
+    of a run, which are not stored, for `frequencies` or `rotor_speed` of a run, and for a path that cannot be written to.
 
     >>> import pathlib, tempfile, numpy as np, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),

@@ -68,7 +68,7 @@ EXPORT Status FMI(SetReal)(void *m, const unsigned reference[], size_t n, const 
     return judged(set_values(m, reference, n, value));
 }
 
-/* A machine has real numbers only. */
+/* All variables are real numbers. */
 #define NONE_OF(Kind, Type)                                                                                   \
     EXPORT Status FMI(Get##Kind)(void *m, const unsigned reference[], size_t n, Type value[]) { return judged(!n); } \
     EXPORT Status FMI(Set##Kind)(void *m, const unsigned reference[], size_t n, const Type value[]) { return judged(!n); }

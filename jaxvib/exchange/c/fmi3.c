@@ -73,7 +73,7 @@ EXPORT Status FMI(SetFloat64)(void *m, const Reference reference[], size_t n, co
     return judged(n == values && set_values(m, reference, n, value));
 }
 
-/* A machine has numbers of double precision only. */
+/* All variables are Float64. */
 typedef const char *Text;
 #define NONE_OF(Kind, Type)                                                                                             \
     EXPORT Status FMI(Get##Kind)(void *m, const Reference r[], size_t n, Type value[], size_t k) { return judged(!n); } \

@@ -1,7 +1,8 @@
 /* A machine of jaxvib: one instance, its values and its steps.
 
-   "model.h" holds the equations of one scene. The values of an instance lie in one array in the order of their references:
-   time, states, their rates, inputs, outputs, parameters (the last one is the step of co-simulation), event indicators. */
+   "model.h" contains the equations of one scene. The values of an instance are in one array, in the order of their value
+   references: time, states, their rates, inputs, outputs, parameters (the last one is the step of co-simulation), event
+   indicators. */
 
 #include <math.h>
 #include <stdarg.h>
@@ -21,7 +22,7 @@
 #define AT_STEP (AT_INDICATORS - 1)
 #define MOST_STEPS 1e9
 
-/* Everything that changes, so that a copy of it is a copy of the instance. */
+/* All data that change during a simulation: a copy of them is a saved state of the instance. */
 typedef struct {
     double values[VALUES];
     double constants[CONSTANTS + 1];
@@ -63,7 +64,7 @@ static Machine *create(const char *name, const char *token, void (*log)(Machine 
     m->name = calloc(strlen(name ? name : "") + 1, 1);
     if (m->name) strcpy(m->name, name ? name : "");
     if (!m->name || !token || strcmp(token, TOKEN)) {
-        report(m, "the token of the model description is not that of the binary: they are of different files");
+        report(m, "the token of the model description differs from that of the binary; both must be from the same FMU");
         free(m->name);
         free(m);
         return NULL;
@@ -77,7 +78,7 @@ static void destroy(Machine *m) {
     free(m);
 }
 
-/* Rates, outputs and indicators of the present values. */
+/* Compute the rates, outputs and event indicators of the present values. */
 static void compute(Machine *m) {
     Data *d = &m->data;
     double *v = d->values;
@@ -87,7 +88,7 @@ static void compute(Machine *m) {
              v + AT_INDICATORS);
 }
 
-/* The same if they are not there yet; 0 if one of them is not finite. */
+/* Compute rates, outputs and indicators if a value has changed; return 0 if a state, rate, input or output is not finite. */
 static int update(Machine *m) {
     double *v = m->data.values;
     if (m->data.evaluated) return 1;
@@ -144,7 +145,7 @@ static void set_states(Machine *m, const double *states) {
     m->data.evaluated = 0;
 }
 
-/* Sensitivities of rates and outputs in a direction of states, inputs, parameters and time. */
+/* Compute the derivatives of rates and outputs in a direction of states, inputs, parameters and time. */
 static int differentiate_values(Machine *m, const unsigned *unknown, size_t unknowns, const unsigned *known, size_t knowns,
                                 const double *seed, double *sensitivity) {
     double direction[VALUES] = {0}, change[VALUES] = {0}, constants[TANGENT_CONSTANTS + 1], *v = m->data.values;
@@ -154,7 +155,7 @@ static int differentiate_values(Machine *m, const unsigned *unknown, size_t unkn
         unsigned r = known[i];
         int is_fixed = !r || (r >= AT_PARAMETERS && r < AT_INDICATORS);
         if (!(is_fixed || (r >= AT_STATES && r < AT_RATES) || (r >= AT_INPUTS && r < AT_OUTPUTS)))
-            return report(m, "there is no derivative by %s, only by states, inputs, parameters and time",
+            return report(m, "there is no derivative with respect to %s, only to states, inputs, parameters and time",
                           r < VALUES ? NAMES[r] : "this");
         direction[r] = change[r] = seed[i];
         full |= is_fixed;
@@ -178,13 +179,13 @@ static int differentiate_values(Machine *m, const unsigned *unknown, size_t unkn
     return 1;
 }
 
-/* Equal Runge-Kutta steps of order 4 over `length`, none longer than the parameter co_simulation.step. */
+/* Advance by `length` in equal Runge-Kutta steps of order 4, which are not longer than the parameter co_simulation.step. */
 static int advance(Machine *m, double time, double length) {
     static const double share[4] = {0.0, 0.5, 0.5, 1.0}, weight[4] = {1.0, 2.0, 2.0, 1.0};
     double *x = m->data.values + AT_STATES, *rate = m->data.values + AT_RATES, begin[STATES + 1], sum[STATES + 1];
     double most = m->data.values[AT_STEP];
     if (!(length >= 0.0) || !isfinite(time) || length / most > MOST_STEPS)
-        return report(m, "a step of %g s from %g s, in steps of %g s, cannot be made", length, time, most);
+        return report(m, "a step of %g s from the time %g s is not possible with a co_simulation.step of %g s", length, time, most);
     double steps = ceil(length / most * (1.0 - 1e-12));
     double h = steps > 0.0 ? length / steps : 0.0;
     for (double n = 0.0; n < steps; n += 1.0) {

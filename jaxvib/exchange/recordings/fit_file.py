@@ -100,7 +100,7 @@ def _run(table: Mapping[str, object], k: int, channels: list[Channel], folder: P
 
 
 def _candidate(table: Mapping[str, object], k: int, channels: list[Mapping[str, object]], first: MeasuredRun) -> PlannedRun:
-    """Return a planned run. It has the channels of the file, some of them at other places, and new channels."""
+    """Return a planned run. Its channels are those of the file, some of them moved to other places, and new ones."""
     field = f"candidate[{k}]"
     for name in table:
         if name not in _CANDIDATE_FIELDS:

@@ -19,8 +19,8 @@ _TWO_LEVELS = 0.9
 
 
 _BAND = (10.0, 1000.0)
-"""Frequencies, Hz, that the velocity of a vibration includes by ISO 20816 for machines above 600 rpm (for slower ones from 2
-Hz)."""
+"""Range of frequencies, Hz, of the velocity of a vibration in ISO 20816, for machines above 600 rpm (for slower machines the
+range begins at 2 Hz)."""
 
 
 class ChannelOverview(NamedTuple):
@@ -31,10 +31,10 @@ class ChannelOverview(NamedTuple):
     - `name`, `unit`; `kinds`: the kinds of channels (see `Channel`) that can have this unit
     - `rate`: sampling rate, Hz, NaN without times; `samples`: number of readings; `start` and `end`: first and last time, s
     - `low` and `high`: smallest and largest reading; `rms`: root mean square of the readings without their mean
-    - `main_frequency`, Hz: frequency of the largest line of the spectrum; `velocity`, m/s: root mean square of the velocity
-      from 10 to 1000 Hz, the band of ISO 20816 for machines above 600 rpm, of a channel of acceleration or velocity. They
-      describe a run at a constant speed, and are NaN for channels without times, with gaps, or with two levels
-    - `missing` and `clipped`: numbers of readings
+    - `main_frequency`, Hz: frequency of the largest line of the spectrum; `velocity`, m/s, of a channel of acceleration or
+      velocity: root mean square of the velocity from 10 to 1000 Hz, the band of ISO 20816 for machines above 600 rpm. Both are
+      valid for a run at a constant speed, and are NaN for channels without times, with gaps, or with two levels
+    - `missing` and `clipped`: numbers of missing and of clipped readings
     - `notes`: sentences about gaps, repairs and problems
     """
 
