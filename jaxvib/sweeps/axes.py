@@ -41,9 +41,10 @@ AxisSpec: TypeAlias = Sequence[Number] | np.ndarray | Mapping[str, Number | int 
 
 
 class Target(NamedTuple):
-    """Target of an axis: the parameter `number` of the scene or, if this is None, an entry of the initial state.
+    """Target of an axis: a parameter of the scene, or an entry of the initial state.
 
-    **Attributes**: `number`; `field` of the initial state and index `entry` in this field, None for all entries.
+    **Attributes**: `number`: the parameter of the scene, None for an entry of the initial state; `field` of the initial state;
+    `entry`: index in this field, None for all entries.
     """
 
     number: NamedNumber | None
@@ -52,12 +53,13 @@ class Target(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """Axis of a study: one or several parameters with a common name, whose value changes from case to case.
+    """Axis of a study: one or several parameters with a common name, whose common value changes from case to case.
 
     **Attributes**
 
-    - `name`, `unit`
-    - `values` (n,), SI; None if values are sampled between `low` and `high`, on a logarithmic scale if `log` is True
+    - `name`, `unit` (SI)
+    - `values` (n,), SI; None if the values are sampled
+    - `low`, `high`: the smallest and the largest value, SI; `log`: True for a logarithmic scale between them
     - `target`: the parameters that the axis changes
     """
 
@@ -79,8 +81,8 @@ class Axis(NamedTuple):
 class Grid(NamedTuple):
     """All cases of a study: all combinations of the values of the axes, and for each combination all samples.
 
-    **Attributes**: `axes`; `samples`: number of samples, 0 without sampled axes; `seed` and `sampling`: see `samples`; `tile`:
-    number of cases of a chunk along each dimension.
+    **Attributes**: `axes`; `samples`: number of samples, 0 without sampled axes; `seed` and `sampling`: arguments of the
+    function `samples`; `tile`: number of cases of a chunk along each dimension.
     """
 
     axes: tuple[Axis, ...]
@@ -250,11 +252,11 @@ def put_start(state: State, targets: Sequence[Target], values: Array) -> State:
 
 
 def extreme_cases(axes: Sequence[Axis], rates: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Return cases (rates, axes), SI, in the range of all axes: case k has the largest value of rate k.
+    """Return cases (R, axes), SI, in the range of all axes: case k has the largest value of rate k.
 
-    `rates` returns the rates (cases, rates) of cases (cases, axes). The search begins at the best of all corners or, with more
-    than 10 axes, of 1024 random corners. It then changes one axis at a time to the best of its ends and 7 values between them,
-    until no change increases a rate.
+    `rates` is a function that returns R rates (cases, R) for cases (cases, axes). The search begins at the best of all corners
+    or, with more than 10 axes, of 1024 random corners. It then changes one axis at a time to the best of its ends and 7 values
+    between them, until no change increases a rate.
     """
     tried = np.stack([_values_to_try(axis) for axis in axes])
     number = len(axes)

@@ -27,8 +27,9 @@ _STUDIES: dict[str, Study] = {}
 def on_a_cluster(
     study: Study, todo: Iterable[int], *, workers: int | None, scheduler: str | None, timeout: Number
 ) -> Generator[tuple[int, Chunk], None, None]:
-    """Compute chunks by workers, and yield the number and the results of each finished chunk. Only the calling process
-    writes to the store.
+    """Compute the chunks `todo` by workers, and yield the number and the results of each finished chunk.
+
+    The calling process writes the results to the store; the workers do not access it.
 
     If a worker terminates, other workers compute its chunks. If several workers terminated while they computed the same chunk,
     the cases of this chunk have the status "lost".

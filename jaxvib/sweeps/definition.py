@@ -1,4 +1,4 @@
-"""Validated study: its identity, the static arguments of its program, and the statuses of its cases."""
+"""Class of a validated study: its identity, the static arguments of its program, and the statuses of its cases."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ class SweepStatus(eqx.Enumeration):
 class Study:
     """Validated study, see `study`.
 
-    **Attributes**: `scene`; `grid` of the cases; `names` of the `measures`; `plan` of the runs, None without runs; `start` and
-    `mode` of the runs; `tier`; `specs`: the values of the axes as the user wrote them; `forms`: shape and type of each measure
-    in one case; `program`: the digest of the program of a case when the study was created.
+    **Attributes**: `scene`; `grid` of the cases; `names` of the `measures`; `plan`: steps and window of the runs, None without
+    runs; `start` and `mode` of the runs; `tier`; `specs`: the values of the axes as the user wrote them; `forms`: shape and
+    type of each measure in one case; `program`: the digest of the program of a case when the study was created.
     """
 
     scene: Scene
@@ -84,7 +84,7 @@ class Study:
 
     @property
     def batch(self) -> int:
-        """Number of cases of a chunk that are computed at the same time: on an accelerator all, if they are not very many."""
+        """Number of cases that are computed at the same time: on an accelerator all cases of a chunk, up to 262,144."""
         return min(batch_size(), _round_up(self._cases_in_chunk, BATCH_SIZE))
 
     @property
@@ -124,7 +124,7 @@ class Study:
         return digest(self.record)
 
     def placeholders(self, cases: int) -> list[np.ndarray]:
-        """Return arrays of the measures for a number of `cases` that have no values: NaN, or -1 for integers."""
+        """Return an array (cases, ...) for each measure, for `cases` without values: NaN, or -1 for integers."""
         return [np.full((cases, *f.shape), np.nan if np.issubdtype(f.dtype, np.inexact) else -1, f.dtype) for f in self.forms]
 
 
@@ -139,7 +139,8 @@ def digest(value: Plain) -> str:
 
 
 def difference(first: Plain, second: Plain, name: str = "") -> tuple[str, Plain, Plain] | None:
-    """Return the path of the first difference between two plain values, and the two entries there; None for equal values."""
+    """Return the path of the first difference between two plain values, and the two different entries; None for equal
+    values."""
     if isinstance(first, dict) and isinstance(second, dict) and first.keys() == second.keys():
         pairs = [(f"{name}.{key}" if name else key, first[key], second[key]) for key in first]
     elif isinstance(first, list) and isinstance(second, list) and len(first) == len(second):

@@ -51,6 +51,8 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
     - two axes or more: a map, of regimes if they were measured
     - random samples as the only axis: the distribution of the first measure
     - one axis: up to four measures as points; with samples, the shares of regimes if they were measured
+
+    For a measure with several values in a case, such as an amplitude for each coordinate, the largest value is shown.
     """
     opened = Store(Path(store))
     dims = opened.dims
@@ -128,7 +130,8 @@ def plot_map(
     **Arguments**
 
     - `measure`: its name in the store; default: the regime if it was measured, otherwise the first measure
-    - `x`, `y`: names of axes; of all other axes the middle value is shown
+    - `x`, `y`: names of the axes of the map; default: the rotor speed and the first other axis. The map shows the cases in
+      which all other axes have their middle value. For a measure with several values in a case, the largest value is shown
     - `theory`: True to draw lines on which exact jams have a fold or lose their stability, computed by
       `branches(scene, exact=True)`; this needs the rotor speed as one of the axes
 
@@ -279,7 +282,7 @@ def _is_log(store: Store, axis: str) -> bool:
 
 
 _USUAL_SIZES = {"m": 0.01, "N/m": 1e5, "N": 100.0}
-"""Usual values, SI, by unit; the display unit of a figure is chosen for them."""
+"""Typical values, SI, by unit. The display unit of a figure suits this value, not the values in the store."""
 
 
 def display_unit(store: Store, name: str) -> tuple[str, float]:

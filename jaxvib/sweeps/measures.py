@@ -21,7 +21,8 @@ from jaxvib.steady.measures import vibration_measures
 from optimize.quantities.quantity import Quantity
 
 _SETTLED_SPEED_SHARE = 0.01
-"""Difference between a mean load speed and the final load speed, relative to the rotor speed, below which loads are settled."""
+"""Difference between a mean speed and the final speed of a load or rotor, relative to the rotor speed, below which it is
+settled."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,8 @@ def _regime_measure(name: str, unit: str, field: str, meanings: tuple[str, ...] 
 def _settling_time(run: BatchRun) -> Array:
     """Return the end, s, of the last part of the run in which the speed of a load or rotor differs from its final speed.
 
-    If the speed still changes within the window, the end of the run is returned.
+    If a speed still changes within the window, the end of the run is returned. For a scene that is not plain
+    (`Scene.is_plain`), differences are relative to the largest speed in the window, otherwise to the rotor speed.
     """
     last = run.measured.load_speed
     if run.regime is None:
@@ -155,7 +157,7 @@ RUN_MEASURES = {
 
 - regime (see `regime`), jam mode (0: not jammed), ripple and rotor speed. They need a scene with one exciter that
   turns anticlockwise and has loads and no unbalance
-- load speeds, amplitudes and foundation force (zero to peak), drift (see `AbstractMeasured`)
+- mean load speed, amplitudes and foundation force (zero to peak), drift (see `AbstractMeasured`)
 - peak displacement and peak force: the largest displacement of each coordinate from rest and the largest magnitude of the
   foundation force of the whole run (start, passage through resonances, stop), as the quantity `peak_force`
 - relative rotation: the largest difference between the angles through which two loads, or rotors without loads, turn in the

@@ -25,13 +25,14 @@ from jaxvib.sweeps.measures import Measure, RunMeasure
 from optimize.quantities.evaluation import Evaluation
 
 _STATES_IN_WINDOW = 1024
-"""Number of states in the measuring window of a run."""
+"""Number of stored states in the measuring window of a run."""
 
 _STATES_PER_TURN = 8
-"""Smallest number of states per turn of the rotor. Jammed loads turn more slowly; there are more states per turn of a load."""
+"""Smallest number of stored states per turn of the rotor. Jammed loads turn more slowly, with more states per turn."""
 
 _SLOW_PERIODS = 20
-"""Length of the window in periods of the lowest natural frequency, as in `simulate`, which allows twice as many turns."""
+"""Length of the window in periods of the lowest natural frequency, as in `simulate`. The window has at most 128 turns of the
+fastest rotor (in `simulate` 256)."""
 
 _CASES_PER_BLOCK = 64
 """Number of cases whose rates are computed together in the search for the fastest and the slowest case."""

@@ -1,4 +1,4 @@
-"""Seals of a store: digests of its files, and the lock of the process that writes.
+"""Seals of a store: digests of its files, and the lock of the process that writes to the store.
 
 The folder `.seals` contains
 

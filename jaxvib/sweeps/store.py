@@ -93,9 +93,9 @@ class Store:
             raise self.damaged(f"{type(error).__name__}: {error}") from error
 
     def damaged(self, what: str) -> InputError:
-        """Return the error for a store that cannot be used."""
+        """Return the error for a folder that is not a store, or for a damaged store; `what`: the reason."""
         return InputError(
-            "store", f"is {quoted(str(self.path))}, which is not the store of a sweep, or a damaged one ({what}); name another"
+            "store", f"is {quoted(str(self.path))}, which is not the store of a sweep, or is damaged ({what}); give another one"
         )
 
     @classmethod

@@ -171,7 +171,7 @@ def _plain_number(value: Number | str) -> str | float:
 def _name_measures(measure: Measures) -> tuple[tuple[str, ...], tuple[Measure, ...]]:
     """Return a unique name for each measure, and the measures.
 
-    The mode is appended to the names of quantities that differ only in it.
+    The number of the jam mode is appended to the names of quantities that differ only in the mode.
     """
     if isinstance(measure, Mapping):
         named = {str(name): measure_of(m, f"measure.{name}") for name, m in measure.items()}

@@ -78,8 +78,8 @@ class Sweep(Result):
     - `store`: path of the store
     - `cases`: number of cases
     - `counts`: number of cases with each status
-    - `regimes`: number of finished cases in each regime, with the jam mode, the most frequent first; empty if neither was
-      measured, or if files were damaged when this call began
+    - `regimes`: number of finished cases in each regime, with the jam mode, the most frequent first; empty if neither regimes
+      nor jam modes were measured, or if files were damaged when this call began
     - `computed`: number of cases computed in this call; `seconds`: their time, including compilation
     - `damaged`: number of cases whose files were damaged or incomplete; `sweep` has computed them again, `open_sweep` counts
       them as missing
@@ -162,8 +162,8 @@ def sweep(
     """Compute all cases of a study and store the results on disk. If the store of the same study exists, it is continued.
 
     - Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask
-    - A finished chunk is written at once and is not lost if the process is terminated; a chunk with damaged files is computed
-      again
+    - Each finished chunk is written immediately, and is not lost if the process is terminated. A chunk with damaged files is
+      computed again
     - The results of a case do not depend on the order of the cases, on the number of workers, or on restarts. The steps of runs
       are planned for all cases of the study together
 
@@ -175,7 +175,8 @@ def sweep(
       run (`jaxvib.sweeps.measures.RUN_MEASURES`): "run.regime", "run.mode", "run.load_speed", "run.amplitude",
       "run.foundation_force", "run.settling_time", ...; or a mapping from names in the store to such measures
     - `store`: a folder, usually with the ending ".zarr"
-    - `tier` of quantities of a jam: "leading", "exact" or "time"; default: that of each quantity
+    - `tier` of quantities of a jam: "leading" (light loads), "exact" (exact orbits) or "time" (full equations); default: the
+      tier of each quantity
     - `start`, `mode`: initial state of runs, "rest" (the default), "spin_up" (drives of constant speed are accelerated from
       rest during half of the run), or "jam" for a start near the jam mode `mode`; axes whose names begin with
       "start." change entries of this state
@@ -183,9 +184,9 @@ def sweep(
     - `steps`: number of equal steps of a run, the same in all cases; default: one for each radian of the fastest motion
     - `samples`: number of samples; typical: 1000 to 100,000; `sampling`: "low_discrepancy" or "random"; `seed` of the samples
     - `chunk`: number of cases that are computed and written together; a store is continued only with the same number.
-      Typical: the default, about a second of computation. With smaller chunks an interruption loses fewer cases, but there are
-      more file operations. An accelerator computes a whole chunk at once, up to 262,144 cases; give a chunk that fills
-      its memory
+      Typical: the default, 512 to 16,384 cases, about a second of computation. With smaller chunks an interruption loses fewer
+      cases, but there are more file operations. An accelerator computes all cases of a chunk together, up to 262,144; give a
+      chunk that fills its memory
     - `workers`: number of processes on this computer; or `scheduler`: address of a Dask scheduler ("tcp://10.0.0.1:8786"),
       which must answer within `timeout`, s. Both need the extra `cluster`
     - `report`: a function that is called with a `Progress` after each chunk
@@ -323,7 +324,7 @@ def _cases_of_chunk(new_study: Study, chunk: int) -> int:
 
 @validated
 def open_sweep(store: str | Path) -> Sweep:
-    """Open the store of a finished or running study. Every file is read once in order to find damaged chunks.
+    """Open the store of a finished or running study. Every file is read once, to find damaged chunks.
 
     **Arguments**: `store`: the folder of the study.
 

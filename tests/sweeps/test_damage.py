@@ -138,7 +138,7 @@ def layout_without(store, text):
 def test_damaged_metadata_are_refused(copy, harm):
     harm(copy)
     for ask in (lambda: run_study(STUDY, copy), lambda: jv.open_sweep(copy)):
-        with pytest.raises(jv.InputError, match="not the store of a sweep, or a damaged one"):
+        with pytest.raises(jv.InputError, match="not the store of a sweep, or is damaged"):
             ask()
 
 
