@@ -88,7 +88,8 @@ def linear_combination(weights: Array, stages: Array) -> Array:
 class Dopri8Interpolation(StepInterpolation):
     """Motion within a step: y0 + (t - t0) sum_j w_j(s) k_j with the fraction s of the step and the rates k_j of the stages.
 
-    The polynomials w_j are diffrax's; `stages` is (10, n), see `dense_stages` and `ravel`.
+    The polynomials w_j are those of diffrax. **Attributes**: `y0`, the state at the start of the step; `stages` (10, n), see
+    `dense_stages` and `ravel`.
     """
 
     y0: Y
@@ -107,7 +108,7 @@ class Dopri8Interpolation(StepInterpolation):
 
 class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
     """Common part of the forms of Dormand and Prince's pair: everything except the computation of stages and of states within
-    a step."""
+    a step. `wrap`: function that is applied to the state after each step, or None."""
 
     wrap: Callable[[Y], Y] | None = None
     tableau: ClassVar[diffrax.ButcherTableau] = _TABLEAU

@@ -219,7 +219,11 @@ def _with_replay(inputs: _Inputs, controller: diffrax.AbstractStepSizeController
 
 
 class _Record(NamedTuple):
-    """Record of a run: its number of steps, the end of each step (max_steps,), and states at regular numbers of steps."""
+    """Record of a run.
+
+    **Attributes**: `steps`: its number of steps; `ends` (max_steps,): the end of each step, s; `states`: the states after every
+    n-th step, see `_spacing`.
+    """
 
     steps: Array
     ends: Array
@@ -227,9 +231,12 @@ class _Record(NamedTuple):
 
 
 class _Slopes(NamedTuple):
-    """State of the backward pass: derivatives with respect to the state, the arrays of equations and arguments, the end, the
-    first step, the jumps of the field and the saved times; and the index of the last saved time that the pass has not reached
-    yet."""
+    """State of the backward pass.
+
+    **Attributes**: derivatives with respect to the `state`, the `numbers` (arrays of arguments and equations), the `end`, the
+    `first_step`, the `jumps` of the field and the saved `times`; `ahead`: index of the last saved time that the pass has not
+    reached yet.
+    """
 
     state: Y
     numbers: PyTree[Array | None]
@@ -440,8 +447,11 @@ def _jump_times(controller: diffrax.AbstractStepSizeController) -> Array | None:
 
 
 class _Saved(NamedTuple):
-    """Derivatives with respect to all saved states: ascending times with the derivatives at these times; the derivative with
-    respect to the state at the end; and the index of each time in the concatenated lists of times."""
+    """Derivatives with respect to all saved states.
+
+    **Attributes**: `times`, ascending, and `states`: the derivatives at these times; `last`: the derivative with respect to the
+    state at the end; `places`: index of each time in the concatenated lists of times.
+    """
 
     times: Array
     states: Y

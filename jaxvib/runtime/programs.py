@@ -101,9 +101,9 @@ def _is_simple(tracer: object) -> bool:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class _CallSignature:
-    """Call of a cached function: the function, and its arguments with slots in place of arrays.
+    """Call of a cached function.
 
-    `outputs` contains the structure of the last result.
+    **Attributes**: the `function`; its `arguments` with slots in place of arrays; `outputs`: the structure of the last result.
     """
 
     function: CachedFunction
@@ -340,10 +340,13 @@ def _batch(
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class _LinearizationPoint:
-    """Point of a linearization: the arguments, the residuals and the types of the floating-point outputs.
+    """Point of a linearization.
 
-    The residuals are all outputs if the function has `outputs_from_solution`. JAX formats the parameters of primitives for
-    error messages whenever it batches them; `repr=False` avoids the formatting of all numbers.
+    **Attributes**: the `call`; `active`: True for arrays with a tangent; `arrays` of the arguments; `residuals` of the reverse
+    derivative, or all outputs if the function has `outputs_from_solution`; `types` of the floating-point outputs.
+
+    JAX formats the parameters of primitives for error messages whenever it batches them; `repr=False` avoids the formatting of
+    all numbers.
     """
 
     call: _CallSignature

@@ -62,15 +62,16 @@ class PackedSystem(eqx.Module):
       keeps their differences
     - `batch`: True if many runs advance as one batch
     - `contacts` of the scene, a second part of `args`, see `jaxvib.motion.integration.contacts`; default: none
-    - `solver`; default: `method`
+    - `solver` with which the equations will be integrated; default: that of `method`
 
     **Attributes**
 
     - `program`: jaxpr of the equations, on scalars if `is_scalarized`, otherwise on arrays; None if this version of JAX gives
       no access to jaxprs
-    - `size`: number of entries of the state; `is_on_scalars`: True if the state is a tuple of scalars
+    - `size`: number of entries of the state; `treedef` and `shapes` of its arrays; `is_on_scalars`: True if the state of the
+      integrator is a tuple of scalars
     - `has_fences`: True if intermediate values are computed only once, see `fenced`
-    - `args`: arguments of `term`
+    - `args`: arguments of `term`; `has_contacts`: True if they contain `contacts`
     """
 
     args: Args
