@@ -17,7 +17,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, Onto, SpeedUnit, quantity_text
 from jaxvib.equations.forces import normal_force
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import on_body, read_place
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -315,10 +315,11 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
         **Arguments**: `at` and `body` as in `ellipse`; typical: (1.2, 0.3); `part`: "window", the end of the run, or "all".
 
-        **Returns** `PointMotion`. **Raises** `InputError` for a place that the machine does not have, and for "all" if the run
-        kept only its window.
+        **Returns** `PointMotion`. **Raises** `InputError` for a place that the machine does not have, for another `part`, and
+        for "all" if the run kept only its window.
         """
         self.require_single()
+        require_one_of(part, ("window", "all"), "part")
         trajectory = self.window if part == "window" else self.trajectory
         if trajectory is None:
             raise InputError("part", "is 'all', but the run kept only its window; simulate with save='all'")

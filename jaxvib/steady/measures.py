@@ -17,7 +17,7 @@ from jaxvib.display import GRAVITIES, quantity_text
 from jaxvib.equations.jammed_bodies import friction_on_light_loads
 from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model, peak_force, rotating_direction
 from jaxvib.equations.torque_balance import resultant_of
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import BodyPoint, Place, on_body, read_place
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
@@ -52,14 +52,12 @@ _MIN_SLIP = 1e-4
 """Slip n - Omega, relative to n, below which the torque is computed from the dissipation of the carrier. At this slip both
 ways to compute the torque have a relative rounding error of 1e-12."""
 
-
 _NEGLIGIBLE = 1e-9
 """Fraction of the largest stroke or force below which a value is a rounding error and is not shown."""
 
 _LARGEST_TRANSMISSIBILITY = 1e4
 """Largest ratio of forces that is shown. At a larger ratio the loads balance one another, and only a decaying motion is
 left."""
-
 
 _MAX_ACCELERATION, _MAX_THROW_NUMBER = 8.0, 8.0
 """Acceleration, g, and throw number above which `VibrationMeasures.notes` doubts a vibration: values usual in practice are 3 to
@@ -101,7 +99,7 @@ def vibration_zone(
     The built-in limits are values usual in practice. They were not compared with the text of the standard: use `limits` if
     a contract depends on them.
 
-    **Returns** a letter. **Raises** `InputError` for a negative velocity, and for limits that do not ascend.
+    **Returns** a letter. **Raises** `InputError` for a negative velocity, another name, and limits that do not ascend.
 
     >>> vibration_zone("3 mm/s"), vibration_zone("3 mm/s", supports="rigid")
     ('B', 'C')
@@ -111,6 +109,8 @@ def vibration_zone(
     Source: ISO 20816-3 defines the zones.
     """
     size = float(number(velocity, "m/s", "velocity", low=0.0))
+    require_one_of(machine, ("medium", "large"), "machine")
+    require_one_of(supports, ("rigid", "flexible"), "supports")
     ends = ZONE_LIMITS[machine, supports] if limits is None else np.asarray(numbers(limits, "m/s", "limits", 3, low=0.0))
     if np.any(np.diff(ends) < 0.0):
         raise InputError("limits", f"are {', '.join(f'{each:g}' for each in ends)} m/s; they must ascend")

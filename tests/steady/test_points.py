@@ -212,6 +212,8 @@ def test_run_without_a_trajectory_refuses_its_whole_motion():
     run = run_of(exciter((0.0, 0.5)))
     with pytest.raises(jv.InputError, match="part is 'all', but the run kept only its window"):
         run.point(part="all")
+    with pytest.raises(jv.InputError, match="part is 'end'; allowed: window, all"):
+        run.point(part="end")
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,18 @@ def test_zones_change_at_the_boundaries_of_the_standard():
     assert [jv.vibration_zone(v, machine="large", supports="rigid") for v in (2e-3, 3e-3, 5e-3, 8e-3)] == list("ABCD")
 
 
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"machine": "small"}, "machine is 'small'; allowed: medium, large"),
+        ({"supports": "soft"}, "supports is 'soft'; allowed: rigid, flexible"),
+    ],
+)
+def test_zones_of_other_machines_and_supports_are_refused(given, says):
+    with pytest.raises(jv.InputError, match=says):
+        jv.vibration_zone(3e-3, **given)
+
+
 def flown(u, w, slope, periods):
     """Mean speed of a particle along a deck by small steps: it sticks while pressed, flies otherwise."""
     gx, gy = -G * np.sin(slope), -G * np.cos(slope)
