@@ -1,4 +1,4 @@
-"""Common parts of benchmarks: the measured machine, the clock, the rows of the table, the processor."""
+"""Common parts of benchmarks: the computer, timing functions, and the rows of the table."""
 
 from __future__ import annotations
 

@@ -1,11 +1,12 @@
-"""The design search against searches without gradients, on a chain of platforms with every spring free.
+"""Search of designs by gradients compared with searches without gradients, for a chain of platforms with all springs free.
 
-Asked is a small foundation force per amplitude of the chain's ends in its highest odd jam mode with springs that differ little
-from those that are there: (force per amplitude / 1 N/mm)^2 + the mean of (ln k/k0)^2. All searches see the same objective
-between the same bounds and follow the jam from a near design; designs without it count as infinitely bad.
+The objective is a small foundation force per amplitude of the ends of the chain, in its highest odd jam mode, with springs that
+differ little from the original ones: (force per amplitude / 1 N/mm)^2 + mean of (ln k/k0)^2. All searches have the same
+objective and the same bounds, and follow the jam from a nearby design. A design without this jam has an infinite objective.
 
-What is compared is when each has first come within 1 % of the least value that any of them found: in seconds and in
-evaluations, of a value with its gradient where gradients are used, of a value elsewhere. Programs are compiled before.
+The result of a search is the effort until it is first within 1 % of the smallest value that any search found: the time, and the
+number of evaluations (of the value with its gradient for searches with gradients, otherwise of the value). Programs are
+compiled before.
 """
 
 from __future__ import annotations

@@ -1,13 +1,15 @@
-"""Cost of a run-up at 1 % error in amplitude: the averaged equations against the full ones.
+"""Cost of a run-up with an error of 1 % in amplitude: averaged equations compared with full equations.
 
     python benchmarks/engine.py --only envelope
 
-For every solver the loosest tolerance that still gives 1 % is found first, then the runs are timed in turn, best of several,
-compile and run time apart, called as an optimizer would: under `jax.jit`, the amplitudes at the end asked for. Ratios travel
-between machines, absolute times do not. The error is the largest difference of
-the platforms' amplitudes to a run at tolerance 1e-9, relative to the greatest amplitude of the platform: in each 64th of the
-run (the modulus of the analytic signal, by Fourier transform; not in the first and the last, where it has no
-neighbours), and as measured at the end. The machine is the two-mass one of the antiphase paper.
+For each solver the loosest tolerance with an error below 1 % is determined first. Then the runs are timed in turn, as an
+optimizer calls them: under `jax.jit`, with the amplitudes at the end as the result. The time is the shortest of several runs,
+without compilation. Ratios of times hardly depend on the computer.
+
+The error is the largest difference of the amplitudes of the platforms from a run with the tolerance 1e-9, relative to the
+largest amplitude of the platform. It is evaluated in each 64th part of the run except the first and the last one (the amplitude
+there is the modulus of the analytic signal, by Fourier transform), and for the amplitudes measured at the end. The machine is
+the two-mass machine of the antiphase paper.
 """
 
 from __future__ import annotations

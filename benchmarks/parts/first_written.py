@@ -1,6 +1,7 @@
-"""diffrax as its documentation writes it, on the State itself, in a process without flags: what `common.as_first_written` runs.
+"""Integration by diffrax as in its documentation, with `State` as the state, in a process without flags of XLA.
 
-Reads a task as JSON on stdin, writes rows [name, seconds, error, compile] as JSON on stdout.
+`common.as_first_written` starts this program. It reads a task as JSON from stdin, and writes rows [name, seconds, error,
+compile] as JSON to stdout.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Cost of 1, 10, 100, 1000 loads: an evaluation of the vector field, and a time integration; no more than their number.
+"""Cost of 1, 10, 100 and 1000 loads: an evaluation of the vector field, and a time integration.
 
     python benchmarks/engine.py --only loads
 
-The field is evaluated many times inside one compiled loop, so that the cost of calling into JAX does not count; each
-evaluation uses the last one's result, so that none is left out. The integration takes equal steps, each load has its own angle
-from the start. Compile time is told apart; the fastest of several runs counts.
+The vector field is evaluated many times within one compiled loop, so that the time of calls into JAX has no influence. Each
+evaluation uses the result of the previous one; the compiler can therefore omit none. The integration has equal steps, and each
+load starts at another angle. Times of compilation are separate; the run time is the shortest of several runs.
 """
 
 from __future__ import annotations

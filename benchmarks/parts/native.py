@@ -1,10 +1,11 @@
-"""The two-mass machine in native loops (numba), written by hand: what the engine is measured against.
+"""Reference for the integration engine: the two-mass machine in hand-written native loops (numba).
 
-Fixed-step Dormand-Prince 8 (the tableau of diffrax's Dopri8), unrolled, sine and cosine as polynomials:
+The method is that of Dormand and Prince of order 8 with fixed steps (the coefficients of diffrax's Dopri8), unrolled; sine and
+cosine are polynomials:
 
-- `single`: one run, scalar
-- `scalar_ensemble`: many runs, one after another on every core (`prange`)
-- `simd_ensemble`: many runs, blocks of lanes whose inner loops become vector instructions
+- `single`: one run, with scalars
+- `scalar_ensemble`: many runs, one after another on each core (`prange`)
+- `simd_ensemble`: many runs, in blocks whose inner loops become vector instructions
 """
 
 from __future__ import annotations

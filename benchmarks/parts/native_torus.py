@@ -1,8 +1,8 @@
-"""Two balls in a torus in a native loop (numba), written by hand: what captures are measured against.
+"""Reference for captures: two balls in a torus in a hand-written native loop (numba).
 
-The equations of `torus_balls` with `RollingFriction(direction="along")`, `Gravity(along="axis")` and `StaticImbalance`. The
-acceleration of the rotor is solved for once, as if every ball pressed on its wall, where the engine looks at the sign of its
-force first: the same wherever they do.
+The equations are those of `torus_balls` with `RollingFriction(direction="along")`, `Gravity(along="axis")` and
+`StaticImbalance`. The loop solves for the accelerations as if every ball were pressed against its wall. The engine first
+determines the sign of the contact force; both agree while all balls are pressed against the wall.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Cost of exact jams: collocation with the carrier eliminated against other ways to the same orbits, at the same accuracy.
+"""Cost of exact jams: collocation without the carrier's unknowns, compared with other methods at the same accuracy.
 
     python benchmarks/engine.py --only orbits
 
-Peers: shooting with RK4, jaxcont's collocation of the whole state (left out where it is not installed), SciPy's solve_bvp.
-Compile and run time apart, the best of several runs; ratios travel between machines, absolute times do not. The machine is
-the two-mass one of the antiphase paper with eps = 0.05.
+The other methods are shooting with RK4, collocation of the whole state by jaxcont (if it is installed), and SciPy's solve_bvp.
+Times of compilation are separate; the run time is the shortest of several runs. Ratios of times hardly depend on the computer.
+The machine is the two-mass machine of the antiphase paper with eps = 0.05.
 """
 
 from __future__ import annotations

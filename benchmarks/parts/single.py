@@ -1,9 +1,10 @@
-"""One run, how its time grows with its length, and an ensemble: the integrator against others at equal achieved error.
+"""Times of one run, of runs of increasing length, and of an ensemble, compared with other integrators at equal achieved error.
 
-Run by engine.py. The machine is the two-mass one of the antiphase paper with one load, eps = 0.05, rotor speed 5.1779, started
-at y = (-1, 1), load speed 1. The error is the largest one in the state at the end, angle in rad; every contender's step or
-tolerance is made smaller until it is reached, then the fastest of several runs counts. The ensemble has
-rotor speeds from 3 to 6; diffrax runs a share of them only, spread over the same speeds, and its time is scaled up.
+Called by engine.py. The machine is the two-mass machine of the antiphase paper with one load, eps = 0.05 and the rotor speed
+5.1779; it starts at y = (-1, 1) with the load speed 1. The error is the largest error of the state at the end, with angles in
+rad. The step or tolerance of each method is reduced until this error is reached; the time is then the shortest of several runs.
+The ensemble has rotor speeds from 3 to 6. diffrax computes only a part of the ensemble, at speeds from the same range, and its
+time is scaled to the whole ensemble.
 """
 
 from __future__ import annotations

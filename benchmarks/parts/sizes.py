@@ -1,7 +1,7 @@
-"""Cost by size of the machine, and time of first answers: rows of the table of engine.py.
+"""Cost by size of the machine, and time of first results: rows of the table of engine.py.
 
-Run by engine.py: platforms and equal loads in CPU seconds, first answers in seconds of the clock, in processes of
-their own. `trials/large_machines.py` measures more sizes and compares with a dense solution.
+Called by engine.py. Times for platforms and equal loads are CPU times; times of first results are elapsed times in new
+processes. `trials/large_machines.py` measures more sizes and compares with a dense solution.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Gradients: of a run by every way there is, their memory over long runs, and of leading-order designs.
+"""Gradients of a run by all available methods, their memory for long runs, and gradients of leading-order designs.
 
-Run by engine.py. The machine and its start are those of single.py.
+Called by engine.py. The machine and its start are those of single.py.
 """
 
 from __future__ import annotations

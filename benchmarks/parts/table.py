@@ -1,6 +1,8 @@
-"""Results of engine.py as a markdown table and as figures; from its JSON alone too.
+"""Results of engine.py as a Markdown table and as figures, also from its JSON file.
 
-PYTHONPATH=benchmarks python -m parts.table out/engine.json      # writes engine.md, engine.png, memory.png beside it
+    PYTHONPATH=benchmarks python -m parts.table out/engine.json
+
+The command writes engine.md, engine.png and memory.png to the folder of the JSON file.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Large batches on an accelerator, in multiples of two cores of the same computer; compile time apart.
+"""Times of large batches on an accelerator, relative to two cores of the same computer, without compilation.
 
     python benchmarks/trials/accelerator.py [--quick] [--out FOLDER]
 
-The work is 1e6 runs with full equations (`ensemble`, 200 s each), a sweep of 65,536 runs with its store, 1e6 leading-order
+The batches are 1e6 runs with full equations (`ensemble`, 200 s each), a sweep of 65,536 runs with its store, 1e6 leading-order
 designs with gradient, 1e5 exact orbits, and 1e4 exact orbits with their multipliers. A process on two cores computes every
-hundredth run and every tenth orbit; its time is scaled up. The difference is the largest one between results of both, relative
-to the largest result. --quick computes a thousandth, to see that it runs. Where JAX finds no accelerator both columns are of
-the CPU.
+hundredth run and every tenth orbit; its time is scaled to the whole batch. The difference is the largest difference between the
+results of both, relative to the largest result. --quick computes a thousandth of each batch, as a test of the program. If JAX
+finds no accelerator, both columns are of the CPU.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Reliability of error estimates: share of runs whose estimated error is below the true one, and of broken accuracies.
+"""Reliability of error estimates: share of runs whose estimated error is below the true one, and of missed accuracies.
 
     python benchmarks/trials/estimates.py --scenes 30 --out out
 
-Random scenes of each kind below, in float64 and float32, to a random tolerance and to a random accuracy. The true error is the
-distance, as `Run.error` measures it, from a run in float64 to the tolerance 1e-14, compared at the very times that the run
-reports, less what that run differs by from one to 1e-13: chaotic motions have no reference beyond that. Numbers change from
-scene to scene and programs do not: two for each kind.
+Random scenes of each kind below are integrated in float64 and float32, to a random tolerance and to a random accuracy. The true
+error is the distance (as in `Run.error`) from a run in float64 with the tolerance 1e-14, at the same times, minus the distance
+of this reference from a run with the tolerance 1e-13: chaotic motions have no more accurate reference. The scenes of a kind
+differ only in their parameters, so that two programs are sufficient for each kind.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Functional mock-up units: time of the right-hand side in C beside a native loop, and time to write a unit.
+"""Functional mock-up units: time of the right-hand side in C relative to a native loop, and time to write a unit.
 
     pip install numba
     python benchmarks/trials/exported_units.py
 
-The right-hand side is that of the published machine with one load, in steps of co-simulation through the interface of the unit;
-the native loop is hand-written (`parts/native.py`). Both are times per evaluation of the equations.
+The right-hand side is that of the published machine with one load. It is evaluated in steps of co-simulation through the
+interface of the unit. The native loop is hand-written (`parts/native.py`). Both times are for one evaluation of the equations.
 """
 
 from __future__ import annotations

@@ -1,20 +1,21 @@
-"""Hostile Python calls: does every one end in one sentence about the input, a named status or a right answer?
+"""Trial of public functions with hostile arguments: each call must end in a message, a named status or a result.
 
     python benchmarks/trials/hostile_calls.py --out out
     python benchmarks/trials/hostile_calls.py --only simulate --list
 
-Every public function, every constructor that users call and every method of results is called once for each parameter and
-each hostile value, the other arguments valid, and once for each number and scene with these traced by JAX. A call ends
+Every public function, every constructor that users call and every method of results is called once for each parameter and each
+hostile value, with valid other arguments, and once for each number and scene that JAX traces. A call ends
 
 - refused: `InputError` or `ComputationError`, or Python's `TypeError` for a missing argument
-- answered: with a result whose numbers are finite or whose status says why they are not
-- raw: in any other error, or in a warning
+- answered: with a result whose numbers are finite, or whose status states why they are not
+- raw: with any other error, or with a warning
 - hang: after more than `PATIENCE` CPU seconds
 - silent: with numbers that are not finite and no status, or with a Boolean, a complex number, a date, bytes or masked values
-  taken for a number
+  accepted as a number
 
-Each raw, hanging or silent call is printed as the line that repeats it; the exit code is their presence. With `--out`, every
-finished function adds a line to `hostile_calls.jsonl` in that folder, and a further run goes on after the last one.
+Each raw, hanging or silent call is printed as a line of Python that repeats it; the exit code is 1 if there is one. With
+`--out`, every finished function adds a line to `hostile_calls.jsonl` in that folder, and another call of the program continues
+after the last line.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Ctrl-C at random moments of a command: does it end with one line, soon, and without a crash?
+"""Trial of Ctrl-C at random times of a command, which must end soon, with one line and without a crash.
 
     python benchmarks/trials/interrupts.py cost --count 60
     python benchmarks/trials/interrupts.py audit --count 40 --cold --within 60

@@ -1,27 +1,29 @@
-"""Share of changes in the packages that the tests see, folder by folder.
+"""Share of changes in the source code that the tests detect, for each folder.
 
     python benchmarks/trials/mutants.py --count 30 --out out/mutants
     python benchmarks/trials/mutants.py --folder jaxvib/steady optimize/search --count 30 --seed 1
 
 A mutant is the package with one change in one line:
 
-- a sign, a factor, an index, a comparison, a sine in place of a cosine, a smaller in place of a larger
-- a term of a sum, a branch of an `if` or a keyword argument of a call that is dropped
-- two neighbouring arguments of a call that are swapped
+- another sign, factor, index or comparison; a sine in place of a cosine; a minimum in place of a maximum
+- without a term of a sum, a branch of an `if` or a keyword argument of a call
+- with two neighbouring arguments of a call swapped
 
-Mutants are drawn from every folder of `jaxvib` and `optimize`, or from each `--folder`: `--count` in each, of all kinds alike,
-in an order that follows from the seed and the change itself: a change of one file leaves the mutants of others as they were.
+Mutants are chosen at random from every folder of `jaxvib` and `optimize`, or from each `--folder`: `--count` in each, with
+equal numbers of all kinds. Their order depends only on the seed and on the change itself; a change of one file therefore does
+not change the mutants of other files.
 
-A mutant is given to the `--tests` tests that are most likely to see it, and to the examples of its own file. Those of the test
-file of its name come first, then those whose text names the changed function or class and those that name a public part of its
-module; the shorter of two equal tests comes first. The first test that fails ends it: the shares are lower bounds of those
-of the whole suite.
+A mutant is tested by the examples of its own file and by the `--tests` tests that most probably detect it: first those in the
+test file of its name, then those whose text names the changed function or class, then those that name a public part of its
+module. Of two equal tests the shorter one comes first. The first failing test ends the mutant. Because only some tests are
+used, the shares are lower bounds of those of the whole test suite.
 
-A mutant is killed when a test fails or when the process dies. Survivors, those whose tests did not end in `--seconds` of
-CPU time or `--wall` seconds, and those without a test are printed with their changes, to be explained or killed by a new test.
-After `--minutes` no mutant is started, and tests that still run are ended; mutants that were not run are printed. All results
-are kept in `--out`, so that a second call goes on where the first was stopped; `--again` runs the survivors anew, after tests
-were added. Processes are forked from one that has imported the libraries, but nothing of the packages.
+A mutant is killed if a test fails or if the process crashes. The following mutants are printed with their changes, to be
+explained or killed by a new test: survivors, mutants whose tests did not end within `--seconds` of CPU time or `--wall`
+seconds, and mutants without a test. After `--minutes` no further mutant is started, and running tests are ended; mutants that
+were not run are printed. All results are stored in `--out`; another call of the program continues from there. `--again` repeats
+the survivors after tests were added. Processes are forked from a process that has imported the libraries, but no module of the
+packages.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Mutated files, stores and saved results: does each end in one sentence, or in the right answer?
+"""Trial of mutated files, stores and saved results: each must give the right result or one message about the input.
 
     python benchmarks/trials/mutated_files.py studies --count 400
     python benchmarks/trials/mutated_files.py scenes --count 2000
@@ -7,11 +7,11 @@
     python benchmarks/trials/mutated_files.py stores --count 400
     python benchmarks/trials/mutated_files.py results --count 2000
 
-Each case is drawn by its seed, from `--first` on, and judged by `tests/helpers/mutations.py`. A study, scene, design or
-measurement file is read; of a store one to three files are changed, then it is read, computed on and read again; a saved result
-is changed byte by byte, or prepared anew with odd parts and the right digest. Printed are the failures with their seeds and the
-counts; the exit code is 1 if there is a failure: a raw error, more than 60 s of CPU time, a number that is not the right
-one.
+Each case follows from its seed (the first one is `--first`) and is tested by `tests/helpers/mutations.py`. A study, scene,
+design or measurement file is read. In a store one to three files are changed; then it is read, continued and read again. A
+saved result has changed bytes, or is written with unusual parts and the right digest. The failures with their seeds, and the
+numbers of outcomes, are printed. The exit code is 1 if there is a failure: another error than the allowed ones, more than 60 s
+of CPU time, or a wrong number.
 """
 
 from __future__ import annotations

@@ -1,18 +1,20 @@
-"""Random scenes and mutated files: is every answer right, a named status, or one sentence about the input?
+"""Trial of random scenes and mutated files: each result must be right, a named status, or a message about the input.
 
     python benchmarks/trials/random_scenes.py --scenes 500 --files 5000 --out out
 
-Scenes are drawn from a few kinds, so that few programs are compiled, with numbers over many decades. Of each are asked
+The scenes are of few kinds, so that few programs are compiled, with parameters over many decades. The tests of each scene are
 
-- `jam_modes`: torques balance by the dense complex algebra of `hard_cases.reference_model`, to 1e-8
-- `jam_orbit` of the first mode there is: its state is carried over one turn by SciPy and comes back, to 1e-6
-- `multipliers` of that jam: the largest is that of SciPy's implicit method along the motion, to 1e-6
-- `balance` of two loads and more: the multipliers are those of SciPy's implicit method, to 1e-6
-- `simulate`: the state at the end agrees with SciPy's, to the claimed error and 1e-6
-- the gradient of the foundation force by the stiffnesses agrees with differences to one of two steps, to 1e-4
+- `jam_modes`: the torques balance in the dense complex algebra of `hard_cases.reference_model`, to 1e-8
+- `jam_orbit` of the first existing mode: its state, integrated by SciPy over one turn, returns to itself, to 1e-6
+- `multipliers` of this jam: the largest one agrees with that of SciPy's implicit method along the motion, to 1e-6
+- `balance` of two loads and more: the multipliers agree with those of SciPy's implicit method, to 1e-6
+- `simulate`: the state at the end agrees with that of SciPy, to the estimated error and 1e-6
+- the gradient of the foundation force with respect to the stiffnesses agrees with finite differences for one of two steps, to
+  1e-4
 
-A mutated file is a template or a record whose characters, numbers, lines or words are changed; reading it ends in a scene or
-in an `InputError`. Everything else, warnings and more than 60 s included, is a failure, printed with the seed that repeats it.
+A mutated file is a template or a record with changed characters, numbers, lines or words; reading it must end in a scene or in
+an `InputError`. Every other outcome, including warnings and more than 60 s, is a failure and is printed with the seed that
+repeats it.
 """
 
 from __future__ import annotations

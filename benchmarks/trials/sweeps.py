@@ -6,8 +6,8 @@
     python benchmarks/trials/sweeps.py million --out out
     python benchmarks/trials/sweeps.py memory
 
-The machine is the two-mass one of the antiphase paper in its dimensionless numbers with one load, eps = 0.05. Seconds are those
-of the clock, and CPU time, which does not depend on what else runs.
+The machine is the two-mass machine of the antiphase paper in dimensionless parameters, with one load and eps = 0.05. Both the
+elapsed time and the CPU time are printed; the CPU time hardly depends on other programs that are running.
 """
 
 from __future__ import annotations

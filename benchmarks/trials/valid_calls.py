@@ -1,4 +1,4 @@
-"""Valid calls of the whole public surface, which trials of hostile input start from."""
+"""Valid calls of all public functions, from which the trials of hostile input are derived."""
 
 from __future__ import annotations
 
