@@ -265,7 +265,7 @@ def _even_frequencies(scene: Scene, frequencies: Numbers | None) -> np.ndarray:
         highest = float(np.max(np.asarray(estimated_frequencies(scene))))
         if highest == 0.0:
             raise InputError(
-                "frequencies", "is missing; a machine without a natural frequency above 0 has no default; give them"
+                "frequencies", "is missing; a machine without a natural frequency above 0 has no default; give frequencies"
             )
         step = _HIGHEST_FREQUENCY_RATIO * highest / (2.0 * np.pi * _LINES)
         return float(f"{step:.{_DIGITS - 1}e}") * np.arange(1, _LINES + 1)
