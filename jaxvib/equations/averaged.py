@@ -23,8 +23,8 @@ that turn with theta. The averaged equation keeps the slow part of this product 
 
 Only a_j, the forward circular part of the acceleration at the load, drives the load; the backward part averages to zero. All
 loads at one point have the same a. For loads at different stations s_j, B_j = B + s_j T, where B q is the displacement of
-the centre of mass and T q its change per length of the axis; then a_j = a_B + s_j a_T with a_B = e^H B A and a_T = e^H T A. A
-contains w_j' (the reaction of the loads); therefore a, or (a_B, a_T), is the solution of a linear system. With the levers
+the centre of mass and T q its change per length of the axis. Then a_j = a_B + s_j a_T with a_B = e^H B A and a_T = e^H T A. A
+contains w_j' (the reaction of the loads). Therefore a, or (a_B, a_T), is the solution of a linear system. With the levers
 g_j = 1 or (1, s_j), P = e^H B M^-1 B^T e (with stations a 2 x 2 matrix, from B and T), h_j = S_j^2/(4 I_j) and
 f_j = D_j (n - w_j)/I_j
 (the load's angular acceleration without vibration), the system is

@@ -68,9 +68,10 @@ class Growth(Result):
     **Attributes**
 
     - `status`: a `GrowthStatus`
-    - `exponent`: the largest Lyapunov exponent, 1/s, over the later half of the segments, and its `uncertainty`: the largest
-      of the standard error, half of the change of the rate between the quarters of this half, and 0.1 divided by the length of
-      this half (exponents that are closer to each other cannot be separated)
+    - `exponent`: the largest Lyapunov exponent, 1/s, over the later half of the segments
+    - `uncertainty` of the exponent, 1/s: the largest of the standard error, half of the change of the rate between the two
+      quarters of this half, and 0.1 divided by the length of this half. (The last one is needed because exponents that are
+      closer to each other cannot be separated.)
     - `horizon`: the time, s, after which rounding errors have grown to the size of the motion itself, ln(1/eps)/exponent, with
       the relative rounding error eps. A derivative with respect to a parameter has then grown by 1/eps, and predicts nothing
       about a change that is larger than rounding. The horizon is infinite for a regular motion; for an undecided one it is a

@@ -110,9 +110,9 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
       one angle even if this motion is unstable. If this motion settles, its stability is tested by the linearized equations. If
       slightly separated loads would leave it, the status is `would_separate`, and the run is not `settled`. Loads with a
       `ball_radius` that end inside each other have the status `overlapping`, which the effect `LoadContact` prevents
-    - `engine` of the integration: "scalar" if the equations are computed on scalars, which is faster for small states, or
-      "array", for states of more than 32 entries, machines with 4 or more coordinates, exciters with 4 or more loads, and very
-      long equations
+    - `engine` of the integration: "scalar" if the equations are computed on scalars, which is faster for small states,
+      otherwise "array". Arrays are used for states of more than 32 entries, machines with 4 or more coordinates, exciters with
+      4 or more loads, and very long equations
     - `evaluations` of the vector field (0 if the method does not count them), and `seconds` of the computation. Both include
       the run with larger steps for the error; `seconds` includes compilation if the program was new, and is NaN under a JAX
       transformation
@@ -121,8 +121,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
     relative to the largest velocity (both at least to their natural unit, see `Tolerance`), angles in rad, speeds of loads
     relative to the rotor speed.
 
-    - It is estimated as a fraction of the difference from a run with larger steps, or as twice this difference if an effect or
-      a drive is not smooth, or if the acceleration of a drive jumps and the steps are equal; rounding errors are added
+    - It is estimated as a fraction of the difference from a run with larger steps; rounding errors are added. It is twice this
+      difference if an effect or a drive is not smooth, or if the acceleration of a drive jumps and the steps are equal
     - A motion whose phase is not determined has a large error, but its amplitudes may be exact
     """
 

@@ -55,9 +55,10 @@ def initial_state(
     **Arguments**
 
     - `scene` of the state
-    - `start`: "rest" (platforms in equilibrium, loads at rest near the bottom of their track, unbalances of motors hanging down
-      if gravity acts on them; a rotor of constant speed turns with its full speed from the beginning), "spin_up" (the same
-      state; in `simulate` the rotor speed then rises smoothly), or "jam" (on the leading-order motion of a jam mode)
+    - `start`: "rest", "spin_up" or "jam". At "rest" the platforms are in equilibrium, the loads rest near the bottom of their
+      track, and unbalances of motors hang down if gravity acts on them; a rotor of constant speed turns with its full speed
+      from the beginning. "spin_up" is the same state, after which the rotor speed rises smoothly in `simulate`. "jam" is a
+      state on the leading-order motion of a jam mode
     - `mode`: number of the jam mode, for "jam"; typical: 1, 3, 5, the modes that are stable for light loads
     - `angles` (count,): the angles of the loads about the axis of the rotor, rad; or one value for the middle of all loads
       (default: the angle of `Loads.rest` at rest, and 0 in a jam). The displacements of a jam belong to the mean angle;
@@ -179,9 +180,9 @@ def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> Sta
 
     - `scene` whose effects permit the rotation (`FreeSpin`, `Sliding`)
     - `state` without this rotation
-    - `rotation`: "rolling" (the default), for loads that roll on their track without spin about the contact normal; or "none",
-      for loads that do not rotate in space (the equations above), so that their contact slides if the scene has `Sliding`;
-      typical: slips of 5 to 50 m/s for "none"
+    - `rotation`: "rolling" (the default) for loads that roll on their track without spin about the contact normal; "none" for
+      loads that do not rotate in space (the equations above). Their contact slides if the scene has `Sliding`; typical: slips
+      of 5 to 50 m/s
 
     **Returns** `State`. **Raises** `InputError` for another name, and for a spin in the state that the scene does not permit
     or that has a wrong shape.

@@ -76,8 +76,9 @@ class AbstractMeasured(Readable):
     - `load_speed` (count,), rad/s: mean speed of each load over whole turns, negative if it turns clockwise; for an exciter
       without loads, that of its rotor
     - `omega`, rad/s: mean of these speeds, each positive in the direction of rotation of its exciter
-    - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, that is half of the peak-to-peak
-      value; for a force with two directions the root of the sum of the squares of both; typical: 0.5 to 10 mm, 10 N to 10 kN
+    - `amplitude` (nd,), m (rad for tilts), zero to peak, that is half of the peak-to-peak value; typical: 0.5 to 10 mm
+    - `foundation_force`, N, zero to peak; for a force with two directions the root of the sum of the squares of both; typical:
+      10 N to 10 kN
     - `drift`: the largest of three relative changes within the window
     - `settled`: True if the drift is below 1e-3
 

@@ -21,9 +21,11 @@ from jaxvib.runtime.programs import cached
 def natural_units(scene: Scene) -> State:
     """Return the natural units of the state.
 
-    They are the unbalance radius S/M for displacements, S/M times the rotor speed for velocities, 1 rad for angles, the rotor
-    speed for rates of angles, and, for a sliding velocity, the rotor speed times the distance of the loads from the axis. S is
-    the unbalance of the loads, or that of the rotor if it is larger.
+    - Displacements: the unbalance radius S/M, with the unbalance S of the loads, or that of the rotor if it is larger
+    - Velocities: S/M times the rotor speed
+    - Angles: 1 rad; rates of angles and the drilling spin: the rotor speed
+    - Sliding velocities: the rotor speed times the distance of the loads from the axis
+    - States of a motor: `Motor.state_units`
     """
     carrier, pairs = scene.machine.carrier(), [_exciter_units(exciter) for exciter in scene.exciters]
     unbalances = [unbalance for unbalances_of_exciter, _ in pairs for unbalance in unbalances_of_exciter]

@@ -172,11 +172,13 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     weight of the unbalances, which averaging omits, determine these angles. Peaks are therefore the largest ones of several
     runs from different initial angles: 8 runs for each motor after the first one, or for each motor if another exciter has an
     ideal drive. The peaks of a single run can be half as large. Compared with the full equations from the same angles without
-    gravity, the peaks have errors of 2 % for a screen that passes its resonances within two turns. With gravity, the weight of
-    an unbalance, with the torque S g cos theta, changes the speed of its rotor within each turn by a share of about
-    S g / (I w^2), I the inertia of the rotor. This excites the resonance w already at the speed w/2, and the vibration that
-    remains changes the later peak. The change has either sign, depending on the initial angle, and is up to about this share
-    (`weight_error`), which can exceed 20 % for screens; use `simulate` from rest for peaks with less error.
+    gravity, the peaks have errors of 2 % for a screen that passes its resonances within two turns.
+
+    With gravity, the weight of an unbalance S acts on its rotor with the torque S g cos theta. The speed of the rotor therefore
+    changes within each turn by a share of about S g / (I w^2) (I: inertia of the rotor, w: a natural frequency). This change
+    excites the resonance w already at the speed w/2, and the vibration that remains changes the later peak. The peak increases
+    or decreases, depending on the initial angle, by up to about this share (`weight_error`), which can exceed 20 % for screens.
+    Use `simulate` from rest for peaks with less error.
 
     **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between passing a
     resonance and being caught use `simulate`. The torque of a motor with currents is its steady torque here. This changes
