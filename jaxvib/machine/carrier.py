@@ -333,7 +333,7 @@ class Machine(Part):
 
     def require_valid(self) -> None:
         """**Raises** `InputError` for arrays that were replaced and do not fit together. By default nothing is examined here,
-        because `validate_scene` calls the constructor again with the new values."""
+        because each analysis calls the constructor again with the new values."""
 
     @property
     def has_foundation(self) -> bool:

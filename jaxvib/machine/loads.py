@@ -364,6 +364,9 @@ def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radi
 
         kappa m R^2 phi'' = - b_W R^2 (phi' - speed) - m p'(phi) . (acceleration of the track),    p = R (cos phi, sin phi)
 
+    phi is the angle of a ball, p its position relative to the rotor's axis, and speed the rotor speed. kappa is the inertia of
+    a ball along the track, divided by that of an equal point mass.
+
     **Arguments** (SI, or strings with a unit such as "800 g")
 
     - `count` N: number of balls, at least 1; typical: 1 to 4
@@ -402,10 +405,10 @@ def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_ra
 
     **Arguments** as for `balls`; the equation is the same
 
-    - `count` N; typical: 1 to 4
-    - `mass` m, kg; typical: 0.1 to 2
+    - `count` N: number of rollers; typical: 1 to 4
+    - `mass` m of a roller, kg; typical: 0.1 to 2
     - `radius` R of the circle of the rollers' axes, m; typical: 0.05 to 0.3
-    - `drag` b_W, N s/m; typical: 0.5 to 5
+    - `drag` b_W: viscous resistance of a roller against the rotor, N s/m; typical: 0.5 to 5
     - `ball_radius` r of a roller, m; typical: 0.01 to 0.03
 
     **Returns** `CircularLoads`. **Raises** `InputError` in the cases of `balls`.
@@ -424,8 +427,8 @@ def pendulums(*, count: int, mass: Numbers, radius: Number, drag: Numbers, inert
 
     **Arguments** as for `balls`; the equation is the same
 
-    - `count` N; typical: 1 to 4
-    - `mass` m, kg; typical: 0.05 to 1
+    - `count` N: number of pendulums; typical: 1 to 4
+    - `mass` m of a pendulum, kg; typical: 0.05 to 1
     - `radius` R: distance of the centre of mass from the axis, m; typical: 0.05 to 0.2
     - `drag` b_W at that radius, N s/m: a bearing with the viscous coefficient mu (N m s) has b_W = mu/R^2; typical: 0.05 to 3,
       that is mu from 3e-4 to 0.02 N m s at R = 0.08 m

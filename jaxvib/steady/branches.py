@@ -114,8 +114,9 @@ def branches(
 
         n(Omega) = Omega + (mean braking torque of the vibration on the loads) / sum b_W R^2      (light loads, no dry friction)
 
-    For light loads n(Omega) is an explicit function (`rotor_speed_at`). Every point, even of the exact branch, is computed
-    separately, without continuation from a neighbouring point. Therefore no part of the branch is missed.
+    n is the rotor speed, Omega the load speed, and b_W and R are the drag and the radius of a load. For light loads n(Omega) is
+    an explicit function. Every point, even of the exact branch, is computed separately, without
+    continuation from a neighbouring point. Therefore no part of the branch is missed.
 
     **Arguments**
 

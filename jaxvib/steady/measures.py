@@ -297,7 +297,9 @@ def vibration_measures(
         stroke = 2 |Y|,    acceleration = Omega^2 |Y| / g,    velocity = Omega |Y| / sqrt 2,
         dynamic load of a support = |k u + i Omega c u|,    static load = k s with K s = M g
 
-    u and s are the displacements of the support by the vibration and by the weight of machine and loads.
+    Omega is the speed of the vibration and Y the complex amplitude of a coordinate. k and c are the stiffness and the damping
+    of a support; u and s are its displacements by the vibration and by the weight of machine and loads. M and K are the mass
+    and stiffness matrices.
 
     **Arguments**
 

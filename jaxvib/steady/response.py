@@ -240,8 +240,9 @@ def response(
         Y = w^2 D(w)^-1 f,    f = sum_k S_k exp(i alpha_k) B_k^T e_k,    D = K - w^2 M + i w (C + sigma w G)
         torque of exciter k = -(S_k/2) Im(exp(-i alpha_k) e_k^H B_k w^2 Y)
 
-    S, alpha, e and B are defined in `synchronous_regimes`; sigma is the mean of the directions of rotation (+1 or -1). The
-    curve of the torque over the speed has a peak at each resonance (Sommerfeld effect). A motor can turn at the speeds at which
+    The symbols are those of `synchronous_regimes`; Y are the complex amplitudes of the coordinates, and sigma is the mean of
+    the directions of rotation (+1 or -1). The curve of the torque over the speed has a peak at each resonance (Sommerfeld
+    effect). A motor can turn at the speeds at which
     its torque equals that of the curve, `operating`. If the torque of the motor changes, operating points appear and merge at
     the `folds` of the curve. The phases of several exciters are fixed, by gears or a common shaft: their torques are added, and
     they turn as one rotor with the sum of their inertias. For motors without gears use `synchronous_regimes`.

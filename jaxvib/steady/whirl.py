@@ -156,7 +156,8 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: LoadMasses
 
         (K + i w (C + n G) - w^2 M) X = 0,      q = Re(X exp(i w t)),  w complex
 
-    The eigenvalues are those of the first-order form; n is the rotor speed.
+    K, C, G and M are the stiffness, damping, gyroscopic and mass matrices of the machine, and n is the rotor speed. w is the
+    complex whirl frequency; it is an eigenvalue of the first-order form of the equation.
 
     **Arguments**
 
@@ -276,9 +277,9 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
 def critical_speeds(scene: Scene, *, loads: LoadMasses = "fixed") -> CriticalSpeeds:
     """Return the critical speeds, at which a whirl turns at the speed w of the rotor: (K - w^2 (M - i G)) X = 0.
 
-    The eigenproblem is Hermitian. On supports that are equal in both directions, the inertia of a forward tilt is the
-    transverse inertia of the rotor minus the polar one, that of a backward tilt their sum. Supports that differ split each
-    critical speed in two.
+    K, M and G are the stiffness, mass and gyroscopic matrices of the machine. The eigenproblem is Hermitian. On supports that
+    are equal in both directions, the inertia of a forward tilt is the transverse inertia of the rotor minus the polar one, that
+    of a backward tilt their sum. Supports that differ split each critical speed in two.
 
     **Arguments** as for `whirl`: `scene`; `loads` "fixed" or "none".
 

@@ -18,7 +18,8 @@ class BeltDrive(MotorWrapper):
         r = speed of the motor / speed of the shaft
         T(t, theta') = r T_motor(t, r theta'),    I = shaft_inertia + r^2 I_motor
 
-    The torque T and the inertia I are referred to the shaft. Speeds of the results are those of the shaft.
+    The torque T and the inertia I are referred to the shaft, whose speed is theta'. Speeds of the results are those of the
+    shaft.
 
     **Arguments** (SI, or strings with a unit)
 

@@ -192,10 +192,10 @@ class SpeedProfile(IdealDrive):
 class SwitchedOff(MotorWrapper):
     """Motor that is switched off at a time and then turns with the friction of its bearings only.
 
-        T = torque of the motor  (t < at),    T = -bearing theta'  (t >= at)
+        T = torque of the motor  (t < at),    T = -bearing theta'  (t >= at),    theta' the rotor speed
 
-    `simulate` ends a step at that time. In analyses of steady motions the motor is off: `torque` is the friction. States of the
-    motor, such as currents, have no effect and no meaning after that time.
+    `simulate` ends a step at the time `at`. In analyses of steady motions the motor is off: `torque` is the friction. States of
+    the motor, such as currents, have no effect and no meaning after that time.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -248,9 +248,9 @@ class Converter(MotorWrapper):
 
         T(t, theta') = T_motor(theta' + n_motor - n(t))
 
-    n_motor is the no-load speed of the motor without the converter (`motor.speed`). The converter shifts the torque curve of
-    the motor along the speed axis, so that the torque is 0 at the speed n(t). This is exact for a `DCMotor` whose voltage is
-    changed, and for Kloss's formula at constant flux (voltage in proportion to the frequency).
+    theta' is the rotor speed, and n_motor the no-load speed of the motor without the converter (`motor.speed`). The converter
+    shifts the torque curve of the motor along the speed axis, so that the torque is 0 at the speed n(t). This is exact for a
+    `DCMotor` whose voltage is changed, and for Kloss's formula at constant flux (voltage in proportion to the frequency).
 
     **Arguments**
 
@@ -313,9 +313,9 @@ class SpeedControl(Motor):
         T_u = gain (n(t) - theta') + z,    T = T_u, limited to the range -torque_limit to torque_limit
         z' = integral_gain (n(t) - theta' + (T - T_u) / gain)
 
-    The integral z is a state of the motor (`state.rotor[2]`, N m). The last term prevents z from growing while the torque is at
-    its limit. Theories of steady motions need the torque as a function of the speed, which this drive does not have; use
-    `ConstantSpeed` for them.
+    theta' is the rotor speed. The integral z is a state of the motor (`state.rotor[2]`, N m). The last term prevents z from
+    growing while the torque is at its limit. Theories of steady motions need the torque as a function of the speed, which this
+    drive does not have; use `ConstantSpeed` for them.
 
     **Arguments** (SI, or strings with a unit; all greater than 0)
 

@@ -238,8 +238,8 @@ class Motor(Drive):
 
         I theta'' = T(theta') - torque of the loads on the rotor
 
-    I (`inertia`) is the moment of inertia of the whole rotor about its axis. It includes the unbalance of the rotor but not
-    the loads; typical: 0.005 to 1 kg m^2.
+    theta is the angle of the rotor and T the torque of the motor. I (`inertia`) is the moment of inertia of the whole rotor
+    about its axis. It includes the unbalance of the rotor but not the loads; typical: 0.005 to 1 kg m^2.
 
     >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
     >>> class Turbine(jv.Motor):
@@ -303,7 +303,7 @@ class Motor(Drive):
 class ConstantSpeed(IdealDrive):
     """Drive at a constant rotor speed, which the loads do not change.
 
-        theta' = n
+        theta' = n,    theta the angle of the rotor
 
     **Arguments**: `speed` n, rad/s or a string such as "1500 rpm"; greater than 0; typical: 60 to 320 rad/s (600 to 3000 rpm).
 
@@ -345,8 +345,8 @@ class SpinUp(IdealDrive):
 
     **Arguments** (SI, or strings with a unit)
 
-    - `speed` n, rad/s, greater than 0; typical: 60 to 320 (600 to 3000 rpm)
-    - `duration`, s, greater than 0; typical: 1 to 20
+    - `speed`: working speed n, rad/s, greater than 0; typical: 60 to 320 (600 to 3000 rpm)
+    - `duration` of the spin-up, s, greater than 0; typical: 1 to 20
 
     **Raises** `InputError` for a wrong unit or a value that is not positive.
 
@@ -390,8 +390,8 @@ class RunUp(IdealDrive):
 
     **Arguments** (SI, or strings with a unit)
 
-    - `speed` n, rad/s, greater than 0; typical: 60 to 500 (600 to 4800 rpm)
-    - `acceleration`, rad/s^2, greater than 0; typical: 10 to 300. For braking use `SpeedProfile`
+    - `speed`: working speed n, rad/s, greater than 0; typical: 60 to 500 (600 to 4800 rpm)
+    - `acceleration` during the run-up, rad/s^2, greater than 0; typical: 10 to 300. For braking use `SpeedProfile`
 
     **Raises** `InputError` for a wrong unit or a value that is not positive.
 
@@ -435,12 +435,12 @@ class RunUp(IdealDrive):
 class DCMotor(Motor):
     """Direct-current motor, switched on at t = 0, whose torque falls linearly with the speed.
 
-        T = stall_torque (1 - theta' / speed)
+        T = stall_torque (1 - theta' / speed),    theta' the rotor speed
 
     **Arguments** (SI, or strings with a unit; all greater than 0)
 
     - `speed`: no-load speed, rad/s; typical: 100 to 320 (1000 to 3000 rpm)
-    - `stall_torque`, N m; typical: 1 to 50
+    - `stall_torque`: torque at standstill, N m; typical: 1 to 50
     - `inertia` I of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
     **Raises** `InputError` for a wrong unit or a value that is not positive.
@@ -469,7 +469,7 @@ class DCMotor(Motor):
 class InductionMotor(Motor):
     """Induction motor, switched on at t = 0, with Kloss's formula.
 
-        T = 2 T_b s s_b / (s^2 + s_b^2),    s = 1 - theta' / speed
+        T = 2 T_b s s_b / (s^2 + s_b^2),    s = 1 - theta' / speed,    theta' the rotor speed
 
     **Arguments** (SI, or strings with a unit; all greater than 0)
 

@@ -173,8 +173,8 @@ class DCMotorElectrical(Motor):
 
         L i' = V - R i - K theta',    T = K i
 
-    With an inductance L the current i is a state of the motor (`state.rotor[2]`, A). Without one, and in theories of steady
-    motions, the torque is K (V - K theta') / R.
+    theta' is the rotor speed. With an inductance L the current i is a state of the motor (`state.rotor[2]`, A). Without one,
+    and in theories of steady motions, the torque is K (V - K theta') / R.
 
     **Arguments** (SI, or strings with a unit; all greater than 0)
 
@@ -237,7 +237,8 @@ class InductionMotorCircuit(Motor):
         V = (R_s + i w L_s) I_s + i w L_m I_r,    0 = (R_r + i w_s L_r) I_r + i w_s L_m I_s
         T = (3/2) p L_m Im(conj(I_r) I_s)
 
-    V = sqrt(2/3) `voltage` is the amplitude of the phase voltage. Transients of the currents are neglected; they are included
+    V = sqrt(2/3) `voltage` is the amplitude of the phase voltage. I_s and I_r are the complex amplitudes of the currents of
+    stator and rotor, and theta' is the rotor speed. Transients of the currents are neglected; they are included
     in `InductionMotorElectrical`.
 
     **Arguments** (SI, or strings with a unit; all greater than 0). Rotor values are referred to the stator. Data sheets often
@@ -328,6 +329,7 @@ class InductionMotorElectrical(InductionMotorCircuit):
         psi_s = L_s i_s + L_m i_r,         psi_r = L_m i_s + L_r i_r
 
     The flux linkages psi_s and psi_r in the fixed frame, two components each, are states of the motor (`state.rotor[2:]`, V s).
+    i_s and i_r are the currents of stator and rotor; V and the other symbols are those of `InductionMotorCircuit`.
     Theories of steady motions use the steady torque of `InductionMotorCircuit`. Arguments, units and typical values are those
     of `InductionMotorCircuit`.
 

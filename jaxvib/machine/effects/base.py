@@ -111,7 +111,7 @@ class Effect(Part):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """Return the effect with typical values, as an audit adds it; None for an effect without typical values.
+        """Return the effect with typical values, as `jaxvib.audit` adds it; None for an effect without typical values.
 
         **Arguments**
 
@@ -141,6 +141,9 @@ class Effect(Part):
 class Gravity(Effect):
     """Gravity on loads, unbalances and static imbalances: V = m g p_up(u), that is the torque -m g R cos phi on a load on a
     circle and -S g cos theta on the rotor of an unbalance.
+
+    V is the potential energy of a load of mass m at its position p(u), R its radius and phi its angle. S is the unbalance and
+    theta the angle of its rotor. Angles are measured from the horizontal direction.
 
     Displacements of platforms are measured from static equilibrium under the weight of platforms and loads. Gravity therefore
     adds no force on the platforms.
@@ -194,8 +197,8 @@ class Gravity(Effect):
 class StaticImbalance(Effect):
     """Static imbalance: the offset of the rotor's centre of mass from its axis is e (cos(theta + angle), sin(theta + angle)).
 
-    theta is the rotor's angle. The force on the machine at the rotor is - M e d^2/dt^2 (cos(theta + angle), sin(theta +
-    angle)). With `Gravity` the torque of its weight on the rotor is - M e g cos(theta + angle).
+    theta is the rotor's angle, and M its mass. The force on the machine at the rotor is - M e d^2/dt^2 (cos(theta + angle),
+    sin(theta + angle)). With `Gravity` the torque of its weight on the rotor is - M e g cos(theta + angle).
 
     **Arguments** (SI, or strings with a unit)
 

@@ -76,8 +76,9 @@ class DryFriction(Effect):
     - `coefficient` mu2, at least 0; typical: about 0.0015 for ball bearings, 0.001 to 0.005 for rolling bearings
     - `diameter` d of the bearing, m; typical: 0.005 to 0.05
     - `reaction`: one of the three names above (default: "exact")
-    - `width`, rad/s: range of sliding speeds over which the sign is smoothed, see `sliding_sign`; typical: 0.01 (the default)
-      to 1. A smaller width is more exact and needs more steps
+    - `width`, rad/s: range of sliding speeds over which the sign is smoothed to tanh((speed - phi')/width); typical: 0.01 (the
+      default) to 1. A smaller width is more exact and needs more steps. A load that would stick creeps at the speed width
+      artanh(f) relative to the rotor, if the torque on it is the fraction f of the largest friction torque
 
     **Raises** `InputError` for values that are not allowed. A scene raises it for loads without bearings: balls and rollers,
     and loads that do not move on a circle.

@@ -27,7 +27,8 @@ class RollingFriction(Effect):
 
         Q_u = - (k/r) |N| J^T d,    v = J (u' - (w, 0, ...)),    d = v tanh(|v|/width)/|v|
 
-    - J = dp/du. v is the velocity of the load's centre along the wall relative to the rotor, which turns at w
+    - Q_u are the generalized forces on the coordinates u of a load, whose centre is at p(u), and J = dp/du. v is the velocity
+      of the load's centre along the wall relative to the rotor, which turns at w
     - N is the normal force (`Loads.normal_force`), solved together with the accelerations; r is the radius of the load
     - In a torus max(N, 0) replaces |N|: a ball that does not press on the wall has no friction. The track of loads on a circle
       can also pull, and then has the same friction

@@ -55,15 +55,16 @@ def _read_platform(kind: str, name: str, number: int) -> int:
 
 
 class CubicSupport(_Support):
-    """Hardening (or softening) support: force k3 r^2 x on the foundation; r = |x| is the distance from the rest position.
+    """Hardening (or softening) support: force k3 r^2 x on the foundation; x is the displacement of the supported point from its
+    rest position, and r = |x|.
 
     **Arguments** (SI, or strings with a unit)
 
     - `stiffness` k3, N/m^3, negative for a softening support; typical: 1e7 to 1e10. It stiffens a support k by 1 % at the
       amplitude a if (3/4) k3 a^2 = 0.01 k: 3e7 for 5e4 N/m and 5 mm
-    - `platform` on which the support acts, numbered from 1 (default: 1)
-    - `position` along a rotor's axis, m from the rotor's centre of mass, in place of the platform; typical: -0.5 to 0.5;
-      default: the station of the loads, or the centre of mass if each load has a separate station
+    - `platform`: number, from 1, of the platform on which the support acts (default: 1)
+    - `position`: distance along a rotor's axis from the rotor's centre of mass, m, in place of the platform; typical: -0.5 to
+      0.5; default: the station of the loads, or the centre of mass if each load has a separate station
 
     **Raises** `InputError` for values that are not allowed. A scene raises it for a place that the machine does not have.
 
@@ -116,16 +117,19 @@ class CubicSupport(_Support):
 class Stop(_Support):
     """Stop beyond a gap: force k (x - gap) + c x' on the foundation while it presses; it never pulls.
 
-    A stop of a platform is above the platform, below it, or on both sides; around a rotor's axis it is a ring of radius `gap`.
+    x is the displacement toward the stop. A stop of a platform is above the platform, below it, or on both sides. Around a
+    rotor's axis it is a ring of radius `gap`.
 
     **Arguments** (SI, or strings with a unit)
 
     - `stiffness` k, N/m, at least 0; typical: 1e5 to 1e7, that is 10 to 100 times that of the support. A stiffer stop needs
       shorter steps
-    - `gap`, m, at least 0; typical: 0.001 to 0.02
+    - `gap`: displacement at which the contact begins, m, at least 0; typical: 0.001 to 0.02
     - `damping` c, N s/m, at least 0 (the default); typical: 0 to 5000
     - `side` of the platform: "above", "below" or "both" (the default); around a rotor's axis only "both"
-    - `platform` or `position`: as for `CubicSupport`; typical: platform 1
+    - `platform`: number, from 1, of the platform whose motion the stop limits (default: 1)
+    - `position`: distance along a rotor's axis from the rotor's centre of mass, m, in place of the platform; typical: -0.5 to
+      0.5; default: the station of the loads, or the centre of mass if each load has a separate station
 
     **Raises** `InputError` for values that are not allowed. A scene raises it for a place that the machine does not have.
 
@@ -217,7 +221,9 @@ class FrictionSupport(_Support):
     - `force` F, N, at least 0; typical: 1 % to 10 % of the largest force of the spring next to it
     - `width`, m/s: range of velocities over which the sign of v is smoothed; typical: 0.01 (the default), 1 % to 10 % of the
       largest velocity. Explicit steps must resolve the decay rate F/(width M) of a mass M that sticks
-    - `platform` or `position`: as for `CubicSupport`; typical: platform 1
+    - `platform`: number, from 1, of the platform on which the friction acts (default: 1)
+    - `position`: distance along a rotor's axis from the rotor's centre of mass, m, in place of the platform; typical: -0.5 to
+      0.5; default: the station of the loads, or the centre of mass if each load has a separate station
     - `to`: number of a second platform if the friction acts in the link between both; default: on the foundation
 
     **Raises** `InputError` for values that are not allowed. A scene raises it for a place that the machine does not have.

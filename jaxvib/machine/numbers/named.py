@@ -1,7 +1,6 @@
 """Parameters of a scene by name: "machine.stiffness[0]", "drive.inertia", "effects.stop[1].gap".
 
-Every floating-point parameter of a machine, a load, a drive or an effect has a name. Its unit, bounds and label are defined in
-the package `numbers`.
+Every floating-point parameter of a scene has a name. Its unit, bounds and label are defined in the package `numbers`.
 """
 
 from __future__ import annotations

@@ -177,13 +177,13 @@ def two_mass(
 
     **Arguments** (SI, or strings with a unit)
 
-    - `mass` (2,), kg, loads not included; typical: 50 to 5000
+    - `mass` (2,) of the platforms, kg, loads not included; typical: 50 to 5000
     - `stiffness` (2,) of the supports, N/m; typical: 1e4 to 1e6, 0 without a support
     - `damping` (2,) of the supports, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M) of
       the platform on its support alone. Also a ratio of it, "5 %", or a loss factor, see `one_mass`
-    - `link_stiffness`, N/m; typical: 5e4 to 5e6, that is 1 to 10 times a support
-    - `link_damping`, N s/m; typical: as `damping`. A ratio is relative to the two platforms on the link alone, that is to the
-      mass M_1 M_2/(M_1 + M_2)
+    - `link_stiffness` of the link, N/m; typical: 5e4 to 5e6, that is 1 to 10 times that of a support
+    - `link_damping` of the link, N s/m; typical: as `damping`. A ratio is relative to the two platforms on the link alone, that
+      is to the mass M_1 M_2/(M_1 + M_2)
     - `exciter`: the number of the platform with the exciter, 1 or 2 (default: 2)
 
     **Returns** `Platforms`. **Raises** `InputError` for wrong lengths, wrong units, masses that are not positive, or negative
@@ -215,7 +215,7 @@ def three_mass(
 
     **Arguments** (SI, or strings with a unit)
 
-    - `mass` (3,), kg, loads not included; typical: 50 to 5000
+    - `mass` (3,) of the platforms, kg, loads not included; typical: 50 to 5000
     - `stiffness` (3,) of the supports, N/m; typical: 1e4 to 1e6, 0 without a support
     - `damping` (3,) of the supports, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M)
     - `link_stiffness` (3,) of the links 1-2, 1-3, 2-3, N/m; typical: 5e4 to 5e6, 0 for an absent link
@@ -251,13 +251,13 @@ def network(
 
     **Arguments** (n platforms, L links; SI or texts with a unit)
 
-    - `mass` (n,), kg, loads not included; typical: 50 to 5000
+    - `mass` (n,) of the platforms, kg, loads not included; typical: 50 to 5000
     - `stiffness` (n,) of the supports, N/m; typical: 1e4 to 1e6, 0 for a platform without a support
     - `damping` (n,) of the supports, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M); 0
       for a platform without a support
     - `links`: L pairs of platforms, numbered from 1
-    - `link_stiffness` (L,), N/m; typical: 5e4 to 5e6
-    - `link_damping` (L,), N s/m; typical: as `damping`
+    - `link_stiffness` (L,) of the links, N/m; typical: 5e4 to 5e6
+    - `link_damping` (L,) of the links, N s/m; typical: as `damping`
     - `exciter`: the number of the platform with the exciter
 
     **Returns** `Platforms`. **Raises** `InputError` in the cases of `two_mass`, and for a link to a platform that does not

@@ -40,7 +40,8 @@ def balanced_motion(scene: Scene, angles: Array, turn: Array) -> State:
 
 
 def at_constant_speed(scene: Scene) -> Scene:
-    """Return the scene with rotors that have their working speed from the start, and motors that are off throughout."""
+    """Return the scene with all drives in their final state: ideal drives turn at their working speed from the start, and
+    motors that are switched off during a run are off from the start."""
     drives = [exciter.drive.settled() for exciter in scene.exciters]
     return eqx.tree_at(lambda s: [exciter.drive for exciter in s.exciters], scene, drives)
 

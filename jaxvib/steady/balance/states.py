@@ -87,7 +87,9 @@ class BalancedStates(Result):
 
     @validated
     def stability(self, arrangement: int = 0, *, steps: int | None = None) -> BalancedStability:
-        """Return the stability of an arrangement at the scene's rotor speed, see `balanced_stability`.
+        """Return the exact stability of an arrangement at the scene's rotor speed.
+
+        The full equations are linearized about the balanced motion and integrated over one turn of the rotor.
 
         **Arguments**: `arrangement`: its number, counted from 0; `steps` of Radau's method over one turn (default: as many as
         the natural frequencies need); the time is proportional to it.
@@ -96,8 +98,8 @@ class BalancedStates(Result):
 
     @validated
     def growth(self, speeds: Numbers, arrangement: int = 0, *, steps: int | None = None) -> np.ndarray:
-        """Return the growth rate of deviations from an arrangement at rotor speeds, 1/s: stable if negative, see
-        `balanced_growth`.
+        """Return the growth rate of deviations from an arrangement at rotor speeds, 1/s, in an array of the shape of `speeds`.
+        The balanced motion is stable if the rate is negative.
 
         **Arguments**: `speeds`, rad/s; `arrangement`: its number, counted from 0; `steps`: as for `stability`.
         """
@@ -107,7 +109,7 @@ class BalancedStates(Result):
     def intervals(
         self, low: Number, high: Number, arrangement: int = 0, *, points: int = 200, steps: int | None = None
     ) -> SpeedIntervals:
-        """Return the intervals of rotor speed, rad/s, in which an arrangement is stable, see `balanced_intervals`.
+        """Return the intervals of rotor speed, rad/s, in which an arrangement is stable; their ends are accurate to 1e-7.
 
         **Arguments**
 

@@ -83,7 +83,8 @@ def drag_limits(scene: Scene, *, phases: bool = False) -> DragLimits:
 
         factor(w) sum b_W R^2 (n - w) = braking torque of the vibration at w
 
-    The greatest drag of a resonance is the maximum of `factor` over the load speeds w near it. At this maximum two jams merge
+    n is the rotor speed, w the load speed, and b_W and R are the drag and the radius of a load. The greatest drag of a
+    resonance is the maximum of `factor` over the load speeds w near it. At this maximum two jams merge
     in a fold; with a larger drag the loads pass this resonance. In the limit of light loads an imbalance of the rotor does not
     change the limits, see `jam_modes`.
 

@@ -283,8 +283,9 @@ def jam_modes(scene: Scene) -> JamModes:
         sum b_W R^2 (n - Omega) + dry friction = mean braking torque of the vibration at Omega,  solved for Omega at the rotor
         speed n
 
-    The branch n(Omega) of `rotor_speed_at` is cut at its folds dn/dOmega = 0 into monotone pieces; each piece that contains
-    the rotor speed gives one mode.
+    b_W and R are the drag and the radius of a load, and Omega is the load speed. The rotor speed is an explicit function
+    n(Omega) of the load speed, the branch (see `branches`). The branch is cut at its folds dn/dOmega = 0 into monotone pieces;
+    each piece that contains the rotor speed of the scene gives one mode.
 
     - Mode numbers follow the resonances: mode 2r - 1 is on the piece that rises to the peak of resonance r, mode 2r on the
       piece that falls from it, and mode 2 nd + 1 is beyond the last resonance. Mode 3 is therefore the jam just below the

@@ -75,7 +75,10 @@ class PhaseJams(AbstractPhaseJam):
 
     @validated
     def follow(self, index: int, omega: Array) -> PhaseBranch:
-        """Return the phase pattern of the jam with an `index` over load speeds `omega` (n,), rad/s, see `phase_branch`."""
+        """Return the phase pattern of the jam with an `index`, counted from 0, at load speeds `omega` (n,), rad/s.
+
+        The speeds ascend and are below the rotor speed. The result states the drag at which the loads jam at each speed.
+        """
         return phase_branch(self.scene, self.select(index), omega)
 
     def summary(self) -> str:
@@ -127,10 +130,12 @@ def phase_jams(
 
         b_W R^2 (n - Omega) = mean braking torque of the vibration on load j,  for every load j, solved for Omega and the phases
 
+    b_W and R are the drag and the radius of the load, n is the rotor speed and Omega the load speed.
+
     - The search computes, at each of many load speeds, the phases at which all loads need the same multiple of their drag. It
       starts from `starts` random sets of phases and some regular ones. If this multiple passes 1 between two load speeds, a jam
-      lies between them, and Newton's method solves for its speed and phases (`phase_jam`). The load speeds are closer together
-      near resonances
+      lies between them, and Newton's method solves for its speed and phases. The load speeds are closer together near
+      resonances
     - Jams that differ by a common rotation of all loads, or by an exchange of equal loads, count as one
     - Loads that turn with the rotor and balance it are left out. Two equal loads at one point of the machine also have a jam at
       the speed at which the response of the machine lags by 90 degrees; it is left out here, and `synchronous_regimes` lists it
@@ -148,8 +153,9 @@ def phase_jams(
       stable jams. Many are necessary for unstable jams near a load speed at which two patterns separate. The time is
       proportional to this number
     - `seed` of these random phases
-    - `near`: (omega, phase), a speed rad/s and the phases (count,) rad of the loads, from which Newton's method finds one jam,
-      see `phase_jam`; the function can then be used under `jit`, `vmap` and `grad`
+    - `near`: (omega, phase), a speed rad/s and the phases (count,) rad of the loads, from which Newton's method finds one jam.
+      The function can then be used under `jit`, `vmap` and `grad`. Derivatives follow from the implicit function theorem;
+      `growth` and `stable` have none
 
     **Returns** `PhaseJams`, or `PhaseJam` with `near`.
 

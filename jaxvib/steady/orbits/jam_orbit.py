@@ -67,9 +67,12 @@ def jam_orbit(
         I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n, a) - S e'(phi) . a,      a = B q''
         D(k Omega) q_k = S k^2 Omega^2 B^T e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
-    with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). The equations
-    are solved by trigonometric collocation of psi. The carrier is eliminated harmonic by harmonic, and Newton's method starts
-    from the leading order.
+    phi = theta + psi(theta) is the angle of the loads, with theta = Omega t. q are the coordinates of the machine, q_k their
+    harmonics, and e_k the harmonics of e = (cos phi, sin phi). S = sum m R, I = sum kappa m R^2, and n is the rotor speed. K,
+    M, C and G are the matrices of the machine; B maps q to the displacement of the point that carries the loads.
+
+    The equations are solved by trigonometric collocation of psi. The carrier is eliminated harmonic by harmonic, and Newton's
+    method starts from the leading order.
 
     - Loads that have equal parameters are at one point. If they have a `ball_radius`, they are side by side, with the unbalance
       S = m R sin(N arcsin(r/R)) / (r/R); if their mean contact force over a period would be tensile, the status is

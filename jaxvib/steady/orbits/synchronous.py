@@ -204,9 +204,11 @@ def synchronous_orbit(
 
         th_k = sigma_k (theta + alpha_k + psi_k(theta)),  q(theta),    theta = Omega t,    psi_k and q periodic
 
-    The full equations of motion are satisfied at equally spaced points of the period (trigonometric collocation of q and all
-    angles), by Newton's method from the given speed and phases. If this start is far from every motion, another motion may be
-    found, or none. The turning body of an exciter is
+    th_k is the angle of the turning body of exciter k, sigma_k its direction of rotation (1 or -1), alpha_k its phase, and
+    psi_k its deviation from uniform rotation. q are the coordinates of the machine. The full equations of motion are satisfied
+    at equally spaced points of the period (trigonometric collocation of q and all angles), by Newton's method from the given
+    speed and phases. If this start is far from every motion, another motion may be found, or none. The turning body of an
+    exciter is
 
     - the rotor with its unbalance, if the exciter has no loads. Omega follows from the torques of the motors; an ideal drive
       instead prescribes th_k = sigma_k n t (phase 0) and Omega = n

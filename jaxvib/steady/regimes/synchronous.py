@@ -306,14 +306,18 @@ def synchronous_regimes(
         V_i = (Omega^4/2) sum_k S_i S_k Im(exp(i (alpha_k - alpha_i)) H_ik)
         H_ik = e_i^H B_i D(Omega)^-1 B_k^T e_k,    e_k = (1, -i direction_k),    D = K - Omega^2 M + i Omega (C + n G)
 
-    - The masses are the unbalances of the exciters and the loads. L is the torque of the motor of an unbalance, or that of the
-      drag on a load. An ideal drive prescribes the angle Omega t of its unbalance, and Omega is then the speed of this drive
-    - n is the mean of the rotors' speeds, anticlockwise positive; the gyroscopic matrix G is 0 for most machines
+    - The masses are the unbalances of the exciters and the loads. S is the unbalance of a mass, and alpha its phase. L is the
+      torque of the motor of an unbalance, or that of the drag on a load. V is the vibrational torque. An ideal drive prescribes
+      the angle Omega t of its unbalance, and Omega is then the speed of this drive
+    - M, C, K and G are the mass, damping, stiffness and gyroscopic matrices of the machine with all masses; G is 0 for most
+      machines. B maps the coordinates to the displacement of the axis of a mass, e_k is the direction of its rotating force,
+      and n is the mean of the rotors' speeds, anticlockwise positive
     - Regimes that differ by the same shift of all phases or by an exchange of equal exciters, such as mirror images, are listed
       once. One member of a family of regimes is listed, with the status `degenerate`
     - If the forces of the masses cancel, for example those of two equal unbalances of one direction and one axis in antiphase,
       the status is `no_vibration`
-    - Stability is the growth of small disturbances of amplitudes, speeds and phases together, see `averaged_field`
+    - Stability is the growth of small disturbances of amplitudes, speeds and phases together in the averaged equations, which
+      `envelope` integrates
     - The relative error of the torques is of the order S^2/(2 M I), where M is the mass of the machine and I the inertia of a
       rotor. Close to the parameters at which two regimes exchange their stability, the error of the phases is some tenths of a
       radian
