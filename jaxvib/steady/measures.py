@@ -163,8 +163,7 @@ class VibrationMeasures(Readable):
     - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on a support.
       They are NaN, as is `foundation_load` in two directions, for a scene with supports that are effects (`CubicSupport`,
       `Stop`, `FrictionSupport`), and for matrices without a foundation
-    - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive; `power` is the mean of torque times
-      speed, which differs from the product of the means if both vary within a turn
+    - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive, see `Vibration`
     - `point` (2,) of a body in a plane, its `point_stroke`, m peak to peak along the long axis of its path, its
       `point_acceleration`, g, `throw_angle`, rad, and `throw_number`, see `Ellipse`, and `conveying_speed`, m/s, the estimate
       of `jaxvib.conveying_speed`; with a leading axis if several points were requested; None for other machines
@@ -297,9 +296,8 @@ def vibration_measures(
         stroke = 2 |Y|,    acceleration = Omega^2 |Y| / g,    velocity = Omega |Y| / sqrt 2,
         dynamic load of a support = |k u + i Omega c u|,    static load = k s with K s = M g
 
-    Omega is the speed of the vibration and Y the complex amplitude of a coordinate. k and c are the stiffness and the damping
-    of a support; u and s are its displacements by the vibration and by the weight of machine and loads. M and K are the mass
-    and stiffness matrices.
+    Omega is the speed, and Y the complex amplitude of a coordinate. k and c are the stiffness and the damping of a support, u
+    and s its displacements by the vibration and by the weight. M and K are the mass and stiffness matrices of the machine.
 
     **Arguments**
 
