@@ -286,11 +286,14 @@ def unit_ratio(one: str, other: str) -> float | None:
 
 
 def in_own_unit(value: str | Quantity, field: str, beside: str = "") -> tuple[float, str]:
-    """Return the magnitude in SI and the SI unit of a string or a pint quantity of any dimension; Hz is converted to rad/s.
+    """Return the magnitude and the SI unit of a string or a pint quantity of any dimension.
 
-    A plain number has the unit "". In a ratio, `beside` is the unit of the other operand. If it is a speed, a speed is
-    converted to it. A value in 1/s or 1/min states neither radians nor revolutions: it is converted to `beside` if that is a
-    speed or a rate; otherwise 1/min is rpm.
+    A plain number has the unit "". A frequency in Hz is converted to rad/s. `beside` is the unit of the other operand of a
+    ratio:
+
+    - if it is the unit of a speed, a speed is returned in this unit
+    - a value in 1/s is a rate. Beside a speed in rad/s it is refused, because it states neither radians nor revolutions
+    - a value in 1/min is returned in the unit `beside` if that is a rate such as 1/s; otherwise it is in rpm
 
     **Raises** `InputError` for other strings, for values that are not finite, and for 1/s beside a speed in rad/s.
 
