@@ -41,7 +41,7 @@ def curve_chart(
 ) -> Drawn:
     """Draw thresholds of capture over a varied parameter, with their uncertainty, and the lowest captured speeds.
 
-    **Arguments** (n values): `value` (n,) of the parameter; `threshold` (n,), NaN if starts at the highest speed were not
+    **Arguments** (n values): `value` (n,) of the parameter; `threshold` (n,), NaN if not all starts at the highest speed were
     captured; `uncertainty` (n,); `least` (n,): the lowest initial speed from which a start was captured. Speeds are relative to
     the rotor, divided by the rotor speed.
 

@@ -84,7 +84,8 @@ class Study:
 
     @property
     def batch(self) -> int:
-        """Number of cases that are computed at the same time: on an accelerator all cases of a chunk, up to 262,144."""
+        """Number of cases that are computed at the same time: 64 on a CPU; all cases of a chunk, up to 262,144, on an
+        accelerator."""
         return min(batch_size(), _round_up(self._cases_in_chunk, BATCH_SIZE))
 
     @property

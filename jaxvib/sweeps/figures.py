@@ -130,8 +130,9 @@ def plot_map(
     **Arguments**
 
     - `measure`: its name in the store; default: the regime if it was measured, otherwise the first measure
-    - `x`, `y`: names of the axes of the map; default: the rotor speed and the first other axis. The map shows the cases in
-      which all other axes have their middle value. For a measure with several values in a case, the largest value is shown
+    - `x`, `y`: names of the axes of the map; default: the rotor speed, if it is an axis, and the first other axes. The map
+      shows the cases in which all other axes have their middle value. For a measure with several values in a case, the largest
+      value is shown
     - `theory`: True to draw lines on which exact jams have a fold or lose their stability, computed by
       `branches(scene, exact=True)`; this needs the rotor speed as one of the axes
 
