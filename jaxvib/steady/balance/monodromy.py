@@ -59,7 +59,10 @@ def _steps_for(scene: Scene) -> Array:
 def monodromy(scene: Scene, angles: Array, steps: int | Array) -> Array:
     """Return the monodromy matrix of the balanced motion over one turn of the rotor, (2 (nd + N), 2 (nd + N)).
 
-        x'' = P(n t) x + R(n t) x',  x = (q / R, dphi),     (x, x' / n)(turn) = monodromy (x, x' / n)(0)
+        x'' = P(n t) x + Q(n t) x',  x = (q / R, dphi),     (x, x' / n)(turn) = monodromy (x, x' / n)(0)
+
+    q are the coordinates of the machine and dphi the deviations of the load angles; R is the mean radius of the loads, and n
+    the rotor speed. P and Q are the coefficients of the linearized equations.
 
     **Arguments**: `angles` (N,) rad of the loads in the rotor's frame; `steps` of `radau.transition`, a Python number (then
     reverse derivatives exist) or a scalar array. The function works under `jit`, `vmap` and `grad`. The caller ensures that

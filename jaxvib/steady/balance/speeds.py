@@ -115,7 +115,8 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
 
         A(w) = B [K - w^2 (M + sum m_j B^T B) + i w (C + w G)]^-1 B^T,     displacement = Re(A F exp(i w t))
 
-    The masses of the loads move with the mount; a gyroscopic matrix G is taken at the rotor speed w.
+    F is the complex amplitude of a force on the mount, and B maps the coordinates to the displacement of the mount. The masses
+    of the loads move with the mount; a gyroscopic matrix G is taken at the rotor speed w.
 
     **Arguments**: `scene`; `omega`.
 

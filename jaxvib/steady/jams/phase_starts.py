@@ -48,8 +48,9 @@ def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generato
 
         T_j = (w^4/2) S_j Im(e^{-i a_j} F_j),      F_j = sum_k S_k H_jk e^{i a_k}
 
-    with the influence coefficients H (`influence_of`). F_j is the same for all equal loads. They need the same torque,
-    therefore Im(e^{-i a_j} F_j) is the same too, and at most two phases a_j are possible. For this reason no jam is missed by
+    T_j is the mean torque of the vibration on load j, S_j the unbalance and a_j the phase of the load, w the load speed, and H
+    are the influence coefficients (`influence_of`). F_j is the same for all equal loads. Equal loads also need the same torque;
+    Im(e^{-i a_j} F_j) is therefore equal for them, and at most two phases a_j are possible. For this reason no jam is missed by
     a search over all divisions of the equal loads into two clusters, with one load in place of each cluster. The unknowns are
     two phases for each group of equal loads, for any number of its loads. The same solution may occur several times.
     """

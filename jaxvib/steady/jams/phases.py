@@ -125,10 +125,10 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 
         b_j R_j^2 (n - w) + T_j(w, a) = 0,     j = 1 .. count
 
-    is solved for w and all phases but the first, see `torques_at`. Stability is determined by the growth rate of small
-    disturbances of the averaged motion, q = Re(z(t) exp(i w t)), in which the angle of each load is free. The averaged
-    equations are autonomous, of dimension 4 nd + 2 count; no motion is assumed to be quasi-static. For isotropic supports
-    averaging is exact.
+    is solved for w and all phases a but the first. b_j is the drag of load j, R_j its radius, n the rotor speed, and T_j the
+    mean torque of the vibration on the load (`torques_at`). Stability is determined by the growth rate of small disturbances of
+    the averaged motion, q = Re(z(t) exp(i w t)), in which the angle of each load is free. The averaged equations are
+    autonomous, of dimension 4 nd + 2 count; no motion is assumed to be quasi-static. For isotropic supports averaging is exact.
 
     **Returns** `PhaseJam`; it works under `vmap` over starts and scenes. Derivatives of all results except stability follow
     from the implicit function theorem. An imbalance of the rotor is not included in amplitudes and forces, see `phase_jams`.

@@ -34,7 +34,7 @@ class OrbitStatus(eqx.Enumeration):
 
     found = "the loads can jam in this periodic motion"
     absent = "this mode does not exist at this rotor speed"
-    not_converged = "no periodic motion was found: the torques cannot be balanced"
+    not_converged = "no periodic motion was found: the torques could not be balanced"
     under_resolved = "the periodic motion needs more harmonics for the requested accuracy; give more points"
     would_separate = "the loads would separate: staying side by side needs tensile forces between them"
     at_fold = "the rotor speed is that of a fold: the motion merges with another one and has no gradient"

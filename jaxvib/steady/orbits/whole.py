@@ -231,7 +231,10 @@ def solve_whole(scene: PeriodicScene, grid: Grid, omega: Array, *, forced: bool)
 def linear_start(scene: PeriodicScene, grid: Grid, omega: Array) -> Array:
     """Return the linear response of the carrier to bodies that turn uniformly.
 
-    q = Re(Y e^(i theta)),    D(Omega) Y = Omega^2 sum_k S_k B_k^T (1, -i sigma_k) e^(i alpha_k)
+        q = Re(Y e^(i theta)),    D(Omega) Y = Omega^2 sum_k S_k B_k^T (1, -i sigma_k) e^(i alpha_k)
+
+    D is the dynamic stiffness of the machine. S_k is the unbalance of exciter k, sigma_k its direction, alpha_k the phase of
+    its first body, and B_k maps the coordinates to the displacement of its axis.
     """
     model, phases, force = linear_model(scene.model.scene), list(scene.phases), []
     for exciter, mount, count in zip(model.scene.exciters, model.mounts, body_counts(model.scene), strict=True):
