@@ -195,8 +195,8 @@ def _is_force(value: object) -> bool:
 def _require_inertia(unbalance: float, mass: float, inertia: float) -> None:
     smallest = unbalance * unbalance / mass  # a power of a large float raises an OverflowError
     if inertia < smallest * (1.0 - 1e-12):
-        problem = f"is {inertia:g} kg m^2, less than that of the unbalance alone, S^2/m = {smallest:g} kg m^2"
-        raise InputError("drive.inertia", f"{problem}; it must include the unbalance")
+        problem = f"turns a rotor with the inertia {inertia:g} kg m^2, less than that of the unbalance alone"
+        raise InputError("drive", f"{problem}, S^2/m = {smallest:g} kg m^2; the inertia must include the unbalance")
 
 
 class Scene(Part):

@@ -135,7 +135,7 @@ whose sag and motor power are examined. Machines with dimensionless parameters h
 _MAX_SUPPORT_DISTANCE = 100.0
 """Largest usual coordinate of a support, m."""
 
-_MIN_AMPLITUDE, _MAX_AMPLITUDE = 1e-5, 0.2
+_MIN_AMPLITUDE, _MAX_AMPLITUDE = 1e-5, 0.05
 """Smallest and largest usual amplitude above the resonances of a machine that unbalances excite, the sum of the unbalances
 divided by the mass, m."""
 

@@ -201,6 +201,13 @@ def test_implausible_bodies_in_a_plane_are_noted():
     assert note == "machine.supports[0].angle is 15 rad; a plain number is in rad: did you mean '15 deg'?"
 
 
+def test_unbalance_of_a_tenth_of_a_metre_is_noted():
+    machine = jv.one_mass(mass=12.0, stiffness=1e5, damping=100.0)
+    motor = jv.Exciter(drive=jv.ConstantSpeed(150.0), unbalance=1.2)
+    (note,) = implausible_numbers(jv.Scene(machine, exciters=[motor]))
+    assert note.startswith("machine.mass is 12 kg, and the unbalances would move the machine by 0.1 m;")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
