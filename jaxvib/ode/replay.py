@@ -395,8 +395,10 @@ class _BackwardPass:
         if self.every == 1:
             return n - 1, self.over_step(n, recorded, slopes)
 
+        plain = dataclasses.replace(self, solver=_with_forward_derivatives(self.solver))
+
         def recompute(j: Array, states: Y) -> Y:
-            y, _ = self.step(jax.tree.map(lambda ys: ys[j], states), *self.span(first + j), self.numbers)
+            y, _ = plain.step(jax.tree.map(lambda ys: ys[j], states), *self.span(first + j), self.numbers)
             return jax.tree.map(lambda ys, y: ys.at[j + 1].set(y), states, y)
 
         states = jax.tree.map(lambda y: jnp.zeros((self.every, *y.shape), y.dtype).at[0].set(y), recorded)
@@ -407,6 +409,13 @@ class _BackwardPass:
             return self.over_step(first + k, jax.tree.map(lambda ys: ys[k], states), slopes)
 
         return n - 1, jax.lax.fori_loop(0, count, from_last, slopes)
+
+
+def _with_forward_derivatives(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
+    """Return the method with loops over stages that have forward derivatives, for steps that are only computed again."""
+    if not isinstance(solver, diffrax.AbstractRungeKutta) or solver.scan_kind is not None:
+        return solver
+    return eqx.tree_at(lambda s: s.scan_kind, solver, "lax", is_leaf=lambda leaf: leaf is None)
 
 
 def _with_tolerances(solver: diffrax.AbstractSolver, controller: diffrax.AbstractStepSizeController) -> diffrax.AbstractSolver:

@@ -179,7 +179,8 @@ def test_slopes_by_the_end_and_by_constant_steps(controller):
         assert jnp.all(by_step == 0.0)
 
 
-def test_second_derivatives_are_forward_over_reverse():
+@pytest.mark.parametrize("max_steps", [256, 2**20])  # each state is recorded, or some of them
+def test_second_derivatives_are_forward_over_reverse(max_steps):
     """End state of y' = -k y: exp(-k)."""
 
     def state(k):
@@ -193,7 +194,7 @@ def test_second_derivatives_are_forward_over_reverse():
             saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True)]),
             controller=diffrax.PIDController(rtol=1e-10, atol=1e-12),
             adjoint=None,
-            max_steps=256,
+            max_steps=max_steps,
         ).ys[0][-1]
 
     np.testing.assert_allclose(jax.hessian(state)(2.0), np.exp(-2.0), rtol=1e-8)
