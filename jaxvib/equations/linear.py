@@ -268,7 +268,7 @@ class JammedModel(ExcitedModel):
         Source: Filimonikhin et al. 2022, section 4; the antiphase paper, equations (25)-(29).
         """
         if self.mount.gyroscopic is not None and speed is None:
-            problem = "jam modes are defined for platforms; use phase_jams, or jam_orbit near a load speed"
+            problem = "jam modes are not defined with gyroscopic coupling; use phase_jams, or jam_orbit near a load speed"
             raise InputError("machine.kind", f"is {quoted(self.scene.machine.kind)}; {problem}")
         return super().displacement(omega, speed)
 

@@ -83,7 +83,7 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     one_plane = TEMPLATES["rotor"].replace("stations = [0.28, 0.25, -0.25, -0.28]", "stations = 0.1")
     (tmp_path / "one_plane.toml").write_text(one_plane)
     code, _, err = typed("modes", "one_plane.toml", "--exact")
-    assert code == 2 and "machine.kind is 'rotor'; jam modes are defined for platforms; use phase_jams" in err
+    assert code == 2 and "machine.kind is 'rotor'; jam modes are not defined with gyroscopic coupling; use phase_jams" in err
     code, _, err = typed("whirl", "stations.toml", "--speed", "-5 rad/s")
     assert code == 2 and "--speed is -5 rad/s; it must be at least 0" in err
 
