@@ -178,7 +178,7 @@ def tolerance_table(ranges: Sequence[ToleranceRange], tolerances: Sequence[str])
         unit, factor = shown_unit(entry.unit, max(abs(entry.design), abs(entry.high)))
         values = [f"{factor * x:.4g}" for x in (entry.design, entry.low, entry.high, entry.worst)]
         rows.append([f"{entry.words}, {unit}".rstrip(", "), *values, f"{100.0 * entry.share:.3g} %"])
-    head = ["light loads", "design", "95 % from", "to", "worst", "share with this quantity, or meeting the demand"]
+    head = ["leading order", "design", "95 % from", "to", "worst", "machines where it exists, or the demand is met"]
     return table(f"machines with {', '.join(tolerances)}", head, rows)
 
 

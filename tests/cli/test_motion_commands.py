@@ -392,6 +392,8 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     scene = jv.load_scene(tmp_path / "screen.toml")
     np.testing.assert_allclose(shown, jv.working_regime(scene).ellipse((0.4, 0.1), slope="-5 deg").throw_number, rtol=5e-3)
     deck = ("--deck", "0.4,0.1", "--slope", "-5 deg")
+    out = typed("regimes", "screen.toml", "--tolerance", "stiffness=5%", *deck)[1]
+    assert "leading order" in out and "light loads" not in out  # the exciters have no loads
     out = typed("regimes", "screen.toml", "--tolerance", "stiffness=5%", *deck, "--json")[1]
     speed, *others = json.loads(out)["tolerances"]
     assert [each["words"].partition(" at ")[0] for each in others[:3]] == ["stroke", "throw angle", "throw number"]
