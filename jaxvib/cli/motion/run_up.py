@@ -44,7 +44,7 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random angles.")
 @SEPARATION
 @click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-7].")
-@click.option("--batch", type=int, default=16, show_default=True, help="Number of run-ups computed in parallel.")
+@click.option("--batch", type=int, default=16, show_default=True, help="Number of run-ups that advance together on each core.")
 @shared
 def run_up_map(scene: Path, drags: tuple[str, ...], tolerance: float | None, output: Output, **options: Any) -> None:
     """Compute run-ups of SCENE from rest for each drag and each set of initial angles, and report the final regimes."""
