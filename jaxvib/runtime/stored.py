@@ -69,9 +69,9 @@ class StoredFunction(Generic[T]):
     """Compiled function of trees of arrays and hashable values, whose programs are stored on disk.
 
     The key of a stored program contains everything on which the program depends: the shapes and types of arrays, the static
-    parts of the arguments, JAX's options, the versions of packages, the sources, and the CPU. If the programs in memory
-    exceed `MAX_PROGRAMS_IN_MEMORY` or `MAX_PROGRAM_MEMORY`, the least recently used ones are freed and later read or traced
-    again.
+    parts of the arguments, JAX's options, the versions of packages, the sources, the devices, the flags of XLA, and the CPU. If
+    the programs in memory exceed `MAX_PROGRAMS_IN_MEMORY` or `MAX_PROGRAM_MEMORY`, the least recently used ones are freed and
+    later read or traced again.
 
     Some programs cannot be stored. They are traced in each process, and again after they were freed:
 
