@@ -88,7 +88,7 @@ def export_fmu(
       during a simulation. `co_simulation.step`, s, is the longest step of co-simulation, which uses the classical Runge-Kutta
       method of order 4
     - Outputs are the states (`displacement.y1`, `velocity.y1`, `angle.load1`, `rate.load1`), `acceleration.y1`,
-      `foundation_force.up`, `rotor.angle` and `rotor.speed`
+      `foundation_force.up` (unless the foundation is unknown), `rotor.angle` and `rotor.speed`
     - Inputs are `force.y1` on each coordinate (N, for angles N m) and, with a motor, `rotor.torque` (N m, anticlockwise), which
       is added to the torque of the motor
     - In a scene with several exciters, the names of their signals begin with the exciter, such as `exciters[1].rotor.torque`

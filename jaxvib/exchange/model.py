@@ -50,9 +50,15 @@ def force_inputs(carrier: Carrier) -> tuple[Signal, ...]:
     return tuple(Signal(f"force.{coordinate}", "N" if unit == "m" else "N m") for coordinate, unit in named)
 
 
-def foundation_forces(carrier: Carrier) -> tuple[Signal, ...]:
-    """Return the signals of the force on the foundation."""
-    return tuple(Signal(f"foundation_force.{direction}", "N") for direction in carrier.foundation_directions)
+def foundation_forces(machine: Machine) -> tuple[Signal, ...]:
+    """Return the signals of the force on the foundation; () if the foundation is unknown."""
+    directions = machine.structure().foundation_directions if machine.has_foundation else ()
+    return tuple(Signal(f"foundation_force.{direction}", "N") for direction in directions)
+
+
+def known_forces(machine: Machine, force: Array) -> Array:
+    """Return the force on the foundation without entries if the foundation is unknown, see `foundation_forces`."""
+    return force if machine.has_foundation else force[:0]
 
 
 class _AppliedForce(Effect):
@@ -177,7 +183,7 @@ def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
     if by_input:
         start = without_motor_states(start)
     rotors, angles = [], []
-    input_signals, output_signals = list(force_inputs(carrier)), list(foundation_forces(carrier))
+    input_signals, output_signals = list(force_inputs(carrier)), list(foundation_forces(scene.machine))
     angle_signals = []
     for k, exciter in enumerate(scene.exciters):
         angle, speed, acceleration, torque = _rotor_signals(scene.prefix_of(k))
@@ -200,7 +206,7 @@ def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
         driven_exciters = [_with_input_drive(exciter, angle, inputs, by_input) for exciter, angle, inputs in cases]
         forced = Scene(scene.machine, exciters=driven_exciters, effects=(*scene.effects, _AppliedForce(values.force)))
         rate = dynamics_of(assemble(forced), solve_definite)(t, state)
-        force = assemble(scene).foundation_force(state.displacement, state.velocity)
+        force = known_forces(scene.machine, assemble(scene).foundation_force(state.displacement, state.velocity))
         are_outputs = [exciter.drive.ideal and not by_input for exciter in scene.exciters]
         turning = [exciter.turning_drive for exciter in scene.exciters]
         rotor_outputs = [

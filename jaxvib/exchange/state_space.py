@@ -16,7 +16,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.averaged import Amplitudes, averaged_field
 from jaxvib.equations.linear import linear_model, mean_speed
 from jaxvib.errors import InputError, optional_module, quoted, require_writable, with_ending, written
-from jaxvib.exchange.model import Signal, coordinate_signals, force_inputs, foundation_forces
+from jaxvib.exchange.model import Signal, coordinate_signals, force_inputs, foundation_forces, known_forces
 from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import SupportForce
@@ -145,8 +145,8 @@ def state_space(
       exciters
     - the mass matrix M includes the masses of the loads; the stiffness matrix K and the damping matrix R include the linear
       parts of nonlinear supports; G is the gyroscopic matrix
-    - the last output is the force on the foundation; F_K and F_R contain stiffness and damping of the supports on the
-      foundation
+    - the last output is the force on the foundation, which is omitted if the foundation is unknown (`from_matrices`); F_K and
+      F_R contain stiffness and damping of the supports on the foundation
 
     In a jam, the model is the linearization of the averaged equations (`envelope`) about the jam:
 
@@ -196,7 +196,7 @@ def _model_at_rest(scene: Scene, speed: Array) -> StateSpace:
         for k, exciter in enumerate(scene.exciters)
         for axis in scene.machine.mounting(exciter.at).axes
     ]
-    outputs = (*states, *coordinate_signals(carrier, "acceleration", 2), *foundation_forces(carrier))
+    outputs = (*states, *coordinate_signals(carrier, "acceleration", 2), *foundation_forces(scene.machine))
     inputs = (*force_inputs(carrier), *(Signal(place, "N") for place in places))
     x0, u0, y0 = (np.zeros(len(signals)) for signals in (states, inputs, outputs))
     return StateSpace(a, b, c, d, states, inputs, outputs, x0, u0, y0, _AT_REST.format(speed=float(speed)))
@@ -220,10 +220,9 @@ def _rest_matrices(scene: Scene, speed: Array) -> tuple[Array, Array, Array, Arr
     no_force = jnp.zeros_like(forces)
     a = jnp.block([[zero, identity], [solved[:, : 2 * nd]]])
     b = jnp.concatenate([no_force, solved[:, 2 * nd :]])
-    c = jnp.concatenate([jnp.eye(2 * nd, dtype=model.mass.dtype), solved[:, : 2 * nd], jnp.concatenate(foundation, axis=1)])
-    d = jnp.concatenate(
-        [no_force, no_force, solved[:, 2 * nd :], jnp.zeros((len(foundation[0]), forces.shape[1]), forces.dtype)]
-    )
+    reaction = known_forces(scene.machine, jnp.concatenate(foundation, axis=1))
+    c = jnp.concatenate([jnp.eye(2 * nd, dtype=model.mass.dtype), solved[:, : 2 * nd], reaction])
+    d = jnp.concatenate([no_force, no_force, solved[:, 2 * nd :], jnp.zeros((len(reaction), forces.shape[1]), forces.dtype)])
     return a, b, c, d
 
 
@@ -250,7 +249,8 @@ def _model_in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
         *(Signal(f"rate.load{j}", "rad/s") for j in loads),
         *(Signal(f"phase.load{j}", "rad") for j in loads[1:]),
     ]
-    outputs = [Signal("load_speed", "rad/s"), *coordinate_signals(carrier, "amplitude", 0), *foundation_forces(carrier)]
+    outputs = [Signal("load_speed", "rad/s"), *coordinate_signals(carrier, "amplitude", 0)]
+    outputs += foundation_forces(scene.machine)
     about = _IN_JAM.format(omega=float(jam.omega), speed=float(jam.rotor_speed))
     inputs = (Signal("rotor_speed", "rad/s"),)
     return StateSpace(a, b, c, d, tuple(states), inputs, tuple(outputs), x0, np.atleast_1d(jam.rotor_speed), y0, about)
@@ -280,7 +280,7 @@ def _jam_matrices(
 
     def outputs(x: Array, speed: Array) -> Array:
         moving = amplitudes(x)
-        force = carrier.foundation_force(moving.displacement, moving.velocity)
+        force = known_forces(scene.machine, carrier.foundation_force(moving.displacement, moving.velocity))
         return jnp.concatenate([jnp.mean(moving.rate)[None], magnitude(moving.displacement), magnitude(force)])
 
     turned = displacement * jnp.exp(-1j * phase[0])

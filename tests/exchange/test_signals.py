@@ -92,6 +92,14 @@ def test_known_angles_and_forces_are_outputs():
     assert change[0] == pytest.approx(9.0 / 900.0, rel=0.05) and change[2] == pytest.approx(3.0 / 300.0, rel=0.3)
 
 
+def test_unknown_force_on_the_foundation_is_no_output():
+    machine = jv.from_matrices([[50.0]], [[30.0]], [[4e4]], places=[[0]])
+    scene = jv.Scene(machine, jv.balls(**BALLS), jv.ConstantSpeed(60.0))
+    found = equations_of(scene, jv.initial_state(scene), "scene")
+    _, outputs = found.rates(scene, jnp.zeros(()), found.states, found.inputs)
+    assert names(found.output_signals) == ["rotor.angle, rad", "rotor.speed, rad/s"] and outputs.foundation_force.shape == (0,)
+
+
 def test_inputs_turn_the_rotors():
     """Anticlockwise inputs of the prescribed rotors, and a torque in place of the motor's own, equal the scene's drives."""
     scene, t = body(), jnp.asarray(1.7)

@@ -115,6 +115,16 @@ def test_jam_of_opposite_loads_has_its_growth():
         assert np.max(jv.state_space(scene(), jam).poles().real) == pytest.approx(float(jam.growth), rel=1e-7)
 
 
+@pytest.mark.parametrize("in_jam", [False, True])
+def test_unknown_force_on_the_foundation_is_no_output(in_jam):
+    machine = jv.from_matrices([[50.0]], [[30.0]], [[4e4]], places=[[0]])
+    turning = jv.Scene(machine, jv.balls(**BALLS), jv.ConstantSpeed(60.0))
+    found = jv.state_space(turning, jv.jam_modes(turning).select(1) if in_jam else "rest")
+    names = ["load_speed", "amplitude.q1"] if in_jam else ["displacement.q1", "velocity.q1", "acceleration.q1"]
+    assert [each.name for each in found.outputs] == names
+    assert len(found.C) == len(found.D) == len(found.y0) == len(names)
+
+
 def test_state_of_a_jam_does_not_depend_on_its_common_phase():
     """All phases are shifted by 0.3 rad, and the complex amplitudes with them."""
     jam = jv.phase_jams(scene()).select(0)
