@@ -22,7 +22,7 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
 
     Newton's method solves (n(w) - w)^(-1/2) = (n - w)^(-1/2), see `rotor_speed_at`. Near a resonance w_r the left side is
     almost proportional to |w - w_r|; a few steps are therefore sufficient even from a distant start. `jam_modes` computes the
-    whole branch, which takes a hundred times as long, and determines the number of the mode. This function keeps the number,
+    whole branch, which takes about fifty times as long, and determines the number of the mode. This function keeps the number,
     and does not detect that modes exchange their numbers.
 
     **Returns** `Jam`, with NaN if the iteration has not converged or ended on a piece of the branch with the wrong sign of the

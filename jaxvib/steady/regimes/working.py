@@ -55,7 +55,7 @@ def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
     reach from most initial states. (A minimum can be unstable if the rotors are light; such a regime is not returned.) If none
     of these regimes is stable, groups of slower regimes follow, each 5 % wide.
 
-    The search takes a hundredth of the time of `synchronous_regimes`, and works under `jit`, `vmap` and `grad`. Derivatives are
+    The search takes 1/50 to 1/5 of the time of `synchronous_regimes`, and works under `jit`, `vmap` and `grad`. Derivatives are
     those of the implicit function theorem. With more than 6 exciters, each start is first moved toward a stable regime, as in
     `synchronous_regimes`.
 
