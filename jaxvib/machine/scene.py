@@ -150,7 +150,8 @@ def unbalance(*, force: Number, at: Number) -> Array:
     - `force` F, N, at that speed; typical: "1 kN" to "200 kN"
     - `at` w, rad/s: the speed at which the force is stated; typical: "750 rpm" to "3000 rpm"
 
-    **Returns** S, kg m. **Raises** `InputError` for a wrong unit or a value that is not positive.
+    **Returns** S, kg m. **Raises** `InputError` for a wrong unit, a value that is not positive, and a plain number above 700
+    for the speed, which was probably meant in rpm.
 
     >>> import jaxvib as jv
     >>> round(float(jv.unbalance(force="20 kN", at="1000 rpm")), 4)

@@ -168,7 +168,7 @@ def torus_balls(
 
     - wrong units and values that are not positive
     - a ball that fills its tube or is larger
-    - a tube wider than its ring
+    - a `tube` that is not less than the `radius` of the ring
     - balls that have no room side by side on the outer equator
 
     >>> import jaxvib as jv
