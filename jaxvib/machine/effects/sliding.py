@@ -29,8 +29,8 @@ class FreeSpin(Effect):
     - A point contact exerts no moment about its normal. The ball's angular velocity about the normal therefore changes only
       with the direction of the normal, s' = Omega . n' + (w cos a)'
     - While f' is constant, s grows by (w B - R f')/r per radian of a, the angle up the wall. On a ball that left the equator
-      with s = 0 the restoring torque is then that of a point mass, m rho B f'^2 per radian, instead of
-      m rho B (7/5 f'^2 - 2/5 w f'); only its inertia contains kappa. Real contacts lie between the two
+      with s = 0 the restoring torque per radian is then m rho (B + 2 rho/5) f'^2, almost that of a point mass (m rho B f'^2). A
+      ball without free spin has m rho B (7/5 f'^2 - 2/5 w f'). Real contacts lie between the two
 
     The effect needs an ideal drive; the acceleration of the wall when w changes is neglected, as in `TorusBalls`.
 

@@ -179,8 +179,11 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
 
 
 def _fold_near(balance: TorqueBalance, x: Array, factor: Array) -> tuple[Array, Array, Slopes]:
-    """Return the unknowns, the factor and the slopes at the fold near a regime: residuals r = 0 and
-    J v = 0, with v0 . v = 1 for the vector v0 of the smallest singular value at `x`."""
+    """Return the unknowns, the factor and the slopes at the fold near a regime.
+
+    At the fold the residuals are 0, and their Jacobian J with respect to the unknowns is singular: J v = 0. The length of v is
+    fixed by v0 . v = 1, where v0 is the vector of the smallest singular value at `x`.
+    """
     begin = slopes_of(x, balance, factor)
     normal = begin.right[-1] / begin.columns
     normal = normal / jnp.sqrt(jnp.sum(normal**2))
