@@ -42,7 +42,8 @@ def _platforms(scene: Scene, least: int) -> Platforms:
     if not isinstance(scene, Scene) or not isinstance(scene.machine, Platforms):
         raise InputError("scene", "needs a machine of platforms for this recipe")
     if scene.machine.mass.shape[0] < least:
-        raise InputError("scene", f"has {scene.machine.mass.shape[0]} platforms; this recipe needs at least {least}")
+        count_text = "1 platform" if scene.machine.mass.shape[0] == 1 else f"{scene.machine.mass.shape[0]} platforms"
+        raise InputError("scene", f"has {count_text}; this recipe needs at least {least}")
     return scene.machine
 
 
@@ -91,7 +92,9 @@ def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
     """Return the design task for an antiphase machine of two masses: least foundation force per relative amplitude.
 
     The frequency of the jam and the sum of the squared support frequencies (k_i/M_i over the platforms) keep their values.
-    Each spring may be changed by a factor of up to `range_`.
+
+    **Arguments**: `scene`: platforms with loads; `mode`: number of the jam mode (default 3); `range_`: largest factor by which
+    each spring may become stiffer or softer; typical: 2 to 10 (default 5).
 
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
 
@@ -118,6 +121,8 @@ def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
     displacement of platform 1 relative to platform 3. Without damping and without a link 1-3, a natural mode of the frequency w
     leaves the middle platform (2) at rest if (k1 + k12)/M1 = (k3 + k23)/M3 = w^2, with the stiffnesses k1 and k3 of the
     supports.
+
+    **Arguments**: `scene`: at least three platforms with loads; `mode`: number of the jam mode; `range_`: as for `antiphase`.
 
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
 
@@ -174,9 +179,11 @@ def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[
 def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[int, int] | None = None) -> Design:
     """Return the design task for springs with which the rotor speed is farthest from the folds of a jam mode.
 
-    The jam mode then exists over a wide range of rotor speeds on both sides of the present one. The objective, to be maximized,
-    is the distance of the rotor speed from the nearer fold, above or below. The amplitude must be at least `keep` times the
-    present amplitude.
+    The jam mode then exists over a wide range of rotor speeds on both sides of the present one. The distance of the rotor speed
+    from the nearer fold, above or below, is maximized. The stiffness of each spring may be changed by a factor of up to 3.
+
+    **Arguments**: `scene`: platforms with loads; `mode` and `of`: as for `amplitude`; `keep`: smallest allowed amplitude,
+    relative to the present one; typical: 0.7 to 1 (default 0.9).
 
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` if `keep` is not greater than 0 and
     at most 1.
@@ -205,14 +212,15 @@ def linear_screen(
     """Return the design task for a linear screen: all points of the deck have the same motion, along a line of given angle.
 
     The objective is the spread of the motions over the deck (`motion_spread`). The motion of the mean of the `points` has the
-    given throw angle and stroke. The positions of the exciters and their unbalances are free; the unbalances keep their ratios.
+    given throw angle and stroke. The positions of the exciters and their unbalances are free. The unbalances keep their ratios;
+    they may change by a factor of up to 3.
 
     **Arguments**
 
     - `scene`: a body in a plane with at least two exciters; typical: two equal motors that turn in opposite directions
     - `points` of the deck, (x, y), m or text, from the centre of mass; typical: feed end and discharge end
-    - `angle` of throw from the horizontal, rad or text; typical: "40 deg" to "50 deg" (default 45). If the deck descends in the
-      direction of x, it is the angle to the deck minus the angle of descent
+    - `angle` of throw from the horizontal, rad or text; typical: "40 deg" to "50 deg" (default 45). For a deck that descends in
+      the direction of x, give the throw angle relative to the deck minus the angle of descent
     - `stroke`, m peak to peak; typical: 6 to 12 mm; default: that of the scene
     - `reach`: distance by which each coordinate of an exciter may change, m; typical: 0.1 to 0.5 (default 0.3)
 
@@ -236,8 +244,7 @@ def circular_screen(
     """Return the design task for a circular screen: all points of the deck have the same motion, on a circle.
 
     The objective is the spread of the motions over the deck (`motion_spread`). The motion of the mean of the `points` has the
-    given stroke, and its roundness must be at least 0.9. The positions of the exciters and their unbalances are free; the
-    unbalances keep their ratios.
+    given stroke, and its roundness must be at least 0.9. The free parameters are those of `linear_screen`.
 
     **Arguments**: `scene`: a body in a plane, typical: with one exciter; `points`, `stroke`, `reach` as for `linear_screen`.
 
@@ -262,8 +269,8 @@ def feeder(
     """Return the design task for a feeder: least foundation force per amplitude of the trough, for a given throw angle and
     stroke.
 
-    The motion of the mean of the `points` has the given throw angle and stroke. The positions of the exciters, their unbalances
-    and the stiffness of the supports are free; the unbalances keep their ratios.
+    The motion of the mean of the `points` has the given throw angle and stroke. The free parameters are those of
+    `linear_screen` and the stiffness of the supports.
 
     **Arguments**
 

@@ -38,7 +38,7 @@ class SynthesisStatus(eqx.Enumeration):
 
     done = "the search converged: no small change of the free parameters improves the objective"
     not_converged = "the search has not converged: allow more polishing or more iterations"
-    contradictory = "no design in the bounds meets all demands"
+    contradictory = "no design within the bounds meets all demands"
     interrupted = "the search was interrupted: this is its best design"
 
 

@@ -261,8 +261,9 @@ def _contradictions(fitted: Fitted) -> Iterator[str]:
 class Disagreement(NamedTuple):
     """Deviation of a run from other runs.
 
-    **Attributes**: `p_value` of a deviation as large as this one if the machine is the same; `name` of the parameter whose
-    change explains most of the deviation; `change` of this parameter, relative (of an angle: in rad), and its standard `error`.
+    **Attributes**: `p_value`: probability of a deviation at least as large as this one if the machine is the same; `name` of
+    the parameter whose change explains most of the deviation; `change` of this parameter, relative (of an angle: in rad), and
+    its standard `error`.
     """
 
     p_value: float

@@ -57,7 +57,7 @@ class RunPrediction(Result):
     **Attributes** (C channels, n samples)
 
     - `status`: a `PredictionStatus`; `notes`: sentences for the reader
-    - `p_value` of a deviation as large as this one, if the machine is the same
+    - `p_value`: probability of a deviation at least as large as this one if the machine is the same
     - `channels` (C,): names; `noise` (C,), SI: standard deviation of the residuals; `ratio` (C,) of this standard deviation to
       that of the fit, both at the lower one of the two sampling rates; NaN for a channel that the fit does not have
     - `time` (n,) s, `readings` and `predicted` (n, C), SI, NaN for samples that do not count

@@ -49,7 +49,7 @@ class Decrement(Result):
     - `viscous` mu1, N m s: an `Estimate`; typical: 3e-4 to 2e-3
     - `estimates` (n,): mu1 of each pair, first to last, N m s
     - `amplitude` (n,): amplitude of the first swing of each pair, rad
-    - `scatter`: largest relative deviation of an estimate from their mean
+    - `scatter`: largest relative deviation of an estimate from the mean of all estimates
     - `drift`: mu1 of the last pair minus mu1 of the first pair, in standard errors
     - `period`, s
     - `periods`: number of periods between the two swings of a pair
@@ -216,8 +216,8 @@ def ten_periods(
     - The amplitude of small swings with viscous friction decays as exp(-mu1 t/(2 J)); the first line follows from this law
     - In one period, a large swing of amplitude A loses an energy of mu1 times the integral of the angular speed over the angle.
       With the complete elliptic integrals K and E of modulus sin(A/2) it follows that A' = -(mu1/J)/G'(A). The second line is
-      the integral of this equation. This function computes the second line. Beyond 60 deg an error of 0.1 % remains, which the
-      interval includes
+      the integral of this equation. This function computes the second line. Beyond 60 deg an error of 0.1 % is assumed, and the
+      interval includes it
     - Beyond 90 deg the error of the turning points is unknown, and the interval is 0 to infinity; `identify` gives a finite
       interval in this case
     - Dry friction is neglected. If it is present, it increases the result by 4 T_f/(pi w A) (torque T_f of the friction,
