@@ -39,6 +39,34 @@ def test_quadratic_programs_meet_their_conditions():
     assert np.all(one.demands >= 0.0) and np.all(p >= low) and np.all(p <= high)
 
 
+def solution_without_violations(hessian, slope, demands):
+    """Exact minimum of p.B p/2 + g.p with C p + c <= 0, by trial of all active sets; the multipliers of the two demands."""
+    rows, excess = demands
+    for active in ([], [0], [1], [0, 1]):
+        m = len(active)
+        matrix = np.block([[hessian, rows[active].T], [rows[active], np.zeros((m, m))]])
+        p, multipliers = np.split(np.linalg.solve(matrix, np.concatenate([-slope, -excess[active]])), [len(slope)])
+        if np.all(rows @ p + excess < 1e-9) and np.all(multipliers > -1e-9):
+            return p, np.max(multipliers, initial=0.0)
+    raise AssertionError
+
+
+@pytest.mark.parametrize("penalty", [10.0, 1e3, 1e6])
+def test_large_penalty_does_not_change_the_solution(penalty):
+    random = np.random.default_rng(0)
+    s, d, box = 100, 3, 30.0
+    root = random.normal(size=(s, d, d))
+    hessian, slope = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(d), random.normal(size=(s, d))
+    demands = random.normal(size=(s, 2, d)), -np.abs(random.normal(size=(s, 2)))
+    bounds = np.full((s, d), -box), np.full((s, d), box)
+    none = np.zeros((s, 0, d)), np.zeros((s, 0))
+    found = solve_penalized(hessian, slope, none, demands, bounds, np.full(s, penalty))
+    exact, multipliers = zip(*map(solution_without_violations, hessian, slope, zip(*demands, strict=True)), strict=True)
+    counts = (np.array(multipliers) < penalty) & (np.max(np.abs(exact), axis=1) < box)
+    assert counts.sum() > 90
+    np.testing.assert_allclose(found.p[counts], np.array(exact)[counts], atol=1e-8 * penalty + 1e-6)
+
+
 def test_quadratic_program_is_independent_of_its_batch(monkeypatch):
     """Two systems of equations a step, and some twenty steps are usual of Mehrotra's method; an easy program beside hard ones
     ends before them."""
