@@ -35,13 +35,14 @@ def divide(scene: Scene, count: int, step: float, readings: Mapping[str, float])
     """
     fastest, slowest = (float(each) for each in frequency_bounds(scene))
     acceleration = max((value * fastest ** _ORDERS[kind] for kind, value in readings.items() if kind in _ORDERS), default=0.0)
-    fastest = max(fastest, _stop_frequency(scene))
-    longest, is_stiff = equal_step_length(fastest, float(machine_decay(scene)), _STEPS_PER_RADIAN)
+    frequency, decay = _rates_with_stops(scene)
+    fastest, decay = max(fastest, frequency), max(float(machine_decay(scene)), decay)
+    longest, is_stiff = equal_step_length(fastest, decay, _STEPS_PER_RADIAN)
     if is_stiff:
         raise InputError(
             "scene",
-            "has a decay rate much higher than the frequencies of the vibration; reduce loads.drag or machine.damping, or "
-            "increase the width of effects.friction_support",
+            "has a decay rate much higher than the frequencies of the vibration; reduce loads.drag, machine.damping or the "
+            "damping of stops, or increase the width of effects.friction_support",
         )
     for effect in scene.effects:
         if isinstance(effect, FrictionSupport) and acceleration > 0.0:
@@ -50,13 +51,19 @@ def divide(scene: Scene, count: int, step: float, readings: Mapping[str, float])
     return number, -(-count // number), max(1, math.ceil(step / longest))
 
 
-def _stop_frequency(scene: Scene) -> float:
-    """Return the highest natural frequency while all stops are in contact, rad/s; 0 without stops."""
-    model = linear_model(scene)
-    stiffness = np.array(model.carrier.stiffness)
+def _rates_with_stops(scene: Scene) -> tuple[float, float]:
+    """Return the highest natural frequency, rad/s, and the fastest decay rate, 1/s, while all stops are in contact; 0 without
+    stops."""
     stops = [effect for effect in scene.effects if isinstance(effect, Stop)]
+    if not stops:
+        return 0.0, 0.0
+    model = linear_model(scene)
+    stiffness, damping = np.array(model.carrier.stiffness), np.array(model.carrier.damping)
     for stop in stops:
         rows = np.asarray(stop.rows(scene.machine))
         stiffness += float(stop.stiffness) * rows.T @ rows
-    squares = np.linalg.eigvals(np.linalg.solve(np.asarray(model.mass), stiffness)).real
-    return math.sqrt(float(np.max(squares))) if stops else 0.0
+        damping += float(stop.damping) * rows.T @ rows
+    square, decay = (
+        float(np.max(np.linalg.eigvals(np.linalg.solve(np.asarray(model.mass), each)).real)) for each in (stiffness, damping)
+    )
+    return math.sqrt(square), decay

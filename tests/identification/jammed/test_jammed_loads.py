@@ -235,5 +235,5 @@ def test_loads_that_are_not_included_are_refused():
     refused(scene, "Parameters of a drive can be unknown only if .* no loads", unknown=["drive.inertia"])
     refused(
         scene.replace(loads=jv.balls(count=1, mass=0.8, radius=RADIUS, drag=1e7)),
-        "reduce loads.drag or machine.damping, or increase",
+        "reduce loads.drag, machine.damping or the damping of stops",
     )

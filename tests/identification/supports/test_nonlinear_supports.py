@@ -20,6 +20,7 @@ from jaxvib.equations.model import assemble
 from jaxvib.equations.state import State
 from jaxvib.identification.fit import project
 from jaxvib.identification.jammed.motion import _recorded, closed_motion, linearized
+from jaxvib.identification.jammed.segments import divide
 from jaxvib.identification.problem import build_problem
 from jaxvib.identification.supports import start
 from jaxvib.identification.supports.contact import FixedContactStop, switched_step, with_fixed_contact
@@ -287,6 +288,21 @@ def refused(scene, words, names=("machine.stiffness",), channels=()):
         run = dataclasses.replace(run, channels=(*run.channels, channel), **same)
     with pytest.raises(jv.InputError, match=words):
         jv.identify(scene, run, unknown=names)
+
+
+def test_steps_resolve_the_damping_of_a_stop():
+    """The method of order 8 diverges if the decay rate times the step is above 5.2."""
+    machine, drive, step = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0), jv.RunUp(50.0, acceleration=5.0), 0.005
+
+    def steps_per_sample(damping):
+        stop = jv.Stop(2e5, gap=2e-3, damping=damping)
+        scene = jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=0.05)], effects=(stop,))
+        return divide(scene, 2000, step, {"velocity": 0.1})[2]
+
+    assert steps_per_sample(300.0) == 1
+    assert (1e5 + 60.0) / 50.0 * step / steps_per_sample(1e5) <= 3.0
+    with pytest.raises(jv.InputError, match="or the damping of stops"):
+        steps_per_sample(1e7)
 
 
 def test_scenes_with_supports_that_are_not_included_are_refused():
