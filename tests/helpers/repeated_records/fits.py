@@ -53,13 +53,15 @@ class Repeated:
     """Fits of repeated records.
 
     **Attributes** (r records, p numbers): `away` (r, p), distances from the truth relative to the standard error; `relative`
-    (r, p), relative errors; `bound` (p,), Cramer-Rao bound; `statuses` (r,).
+    (r, p), relative errors; `bound` (p,), Cramer-Rao bound; `statuses` (r,); `linear` (r, p), relative errors of the linearized
+    fit to the same noise, computed for records with nonlinear supports only.
     """
 
     away: np.ndarray
     relative: np.ndarray
     bound: np.ndarray
     statuses: np.ndarray
+    linear: np.ndarray | None = None
 
     @property
     def wrong(self):
@@ -75,6 +77,19 @@ class Repeated:
     def ratio(self):
         """Standard deviation (p,) of the errors relative to the Cramer-Rao bound, wrong minima left out."""
         return np.sqrt(np.mean(self.relative[~self.wrong] ** 2, axis=0)) / self.bound
+
+    @property
+    def linear_held(self):
+        """Share (p,) of the intervals of the linearized fits that contain the true value."""
+        return np.mean(np.abs(self.linear / self.bound) < 1.96, axis=0)
+
+    @property
+    def from_linear(self):
+        """Differences (r, p) between the errors of the fits and those of the linearized fits, relative to the bound.
+
+        With a right method they are small in every record, even if its noise makes the errors large.
+        """
+        return (self.relative - self.linear) / self.bound
 
     @property
     def row(self):
@@ -109,7 +124,7 @@ def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None
     if support:
         truth, scene = supports.truth(support), supports.scene_of
         names = [*NAMES, *(name for name in truth if name.startswith("effects") and "width" not in name)]
-    away, relative, statuses, order = [], [], [], ()
+    away, relative, statuses, runs, order = [], [], [], [], ()
     for k in range(count):
         rng = np.random.default_rng([seed, k])
         if balls:
@@ -128,13 +143,17 @@ def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None
         away.append((found[0] - true) / found[1])
         relative.append(found[0] / true - 1.0)
         statuses.append(fit.status_name)
+        runs.append(run)
         order = fit.names
     options.pop("full_scale", None)
+    linear = None
     if support:
-        least = supports.bound(support, order, NOISE)
+        estimates, clean = supports.estimator(support, order), supports.clean_motion(support)
+        least = supports.bound(estimates, NOISE)
+        linear = np.array([supports.linear_errors(estimates, run, clean) for run in runs])
     else:
         least = jammed.bound(order, JAMMED_NOISE, **options) if balls else _bound(turning, **options)
-    return Repeated(np.array(away), np.array(relative), least, np.array(statuses))
+    return Repeated(np.array(away), np.array(relative), least, np.array(statuses), linear)
 
 
 def _bound(turning, color=0.0, gain_error=0.0, outliers=0.0, resolution=0.0, pulses=24, **_):

@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 from run_ups_by_scipy import TRUTH as MACHINE
-from run_ups_by_scipy import ramp, record
+from run_ups_by_scipy import pulse_times, ramp, record
 from run_ups_by_scipy import scene_of as linear_scene_of
 from scipy.integrate import solve_ivp
 
@@ -72,20 +72,37 @@ def motion(numbers, first=(0.0,) * 4, phase=0.4, times=TIMES, turning=ramp):
     return np.array(found)
 
 
-def bound(kind, names, noise):
-    """Return the Cramer-Rao bound of the relative standard errors of `names`; states, offsets and phase are free."""
+def estimator(kind, names, times=TIMES):
+    """Return the matrix (numbers, n, 2) from the noise of a record to the relative errors of `names` in the linearized fit.
+
+    The derivatives of the motion are differences of those by SciPy; states, offsets and phase are free. The rows for white
+    noise of standard deviation 1 have the lengths of the Cramer-Rao bound. Samples before the first pulse do not count,
+    because the angle of the rotor is unknown.
+    """
     step, numbers, columns = 1e-4, truth(kind), []
     for name in names:
-        high, low = (motion(numbers | {name: numbers[name] * (1.0 + sign * step)}) for sign in (1.0, -1.0))
+        high, low = (motion(numbers | {name: numbers[name] * (1.0 + sign * step)}, times=times) for sign in (1.0, -1.0))
         columns.append((high - low) / (2.0 * step))
     for unit in 1e-3 * np.eye(4):
-        columns.append((motion(numbers, step * unit) - motion(numbers, -step * unit)) / (2.0 * step))
-    columns.append((motion(numbers, phase=0.4 + step) - motion(numbers, phase=0.4 - step)) / (2.0 * step))
-    columns += list(np.repeat(np.eye(2)[:, None], TIMES.size, axis=1))
-    slopes = np.stack(columns, axis=-1).reshape(-1, len(columns)) / noise
+        high, low = (motion(numbers, sign * step * unit, times=times) for sign in (1.0, -1.0))
+        columns.append((high - low) / (2.0 * step))
+    high, low = (motion(numbers, phase=0.4 + sign * step, times=times) for sign in (1.0, -1.0))
+    columns += [(high - low) / (2.0 * step), *np.repeat(np.eye(2)[:, None], times.size, axis=1)]
+    used = times >= pulse_times(ramp, float(times[-1]), 24)[1][0]
+    slopes = (np.stack(columns, axis=-1) * used[:, None, None]).reshape(-1, len(columns))
     scale = np.linalg.norm(slopes, axis=0)
-    covariance = np.linalg.inv((slopes / scale).T @ (slopes / scale)) / np.outer(scale, scale)
-    return np.sqrt(np.diagonal(covariance)[: len(names)])
+    return (np.linalg.pinv(slopes / scale) / scale[:, None])[: len(names)].reshape(-1, times.size, 2)
+
+
+def bound(estimates, noise):
+    """Return the Cramer-Rao bound of the relative standard errors for an `estimator` and white noise, m/s^2."""
+    return noise * np.linalg.norm(estimates, axis=(1, 2))
+
+
+def linear_errors(estimates, run, clean):
+    """Return the relative errors of the linearized fit by an `estimator` to a record of the `clean` accelerations (n, 2)."""
+    readings = np.stack([run.values[name] for name in ("a1", "a2")], axis=1)
+    return np.einsum("kij,ij->k", estimates, readings - clean)
 
 
 @functools.cache
