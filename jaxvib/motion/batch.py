@@ -17,7 +17,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Measured, Peaks, Trajectory, locate_peaks, measure, trajectory, turning_angles
 from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.motion.analysis.scaled_error import natural_units
-from jaxvib.motion.integrate import angle_wrapping, is_finite
+from jaxvib.motion.integrate import angle_wrapping, is_finite, is_unbounded
 from jaxvib.motion.integration.contacts import Contacts, ContactSolver
 from jaxvib.motion.integration.system import PackedSystem
 from jaxvib.numerics.extrema import NODES
@@ -204,13 +204,15 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     times = begin + spacing * jnp.arange(plan.samples, dtype=dtype)
     window = trajectory(model, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length
-    measured = measure(model, field, times, states, natural_units(scene))
+    unit, last = natural_units(scene), jax.tree.map(lambda leaf: leaf[-1], states)
+    measured = measure(model, field, times, states, unit)
     kind = regime(scene, window) if scene.is_plain else None
+    finite = is_finite(states) & ~is_unbounded(unit, state, last)
     peaks = None
     if part_peaks is not None:
         last_peaks = locate_peaks(model, field, times, states)
         peaks = jax.tree.map(lambda parts, last: jnp.maximum(jnp.max(parts, axis=0), last), part_peaks, last_peaks)
-    return BatchRun(scene, window, measured, kind, speed, jnp.asarray(length, dtype), is_finite(states), peaks)
+    return BatchRun(scene, window, measured, kind, speed, jnp.asarray(length, dtype), finite, peaks)
 
 
 def _prepended(first: IntegratorState, later: IntegratorState) -> IntegratorState:

@@ -32,7 +32,7 @@ from jaxvib.motion.analysis.ensemble_regimes import (
 from jaxvib.motion.analysis.measure import turning_angles, turning_directions
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
 from jaxvib.motion.batch import advance, batch_size, divide_run, pack_batch
-from jaxvib.motion.integrate import is_finite
+from jaxvib.motion.integrate import is_finite, is_unbounded
 from jaxvib.motion.integration.stiffness import is_unresolved
 from jaxvib.motion.integration.system import with_first_derivatives
 from jaxvib.motion.plan import ENSEMBLE_PARTS, EqualSteps, plan_ensemble
@@ -73,7 +73,9 @@ class EnsembleStatus(eqx.Enumeration):
     detached = "the run reached its end, but a load lost contact with its track; the equations keep it on the track"
     not_finite = "the motion grew without bounds"
     refused = REFUSED
-    not_resolved = "the steps are too long for a fast decay, by drag of the loads, damping or a motor: use more steps"
+    not_resolved = (
+        "the steps are too long for contacts or for a fast decay, by drag of the loads, damping or a motor: use more steps"
+    )
 
 
 class Ensemble(Result):
@@ -98,7 +100,8 @@ class Ensemble(Result):
       finite; infinite for 4 steps or fewer, because a run with larger steps does not exist
     - `allowed` (B,): False if `make` returned a scene with a value that its constructor does not allow
     - `finite` (B,): True if the motion stayed finite
-    - `resolved` (B,): False if explicit steps are too long for the fastest decay, which is possible under a JAX transformation
+    - `resolved` (B,): False if explicit steps are too long for the fastest decay, which is possible under a JAX transformation,
+      or if steps are too long for contacts with a `Stop` or between loads (3 steps per contact or fewer)
     - `detached` (B, count): True if, at any stage of any step, the track would have had to pull the load although it can only
       push
     - `steps` of each run
@@ -128,8 +131,10 @@ class Ensemble(Result):
 
         def status_of_run(allowed: Array, finite: Array, detached: Array, resolved: Array) -> EnsembleStatus:
             ended = EnsembleStatus.where(jnp.any(detached), EnsembleStatus.detached, EnsembleStatus.done)
-            failed = EnsembleStatus.where(resolved, EnsembleStatus.not_finite, EnsembleStatus.not_resolved)
-            return EnsembleStatus.where(allowed, EnsembleStatus.where(finite, ended, failed), EnsembleStatus.refused)
+            ended = EnsembleStatus.where(finite, ended, EnsembleStatus.not_finite)
+            return EnsembleStatus.where(
+                allowed, EnsembleStatus.where(resolved, ended, EnsembleStatus.not_resolved), EnsembleStatus.refused
+            )
 
         return jax.vmap(status_of_run)(self.allowed, self.finite, self.detached, self.resolved)
 
@@ -287,7 +292,8 @@ def ensemble(
         # method has order 8.
         error = estimated_error(difference, (plan.coarse / plan.each) ** 3, plan.scenes, ends_at_jumps=False)
     unknown = np.asarray(np.nan, plan.end.dtype)
-    resolved = plan.implicit | ~is_unresolved(plan.decay, plan.end / (ENSEMBLE_PARTS * plan.each))
+    step = plan.end / (ENSEMBLE_PARTS * plan.each)
+    resolved = ~is_unresolved(plan.decay, plan.contact, step, implicit=plan.implicit)
     if not plan.is_allowed:
         numbers = last, load_speed, error, finite, resolved, detached
         last, load_speed, error, finite, resolved, detached = jax.vmap(without_numbers)(plan.allowed, numbers)
@@ -384,7 +390,10 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     detached = last.missing != 0.0 if is_watched else jnp.zeros(turning_directions(scene).shape, dtype=bool)
     last, coarse = (State(either.displacement, either.velocity, exciters=either.exciters) for either in (last, coarse))
     angle, _ = turning_angles(scene, lambda: length * jnp.arange(ENSEMBLE_PARTS - 1, ENSEMBLE_PARTS + 1), pair)
-    finite, difference = is_finite(last), scaled_error(last, coarse, error_scale(last, natural_units(scene)))
+    unit, finite = natural_units(scene), is_finite(last)
+    if motion.has_contacts:  # the damper of a contact that is not resolved can amplify a motion that then stays finite
+        finite = finite & ~is_unbounded(unit, state, last)
+    difference = scaled_error(last, coarse, error_scale(last, unit))
     # The error of a run is unknown (infinite) if the coarser run did not stay finite.
     difference = jnp.where(finite & ~is_finite(coarse), jnp.inf, difference)
     return last, (angle[1] - angle[0]) / length, difference, finite, detached, step_counts[0]

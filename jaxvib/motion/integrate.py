@@ -22,7 +22,7 @@ from jaxvib.equations.state import ExciterState, Spin, State
 from jaxvib.errors import InputError
 from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import has_term
-from jaxvib.machine.effects.terms import LoadInteraction, RotorImbalance
+from jaxvib.machine.effects.terms import LoadInteraction, RotorImbalance, Term
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory, unmeasured
 from jaxvib.motion.analysis.scaled_error import natural_units
@@ -103,12 +103,16 @@ def with_jump_times(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeCo
     return diffrax.ClipStepSizeController(controller, jump_ts=jnp.stack(jump_ts))
 
 
-def effects_rate(scene: Scene) -> Array:
-    """Return the fastest rate that effects add to the motion of loads, see `Effect.fastest_rate`; 0 without such effects."""
+def effects_rate(scene: Scene, *kinds: type[Term]) -> Array:
+    """Return the fastest rate that effects add to the motion of loads, see `Effect.fastest_rate`; 0 without such effects.
+
+    **Arguments**: `kinds` of terms: only effects with a term of one of these kinds count; default: all effects.
+    """
     all_rates, zero = [], jnp.zeros_like(scene.exciters[0].drive.speed)
     for exciter in scene.exciters:
         if exciter.loads is not None:
-            rates = [effect.fastest_rate(exciter.loads, exciter.drive.speed) for effect in (*scene.effects, *exciter.effects)]
+            effects = [e for e in (*scene.effects, *exciter.effects) if not kinds or has_term([e], *kinds)]
+            rates = [effect.fastest_rate(exciter.loads, exciter.drive.speed) for effect in effects]
             all_rates += [jnp.max(rate) for rate in rates if rate is not None]
     return functools.reduce(jnp.maximum, all_rates, zero)
 
@@ -227,7 +231,7 @@ def integrate(
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
     # A run that did not reach its end has no window; its last state shows whether it diverged.
     has_ended = solution.result == diffrax.RESULTS.successful
-    is_bounded = jnp.where(has_ended, is_finite(states), ~_diverged(unit, state, last))
+    is_bounded = jnp.where(has_ended, is_finite(states), ~is_unbounded(unit, state, last))
     steps = solution.stats["num_steps"]
     not_computed = jnp.full_like(end, jnp.nan)
     return Run(
@@ -317,7 +321,7 @@ def _is_coincident(angles: list[Array], stations: list[Array | None]) -> Array:
     return functools.reduce(jnp.logical_or, has_coincident) if has_coincident else jnp.zeros((), bool)
 
 
-def _diverged(unit: State, first: State, last: State) -> Array:
+def is_unbounded(unit: State, first: State, last: State) -> Array:
     """Return True if the displacement or velocity of the carrier exceeds its initial value and its natural unit by the factor
     `_UNBOUNDED_FACTOR`, or if the last state is not finite."""
     pairs = ((first.displacement, last.displacement, unit.displacement), (first.velocity, last.velocity, unit.velocity))

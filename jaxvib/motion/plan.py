@@ -25,7 +25,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns, validate_scene
 from jaxvib.motion.integrate import MIN_SAMPLES_PER_TURN, IntegrationPlan, StepControl, frequency_bounds
-from jaxvib.motion.integration.stiffness import equal_step_length, fastest_decay, fastest_motion, stiff_solver
+from jaxvib.motion.integration.stiffness import contact_rate, equal_step_length, fastest_decay, fastest_motion, stiff_solver
 from jaxvib.motion.start import Start, initial_state, require_start, start_state, with_spin, with_spin_up_drive
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.runtime.devices import known as numpy_of_known
@@ -333,7 +333,8 @@ class EnsemblePlan(NamedTuple):
     - `end`, s
     - `each`: number of steps in each of the `ENSEMBLE_PARTS` of a run; `coarse`: that of a second run with larger steps;
       `is_compared`: True if there is a second run
-    - `decay`: fastest decay rate of each scene, 1/s; `implicit`: True for implicit steps
+    - `decay`: fastest decay rate of each scene, 1/s; `contact`: its fastest rate during contacts, rad/s, 0 without contacts;
+      `implicit`: True for implicit steps
     - `batch`: number of runs in a batch; `is_known`: True if all parameters have values
     """
 
@@ -349,6 +350,7 @@ class EnsemblePlan(NamedTuple):
     coarse: int
     is_compared: bool
     decay: Array
+    contact: Array
     implicit: bool
     batch: int
     is_known: bool
@@ -380,7 +382,7 @@ def plan_ensemble(
     require(steps, EqualSteps)
     if steps is None and not known:
         raise InputError("stepsize_controller", "is missing; under a JAX transformation give EqualSteps(...)")
-    fastest, decay = _rates(scenes)
+    fastest, decay, contact = _rates(scenes)
     number_of_steps, implicit = 0 if steps is None else count(steps.number, "steps"), False
     if known:
         # Refused runs do not influence the steps of other runs.
@@ -410,6 +412,7 @@ def plan_ensemble(
         coarse=coarse,
         is_compared=is_estimated and coarse < steps_per_part,  # a run of one step in each part has no coarser one
         decay=decay,
+        contact=contact,
         implicit=implicit,
         batch=batch,
         is_known=known,
@@ -443,9 +446,14 @@ def _start_speed(states: State) -> np.ndarray:
 
 
 @cached
-def _rates(scenes: Scene) -> tuple[Array, Array]:
-    """Return the fastest rates of the motion, rad/s, and of the decay, 1/s, of each scene."""
-    return jax.vmap(lambda scene: (fastest_motion(scene), fastest_decay(scene)))(scenes)
+def _rates(scenes: Scene) -> tuple[Array, Array, Array]:
+    """Return the fastest rates of the motion, rad/s, of the decay, 1/s, and of contacts, rad/s, of each scene."""
+
+    def rates_of_scene(scene: Scene) -> tuple[Array, Array, Array]:
+        decay, contact = fastest_decay(scene), contact_rate(scene)
+        return fastest_motion(scene), decay, jnp.zeros_like(decay) if contact is None else contact
+
+    return jax.vmap(rates_of_scene)(scenes)
 
 
 def with_settled_drives(scene: Scene, start: Start | State | None, problem: str) -> Scene:

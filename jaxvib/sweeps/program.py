@@ -38,8 +38,8 @@ _CASES_PER_BLOCK = 64
 """Number of cases whose rates are computed together in the search for the fastest and the slowest case."""
 
 _STEPS_PER_RADIAN_OF_CONTACT = 4.0
-"""Number of steps for each radian of the vibration on a stop: about 12 in a contact. Other motions have one, because they are
-smooth."""
+"""Number of steps for each radian of a contact with a stop or between loads: about 12 in a contact. Other motions have one,
+because they are smooth."""
 
 _MAX_STEPS = 1e9
 """Maximum number of steps of a run, about an hour of computation."""

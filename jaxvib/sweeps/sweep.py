@@ -182,7 +182,7 @@ def sweep(
       "start." change entries of this state
     - `until`: end of runs, s or text; typical: 5 to 60
     - `steps`: number of equal steps of a run, the same in all cases; default: one for each radian of the fastest motion of
-      all cases (four for the vibration on a stop), and more if a motion decays fast
+      all cases (four for a contact with a stop or between loads), and more if a motion decays fast
     - `samples`: number of samples; typical: 1000 to 100,000; `sampling`: "low_discrepancy" or "random"; `seed` of the samples
     - `chunk`: number of cases that are computed and written together; a store is continued only with the same number.
       Typical: the default, 512 to 16,384 cases, about a second of computation. With smaller chunks an interruption loses fewer

@@ -12,7 +12,7 @@ from scenes import published, scene
 
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import natural_units
-from jaxvib.motion.integrate import _diverged, _status, is_finite
+from jaxvib.motion.integrate import _status, is_finite, is_unbounded
 from jaxvib.motion.plan import plan_segment
 from jaxvib.ode.control import PIController
 from jaxvib.ode.dopri8 import UnrolledDopri8
@@ -190,10 +190,10 @@ def test_a_motion_has_grown_where_one_platform_alone_has():
         size = float(getattr(unit, name))
         for last, grown in (([0.0, 1.1e8], True), ([-1.1e8, 0.0], True), ([0.9e8, 0.9e8], False)):
             there = eqx.tree_at(lambda y, name=name: getattr(y, name), first, size * jnp.asarray(last))
-            assert bool(_diverged(unit, first, there)) == grown
+            assert bool(is_unbounded(unit, first, there)) == grown
     far = eqx.tree_at(lambda y: y.displacement, first, float(unit.displacement) * jnp.asarray([0.0, 1e3]))
-    assert not bool(_diverged(unit, far, eqx.tree_at(lambda y: y.displacement, first, 1e8 * far.displacement)))
-    assert bool(_diverged(unit, first, eqx.tree_at(lambda y: y.rate, first, (jnp.full(3, jnp.inf),))))
+    assert not bool(is_unbounded(unit, far, eqx.tree_at(lambda y: y.displacement, first, 1e8 * far.displacement)))
+    assert bool(is_unbounded(unit, first, eqx.tree_at(lambda y: y.rate, first, (jnp.full(3, jnp.inf),))))
 
 
 def test_one_number_that_is_not_finite_makes_a_state_that_is_not():

@@ -302,6 +302,44 @@ def test_equal_steps_resolve_the_contact_with_a_stop():
     np.testing.assert_allclose(many.state.displacement[1], one.window.state.displacement[-1], atol=1e-5)
 
 
+def damped_stop(damping):
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
+    exciter = jv.Exciter(drive=jv.ConstantSpeed(60.0), unbalance=0.1)
+    return jv.Scene(machine, exciters=[exciter], effects=[jv.Stop(1e6, gap=2e-3, damping=damping)])
+
+
+def test_equal_steps_resolve_the_damper_of_a_stop():
+    """With steps of its spring alone the displacement is 1.6 times too large for 1e5 N s/m, and NaN for 1e6."""
+    np.testing.assert_allclose(fastest_motion(damped_stop(1e5)), 1e5 / 50.0, rtol=1e-12)
+    many = jv.ensemble(damped_stop, jnp.asarray([1e5, 1e6]), 1.0)
+    assert bool(jnp.all(many.resolved)) and float(jnp.max(many.error)) < 5e-3
+    for damping, end in zip((1e5, 1e6), many.state.displacement, strict=True):
+        one = jv.simulate(damped_stop(damping), 1.0, stepsize_controller=jv.Tolerance(1e-10), save="window", estimate=False)
+        np.testing.assert_allclose(end, one.window.state.displacement[-1], atol=5e-6)
+
+
+def test_steps_too_long_for_a_stop_are_named():
+    """The damper of 1e5 N s/m makes the displacement grow to 1e187 m, which is finite."""
+    many = jv.ensemble(damped_stop, jnp.asarray([0.0, 1e5, 1e6]), 1.0, stepsize_controller=jv.EqualSteps(400))
+    assert many.resolved.tolist() == many.finite.tolist() == [True, False, False]
+    assert "steps are too long for contacts" in many.summary() and "(2 of 3)" in many.summary()
+
+
+def test_equal_steps_resolve_the_damper_of_colliding_loads():
+    """With steps of its spring alone the loads turn by 19,000 rad and overlap."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
+    loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5, ball_radius=0.02)
+    still = jnp.zeros(1)
+    start = jv.State(still, still, (jnp.asarray([0.0, 1.0]),), (jnp.asarray([60.0, 10.0]),))
+
+    def make(damping):
+        return jv.Scene(machine, loads, jv.ConstantSpeed(60.0), [jv.LoadContact(1e5, damping=damping)]), start
+
+    many = jv.ensemble(make, jnp.asarray([1e4]), 0.3)
+    one = jv.simulate(make(1e4)[0], 0.3, start=start, stepsize_controller=jv.Tolerance(1e-10), save="window", estimate=False)
+    np.testing.assert_allclose(many.state.angle[0][0], one.window.state.angle[0][-1], atol=0.01)
+
+
 def test_tables_name_coordinates_and_masses(tmp_path):
     supports = [jv.support(at=(x, 0.0), stiffness=(1e5, 1e5), damping=(50.0, 50.0)) for x in (-0.5, 0.5)]
     machine, drive = jv.plane_body(mass=100.0, inertia=5.0, supports=supports), jv.ConstantSpeed(60.0)

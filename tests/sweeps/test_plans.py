@@ -104,6 +104,15 @@ def test_the_stiffest_stop_sets_the_steps():
     assert plan.each == np.ceil(part * rate) and plan.each > 10 * part * fastest
 
 
+def test_contacts_between_loads_have_four_steps_per_radian():
+    loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5, ball_radius=0.02)
+    scene = jv.Scene(SCENE.machine, loads, jv.ConstantSpeed(60.0), [jv.LoadContact(1e5, damping=1.0)])
+    rounding = 1e-9
+    for damping, rate in ((30.0, np.sqrt(1e5 / 0.5 * 2.0 * 0.96 / 1.4)), (1e4, 1e4 / 0.5 * 2.0 * 0.96 / 1.4)):
+        plan = study(scene, {"effects.load_contact.damping": [1.0, damping]}, ["run.amplitude"], until=2.0).plan
+        assert plan.each == np.ceil((2.0 - plan.window) / PARTS_OF_RUN * 4.0 * rate - rounding)
+
+
 def test_the_largest_friction_sets_the_steps(tmp_path):
     exciter = jv.Exciter(drive=jv.ConstantSpeed("60 rad/s"), unbalance=0.08)
     scene = jv.Scene(SCENE.machine, exciters=[exciter], effects=[jv.FrictionSupport(30.0, width=1e-3)])

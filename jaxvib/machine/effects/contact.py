@@ -41,8 +41,8 @@ class LoadContact(Effect):
 
     if zeta <= 1, otherwise e = exp(-2 gamma coth gamma) with cosh gamma = zeta. The two loads lose the share 1 - e^2 of the
     energy of their relative motion, including that of rolling; friction between loads is neglected. A contact lasts about pi
-    sqrt(mu/k). Equal steps must resolve this time: `ensemble` takes about 12 steps per contact, `capture` about 6 in its first
-    scan and twice as many after each doubling.
+    sqrt(mu/k). Equal steps must resolve this time, and the time mu/c of the damper if this is shorter: `ensemble` and `sweep`
+    take about 12 steps per contact, `capture` about 6 in its first scan and twice as many after each doubling.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -130,8 +130,10 @@ class LoadContact(Effect):
             raise InputError("start.angle", f"{problem}; start them {size:.4g} m apart, their diameter")
 
     def fastest_rate(self, loads: Loads, speed: Array) -> Array:
-        """Return sqrt(k / mu), the natural frequency of a contact, rad/s; typical: 300 to 5000."""
-        return jnp.sqrt(self.stiffness / self._reduced_mass(loads))
+        """Return the natural frequency sqrt(k / mu) of a contact, rad/s, or its decay rate c / mu, 1/s, if this is larger;
+        typical: 300 to 5000."""
+        mass = self._reduced_mass(loads)
+        return jnp.maximum(jnp.sqrt(self.stiffness / mass), self._damping(loads) / mass)
 
     def prepare(self, loads: Loads, mount: Mount) -> LoadContact:
         """Return the contact with the damping that gives its restitution, and with the tracks of the loads."""

@@ -125,7 +125,7 @@ class Stop(_Support):
     - `stiffness` k, N/m, at least 0; typical: 1e5 to 1e7, that is 10 to 100 times that of the support. A stiffer stop needs
       shorter steps
     - `gap`: displacement at which the contact begins, m, at least 0; typical: 0.001 to 0.02
-    - `damping` c, N s/m, at least 0 (the default); typical: 0 to 5000
+    - `damping` c, N s/m, at least 0 (the default); typical: 0 to 5000. Equal steps must resolve the decay rate c/M of a mass M
     - `side` of the platform: "above", "below" or "both" (the default); around a rotor's axis only "both"
     - `platform`: number, from 1, of the platform whose motion the stop limits (default: 1)
     - `position`: distance along a rotor's axis from the rotor's centre of mass, m, in place of the platform; typical: -0.5 to
@@ -179,7 +179,8 @@ class Stop(_Support):
 
     def terms(self) -> tuple[Term, ...]:
         """Return the force of spring and damper."""
-        return (SupportForce(self.rows, self.energy, self.resistance, stiffness=self.stiffness, penetration=self.penetration),)
+        rates = {"stiffness": self.stiffness, "contact_damping": self.damping}
+        return (SupportForce(self.rows, self.energy, self.resistance, **rates, penetration=self.penetration),)
 
     def rows(self, machine: Machine) -> Array:
         """Return the matrix (1, nd) or (2, nd) that gives the displacement of the place on a `machine` with nd coordinates.

@@ -241,6 +241,7 @@ class SupportForce:
     - `stiffness`: largest stiffness of the support, N/m, whose vibration equal steps must resolve; None if it has no limit
     - `damping`: largest slope of a resistance that acts at any displacement, N s/m, whose decay explicit steps must resolve;
       None for a contact, and without a resistance
+    - `contact_damping`: damping of a contact, N s/m, whose decay equal steps must resolve; None without a damper
     - `penetration`: function of x that returns the penetration, m, negative without contact, and its direction (k,), if the
       force jumps when a contact begins; otherwise None
     - `is_link`: True if the force acts between two points of the machine, False if it acts on the foundation
@@ -252,6 +253,7 @@ class SupportForce:
     is_smooth: bool = False
     stiffness: Array | None = None
     damping: Array | None = None
+    contact_damping: Array | None = None
     penetration: Callable[[Array], tuple[Array, Array]] | None = None
     is_link: bool = False
 

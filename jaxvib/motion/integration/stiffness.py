@@ -13,17 +13,21 @@ from jaxvib.equations.linear import LinearModel, linear_model
 from jaxvib.equations.sliding import kinematics
 from jaxvib.equations.state import State
 from jaxvib.machine.drives.drive import Drive
-from jaxvib.machine.effects.base import terms_of
-from jaxvib.machine.effects.terms import SupportForce
+from jaxvib.machine.effects.base import has_term, terms_of
+from jaxvib.machine.effects.terms import LoadInteraction, SupportForce
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.integrate import frequency_bounds, motor_poles
+from jaxvib.motion.integrate import effects_rate, frequency_bounds, motor_poles
 from jaxvib.numerics.linalg import hermitian_modes, relative_to
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.runtime.programs import cached
 
 _MAX_DECAY_PER_STEP = 3.0
 """Largest product of decay rate and length of an explicit step for which the method is accurate; above 5.2 it diverges."""
+
+_MAX_CONTACT_PER_STEP = 1.0
+"""Largest product of the rate during a contact and the length of a step, about a third of a contact, for which runs do not
+diverge. The stages of a step in which a damper begins to act amplify its force."""
 
 _STIFF_RATE_RATIO = 100.0
 """Ratio of the rates of decay and motion above which the implicit method takes less time than explicit steps."""
@@ -100,23 +104,32 @@ def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rod
 
 
 def fastest_motion(scene: Scene, per_contact: float = 1.0) -> Array:
-    """Return the fastest rate that equal steps must resolve, rad/s: that of `frequency_bounds`, or that of a machine on a stop.
-
-        w^2 = fastest^2 + k max(P M^-1 P^T)
-
-    k is the stiffness of the stop and P maps q to its displacements. The rate on a stop is multiplied by `per_contact`.
-    """
+    """Return the fastest rate that equal steps must resolve, rad/s: that of `frequency_bounds`, or that of a contact, see
+    `contact_rate`, multiplied by `per_contact`."""
     fastest = frequency_bounds(scene)[0]
-    if not terms_of(scene.effects, SupportForce):
-        return fastest
+    return fastest if (contact := contact_rate(scene)) is None else jnp.maximum(fastest, per_contact * contact)
+
+
+def contact_rate(scene: Scene) -> Array | None:
+    """Return the fastest rate during a contact with a stop or between loads, rad/s; None for a scene without contacts.
+
+        w^2 = fastest^2 + k max(P M^-1 P^T)   or   c max(P M^-1 P^T)   on a stop,    `Effect.fastest_rate` between loads
+
+    k and c are the stiffness and the damping of the stop; P maps q to its displacements. The force of the damper begins within
+    a step. The implicit method, whose Jacobian is that before the contact, must therefore resolve c, too.
+    """
     scene = jax.lax.stop_gradient(scene)
-    stiffnesses = [term.stiffness for term in terms_of(scene.effects, SupportForce)]
-    linear, rates = linear_model(scene), [fastest]
-    for stiffness, rows in zip(stiffnesses, linear.supports, strict=True):
-        if stiffness is not None:
-            accelerance = jnp.max(jnp.diagonal(rows @ jnp.linalg.solve(linear.mass, rows.T)))
-            rates.append(per_contact * jnp.sqrt(fastest**2 + stiffness * accelerance))
-    return functools.reduce(jnp.maximum, rates)
+    contacts, rates = [term for term in terms_of(scene.effects, SupportForce) if term.stiffness is not None], []
+    if has_term(scene.all_effects, LoadInteraction):
+        rates.append(effects_rate(scene, LoadInteraction))
+    if contacts:
+        fastest, linear = frequency_bounds(scene)[0], linear_model(scene)
+        for term, rows in zip(terms_of(scene.effects, SupportForce), linear.supports, strict=True):
+            if term.stiffness is not None:
+                accelerance = jnp.max(hermitian_modes(rows @ jnp.linalg.solve(linear.mass, rows.T))[0])
+                rates.append(jnp.sqrt(fastest**2 + term.stiffness * accelerance))
+                rates += [] if term.contact_damping is None else [term.contact_damping * accelerance]
+    return functools.reduce(jnp.maximum, rates) if rates else None
 
 
 def equal_step_length(fastest: float, decay: float, per_radian: float, step: float | None = None) -> tuple[float, bool]:
@@ -132,9 +145,13 @@ def equal_step_length(fastest: float, decay: float, per_radian: float, step: flo
     return 1.0 / max(per_radian * fastest, decay / _MAX_DECAY_PER_STEP), False
 
 
-def is_unresolved(decay: Array | np.ndarray, step: Array | float) -> Array | np.ndarray:
-    """Return True if explicit steps of the length `step`, s, diverge because of the decay rate `decay`, 1/s."""
-    return decay * step > 2.0 * _MAX_DECAY_PER_STEP
+def is_unresolved(
+    decay: Array | np.ndarray, contact: Array | np.ndarray, step: Array | float, *, implicit: bool = False
+) -> Array | np.ndarray:
+    """Return True if steps of the length `step`, s, are too long for the decay rate `decay`, 1/s, with which explicit steps
+    diverge, or for the rate during a `contact`, rad/s, see `contact_rate`."""
+    passes_contact = contact * step > _MAX_CONTACT_PER_STEP
+    return passes_contact if implicit else passes_contact | (decay * step > 2.0 * _MAX_DECAY_PER_STEP)
 
 
 def advice(scene: Scene) -> str:

@@ -54,7 +54,8 @@ def test_steps_resolve_decay_or_are_implicit():
         1e-3,
         True,
     )
-    assert bool(is_unresolved(7000.0, 1e-3)) and not bool(is_unresolved(5000.0, 1e-3))
+    assert is_unresolved(7000.0, 0.0, 1e-3) and not is_unresolved(5000.0, 900.0, 1e-3)
+    assert not is_unresolved(7000.0, 900.0, 1e-3, implicit=True) and is_unresolved(0.0, 1100.0, 1e-3, implicit=True)
 
 
 KLOSS = {"speed": 50.0, "breakdown_torque": 120.0, "breakdown_slip": 0.05, "inertia": 0.02}
@@ -126,7 +127,7 @@ def test_unresolved_runs_are_named(monkeypatch):
     monkeypatch.setattr(plan, "equal_step_length", lambda *_: (1.0, False))
     many = jv.ensemble(of_drag, jnp.asarray([1.0, 1e5]), 5.0, stepsize_controller=jv.EqualSteps(1200))
     assert [str(s) for s in np.asarray(many.resolved)] == ["True", "False"]
-    assert "too long for motions that decay fast, by drag" in many.summary()
+    assert "too long for contacts or for a fast decay, by drag" in many.summary()
 
 
 def test_a_sweep_over_drag_is_answered(tmp_path):
