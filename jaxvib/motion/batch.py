@@ -14,11 +14,22 @@ from jaxvib.equations.dynamics import dynamics_of
 from jaxvib.equations.model import assemble
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import Measured, Peaks, Trajectory, locate_peaks, measure, trajectory, turning_angles
+from jaxvib.motion.analysis.measure import (
+    Extremes,
+    Measured,
+    Peaks,
+    Trajectory,
+    extremes_of_steps,
+    locate_peaks,
+    measure,
+    trajectory,
+    turning_angles,
+)
 from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.integrate import angle_wrapping, is_finite, is_unbounded
 from jaxvib.motion.integration.contacts import Contacts, ContactSolver
+from jaxvib.motion.integration.stiffness import has_contacts, resolves
 from jaxvib.motion.integration.system import PackedSystem
 from jaxvib.numerics.extrema import NODES
 from jaxvib.ode.rodas4 import Rodas4
@@ -65,6 +76,21 @@ def advance(
         throw=False,
     )
     return jax.tree.map(lambda leaf: leaf[-1], solution.ys), solution.stats["num_steps"]
+
+
+def advance_by_steps(
+    motion: PackedSystem, packed: IntegratorState, begin: Array, length: Array, number: int, *, implicit: bool
+) -> tuple[IntegratorState, tuple[Array, State]]:
+    """Return the state of the integrator at the time `begin` + `length`, and the times and the states of a `number` of equal
+    steps."""
+    step, indices = length / number, jnp.arange(number + 1, dtype=length.dtype)
+
+    def single_step(packed: IntegratorState, k: Array) -> tuple[IntegratorState, IntegratorState]:
+        moved, _ = advance(motion, packed, begin + k * step, step, step, implicit=implicit)
+        return moved, moved
+
+    last, later = jax.lax.scan(single_step, packed, indices[:-1])
+    return last, (begin + step * indices, motion.unpack(_prepended(packed, later)))
 
 
 def divide_run(
@@ -136,7 +162,8 @@ class BatchRun(NamedTuple):
     **Attributes**: `scene`; `window`: trajectory in the measuring window; `measured`: the quantities measured in the window;
     `regime` of the window, None for a scene that is not plain (`Scene.is_plain`); `part_speed` (PARTS_OF_RUN, count): mean
     speeds of the loads, or of rotors without loads, rad/s, over the equal parts before the window; `part_length` of such a
-    part, s; `finite`: True if the motion stayed finite; `peaks` of the whole run, None if the plan has no blocks.
+    part, s; `finite`: True if the motion stayed finite; `resolved`: False if the steps are too long, see `resolves`; `peaks` of
+    the whole run, None if the plan has no blocks.
     """
 
     scene: Scene
@@ -146,6 +173,7 @@ class BatchRun(NamedTuple):
     part_speed: Array
     part_length: Array
     finite: Array
+    resolved: Array
     peaks: Peaks | None = None
 
 
@@ -158,6 +186,7 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     model = assemble(scene)
     field = dynamics_of(model)
     motion = pack_batch(scene, field, state, implicit=plan.implicit)
+    sharp = has_contacts(scene)
     begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS_OF_RUN
     spacing = plan.window / (plan.samples - 1)
 
@@ -165,23 +194,18 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
         packed, _ = advance(motion, packed, *at, jnp.asarray(length / plan.each, dtype), implicit=plan.implicit)
         return packed, (packed, None)
 
-    def sample(packed: IntegratorState, k: Array) -> tuple[IntegratorState, IntegratorState]:
-        at, step = begin + k * spacing, jnp.asarray(spacing / plan.between, dtype)
-        moved, _ = advance(motion, packed, at, jnp.asarray(spacing, dtype), step, implicit=plan.implicit)
-        return moved, moved
+    def sample(packed: IntegratorState, k: Array) -> tuple[IntegratorState, tuple[IntegratorState, Extremes | None]]:
+        at, length = begin + k * spacing, jnp.asarray(spacing, dtype)
+        if sharp:  # a contact may be shorter than the time between two samples
+            moved, steps = advance_by_steps(motion, packed, at, length, plan.between, implicit=plan.implicit)
+            return moved, (moved, extremes_of_steps(model, field, *steps))
+        moved, _ = advance(motion, packed, at, length, jnp.asarray(spacing / plan.between, dtype), implicit=plan.implicit)
+        return moved, (moved, None)
 
     def block(packed: IntegratorState, at: tuple[Array, Array]) -> tuple[IntegratorState, Peaks]:
         """Advance by a block, and return the largest values in it."""
-        (begin, length), number = at, plan.each // plan.blocks
-
-        def single_step(packed: IntegratorState, k: Array) -> tuple[IntegratorState, IntegratorState]:
-            step = length / number
-            moved, _ = advance(motion, packed, begin + k * step, step, step, implicit=plan.implicit)
-            return moved, moved
-
-        last, later = jax.lax.scan(single_step, packed, jnp.arange(number, dtype=dtype))
-        states = motion.unpack(_prepended(packed, later))
-        return last, locate_peaks(model, field, begin + length / number * jnp.arange(number + 1, dtype=dtype), states)
+        last, steps = advance_by_steps(motion, packed, *at, plan.each // plan.blocks, implicit=plan.implicit)
+        return last, extremes_of_steps(model, field, *steps).peaks(model) if sharp else locate_peaks(model, field, *steps)
 
     def part_with_peaks(
         packed: IntegratorState, at: tuple[Array, Array]
@@ -195,7 +219,7 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     sizes = jnp.asarray(length, dtype), jnp.asarray(length / plan.each, dtype)
     packed, begins, lengths = divide_run(motion, first, *sizes, PARTS_OF_RUN, implicit=plan.implicit)
     packed, (parts, part_peaks) = jax.lax.scan(part_with_peaks if plan.blocks else part, packed, (begins, lengths))
-    _, later = jax.lax.scan(sample, packed, jnp.arange(plan.samples - 1, dtype=dtype))
+    _, (later, extremes) = jax.lax.scan(sample, packed, jnp.arange(plan.samples - 1, dtype=dtype))
     packed_history = _prepended(first, parts)
     azimuth, _ = turning_angles(
         scene, lambda: length * jnp.arange(PARTS_OF_RUN + 1, dtype=dtype), motion.unpack(packed_history)
@@ -205,14 +229,16 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     window = trajectory(model, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length
     unit, last = natural_units(scene), jax.tree.map(lambda leaf: leaf[-1], states)
-    measured = measure(model, field, times, states, unit)
+    measured = measure(model, field, times, states, unit, extremes)
     kind = regime(scene, window) if scene.is_plain else None
     finite = is_finite(states) & ~is_unbounded(unit, state, last)
-    peaks = None
+    peaks, largest = None, states.displacement
     if part_peaks is not None:
-        last_peaks = locate_peaks(model, field, times, states)
+        last_peaks = locate_peaks(model, field, times, states) if extremes is None else extremes.part().peaks(model)
         peaks = jax.tree.map(lambda parts, last: jnp.maximum(jnp.max(parts, axis=0), last), part_peaks, last_peaks)
-    return BatchRun(scene, window, measured, kind, speed, jnp.asarray(length, dtype), finite, peaks)
+        largest = jnp.concatenate([largest, peaks.displacement[None]])
+    resolved = resolves(scene, max(length / plan.each, spacing / plan.between), largest, implicit=plan.implicit)
+    return BatchRun(scene, window, measured, kind, speed, jnp.asarray(length, dtype), finite, resolved, peaks)
 
 
 def _prepended(first: IntegratorState, later: IntegratorState) -> IntegratorState:

@@ -33,9 +33,9 @@ from jaxvib.motion.analysis.measure import turning_angles, turning_directions
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
 from jaxvib.motion.batch import advance, batch_size, divide_run, pack_batch
 from jaxvib.motion.integrate import is_finite, is_unbounded
-from jaxvib.motion.integration.stiffness import is_unresolved
+from jaxvib.motion.integration.stiffness import is_unresolved, resolves_contact
 from jaxvib.motion.integration.system import with_first_derivatives
-from jaxvib.motion.plan import ENSEMBLE_PARTS, EqualSteps, plan_ensemble
+from jaxvib.motion.plan import ENSEMBLE_PARTS, EnsemblePlan, EqualSteps, plan_ensemble
 from jaxvib.ode.replay import forward_only
 from jaxvib.ode.types import Y
 from jaxvib.results.estimate import Share, estimate_share
@@ -101,7 +101,8 @@ class Ensemble(Result):
     - `allowed` (B,): False if `make` returned a scene with a value that its constructor does not allow
     - `finite` (B,): True if the motion stayed finite
     - `resolved` (B,): False if explicit steps are too long for the fastest decay, which is possible under a JAX transformation,
-      or if steps are too long for contacts with a `Stop` or between loads (3 steps per contact or fewer)
+      or if steps are too long for contacts with a `Stop` or between loads (3 steps per contact or fewer, or 4 per decay time of
+      its damper)
     - `detached` (B, count): True if, at any stage of any step, the track would have had to pull the load although it can only
       push
     - `steps` of each run
@@ -292,8 +293,7 @@ def ensemble(
         # method has order 8.
         error = estimated_error(difference, (plan.coarse / plan.each) ** 3, plan.scenes, ends_at_jumps=False)
     unknown = np.asarray(np.nan, plan.end.dtype)
-    step = plan.end / (ENSEMBLE_PARTS * plan.each)
-    resolved = ~is_unresolved(plan.decay, plan.contact, step, implicit=plan.implicit)
+    resolved = _resolved(plan)
     if not plan.is_allowed:
         numbers = last, load_speed, error, finite, resolved, detached
         last, load_speed, error, finite, resolved, detached = jax.vmap(without_numbers)(plan.allowed, numbers)
@@ -326,6 +326,13 @@ def ensemble(
         return forward_only(result, "ensemble", "supports forward derivatives only; use jax.jacfwd or jax.jvp")
     jax.block_until_ready(result)
     return dataclasses.replace(result, seconds=on_device(np.asarray(time.perf_counter() - begun, plan.end.dtype)))
+
+
+def _resolved(plan: EnsemblePlan) -> Array:
+    """Return True for each run whose steps resolve decay and contacts."""
+    step = plan.end / (ENSEMBLE_PARTS * plan.each)
+    resolved = plan.implicit | ~is_unresolved(plan.decay, step)
+    return resolved if plan.contact is None else resolved & resolves_contact(plan.contact, step)
 
 
 @cached
@@ -390,7 +397,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     detached = last.missing != 0.0 if is_watched else jnp.zeros(turning_directions(scene).shape, dtype=bool)
     last, coarse = (State(either.displacement, either.velocity, exciters=either.exciters) for either in (last, coarse))
     angle, _ = turning_angles(scene, lambda: length * jnp.arange(ENSEMBLE_PARTS - 1, ENSEMBLE_PARTS + 1), pair)
-    unit, finite = natural_units(scene), is_finite(last)
+    finite, unit = is_finite(last), natural_units(scene)
     if motion.has_contacts:  # the damper of a contact that is not resolved can amplify a motion that then stays finite
         finite = finite & ~is_unbounded(unit, state, last)
     difference = scaled_error(last, coarse, error_scale(last, unit))

@@ -333,7 +333,7 @@ class EnsemblePlan(NamedTuple):
     - `end`, s
     - `each`: number of steps in each of the `ENSEMBLE_PARTS` of a run; `coarse`: that of a second run with larger steps;
       `is_compared`: True if there is a second run
-    - `decay`: fastest decay rate of each scene, 1/s; `contact`: its fastest rate during contacts, rad/s, 0 without contacts;
+    - `decay`: fastest decay rate of each scene, 1/s; `contact`: its fastest rate during contacts, rad/s, or None;
       `implicit`: True for implicit steps
     - `batch`: number of runs in a batch; `is_known`: True if all parameters have values
     """
@@ -350,7 +350,7 @@ class EnsemblePlan(NamedTuple):
     coarse: int
     is_compared: bool
     decay: Array
-    contact: Array
+    contact: Array | None
     implicit: bool
     batch: int
     is_known: bool
@@ -446,14 +446,9 @@ def _start_speed(states: State) -> np.ndarray:
 
 
 @cached
-def _rates(scenes: Scene) -> tuple[Array, Array, Array]:
-    """Return the fastest rates of the motion, rad/s, of the decay, 1/s, and of contacts, rad/s, of each scene."""
-
-    def rates_of_scene(scene: Scene) -> tuple[Array, Array, Array]:
-        decay, contact = fastest_decay(scene), contact_rate(scene)
-        return fastest_motion(scene), decay, jnp.zeros_like(decay) if contact is None else contact
-
-    return jax.vmap(rates_of_scene)(scenes)
+def _rates(scenes: Scene) -> tuple[Array, Array, Array | None]:
+    """Return the fastest rates of the motion, rad/s, of the decay, 1/s, and of contacts, rad/s or None, of each scene."""
+    return jax.vmap(lambda scene: (fastest_motion(scene), fastest_decay(scene), contact_rate(scene)))(scenes)
 
 
 def with_settled_drives(scene: Scene, start: Start | State | None, problem: str) -> Scene:

@@ -138,6 +138,34 @@ def greatest(values: Array) -> Array:
     return values[jnp.argmax(values)]
 
 
+def step_extrema(x: Array, v: Array) -> tuple[Array, Array]:
+    """Return the minimum and the maximum of motions that are sampled at all steps of a run.
+
+    Between two samples the motion is approximated by the cubic polynomial through their values and slopes. In contrast to the
+    polynomials of `locate_extrema`, it needs no further samples, which may be beyond a kink. The relative error is
+    (w h)^4 / 384 for a vibration of the rate w and a step h without a kink.
+
+    **Arguments**: x, v (n, ...), n >= 2: samples, and their slopes times the sampling step. **Returns** two arrays (...).
+    """
+    rise, begin, end = x[1:] - x[:-1], v[:-1], v[1:]
+    turns, share = _cubic_extremum(rise, begin, end)
+    inner = x[:-1] + share * (begin + share * (3.0 * rise - 2.0 * begin - end + share * (begin + end - 2.0 * rise)))
+    values = jnp.concatenate([x, jnp.where(turns, inner, x[:-1])])
+    return jnp.min(values, axis=0), jnp.max(values, axis=0)
+
+
+def _cubic_extremum(rise: Array, begin: Array, end: Array) -> tuple[Array, Array]:
+    """Return True where a motion has an extremum between two samples, and its position from 0 to 1 on the cubic polynomial.
+
+    **Arguments**: `rise` of the values, and slopes at the `begin` and at the `end`, times the sampling step.
+    """
+    turns = begin * end < 0.0
+    bend = 3.0 * rise - 2.0 * begin - end
+    root = jnp.sqrt(jnp.where(turns, jnp.abs(bend**2 - 3.0 * (begin + end - 2.0 * rise) * begin), 1.0))
+    divisor = bend + jnp.where(begin > 0.0, -root, root)
+    return turns, jnp.clip(-begin / jnp.where(turns & (divisor != 0.0), divisor, 1.0), 0.0, 1.0)
+
+
 def _extrema_between(x: Array, v: Array) -> tuple[Array, Array]:
     """Return the position of the extremum in each step between two samples, from 0 to 1, and the value at this position.
 
@@ -156,17 +184,14 @@ def _extrema_between(x: Array, v: Array) -> tuple[Array, Array]:
     slope = _derivative(polynomial)
     curvature = _derivative(slope)
     # Newton's method starts at the extremum of the cubic polynomial through the two samples of the step and their slopes.
-    turns = begin * end < 0.0
-    bend = 3.0 * rise - 2.0 * begin - end
-    root = jnp.sqrt(jnp.where(turns, jnp.abs(bend**2 - 3.0 * (begin + end - 2.0 * rise) * begin), 1.0))
-    divisor = bend + jnp.where(begin > 0.0, -root, root)
+    turns, start = _cubic_extremum(rise, begin, end)
 
     def improved(share: Array) -> Array:
         curved = _at(curvature, origin + share)
         change = _at(slope, origin + share) / jnp.where(turns & (curved != 0.0), curved, 1.0)
         return jnp.clip(share - change, 0.0, 1.0)
 
-    share = improved(jnp.clip(-begin / jnp.where(turns & (divisor != 0.0), divisor, 1.0), 0.0, 1.0))
+    share = improved(start)
     value = jnp.where(turns, _at(polynomial, origin + share), x[:-1])
     # Without the barrier and the fence the compiler recomputes the polynomials for each use of their values.
     return jax.lax.optimization_barrier((improved(share), fence(value, hidden_one(x[0]))))

@@ -35,6 +35,10 @@ class CaseStatus(eqx.Enumeration):
     not_finite = "the motion grew without bounds"
     failed = "an error was raised; its message is stored with the case"
     lost = "the process that computed the case terminated unexpectedly several times"
+    not_resolved = (
+        "steps too long for contacts, for the stiffness of a support at the displacements of the run, or for the motion: use "
+        "more steps"
+    )
 
 
 CASE_STATUSES = enumeration_names(CaseStatus)

@@ -13,7 +13,7 @@ from jax import Array
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.batch import PARTS_OF_RUN, BatchPlan, run_in_batch
+from jaxvib.motion.batch import PARTS_OF_RUN, BatchPlan, BatchRun, run_in_batch
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.integration.stiffness import equal_step_length, fastest_decay, fastest_motion
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state
@@ -71,7 +71,7 @@ def _measure_cases(
 ) -> tuple[tuple[Array, ...], Array]:
     """Compute the measures of the cases with the `values` (cases, axes) of the axes, `batch` cases at a time.
 
-    **Returns** the measures (cases, ...), and True (cases,) for cases whose motion stayed finite.
+    **Returns** the measures (cases, ...), and indices of `CASE_STATUSES` (cases,): done, not_finite or not_resolved.
     """
 
     def measure_case(value: Array) -> tuple[tuple[Array, ...], Array]:
@@ -90,9 +90,17 @@ def _measure_cases(
             assert run is not None
             return measure.read(run)
 
-        return tuple(jnp.asarray(read(measure)) for measure in measures), jnp.asarray(True) if run is None else run.finite
+        return tuple(jnp.asarray(read(measure)) for measure in measures), jnp.asarray(_ending(run), jnp.uint8)
 
     return jax.lax.map(measure_case, values, batch_size=batch)
+
+
+def _ending(run: BatchRun | None) -> Array | int:
+    """Return the index in `CASE_STATUSES` of the outcome of a run, done without a run."""
+    done, not_finite, not_resolved = (_STATUS_NUMBER[name] for name in ("done", "not_finite", "not_resolved"))
+    if run is None:
+        return done
+    return jnp.where(run.resolved, jnp.where(run.finite, done, not_finite), not_resolved)
 
 
 @cached
@@ -175,11 +183,10 @@ def compute(study: Study, chunk: int) -> Chunk:
     values = study.grid.values(chunk)
     errors: dict[int, str] = {}
     parts = _compute_cases(study, values, np.arange(len(values)), errors)
-    leaves, finite = parts
+    leaves, endings = parts
     is_complete = np.all([np.all(np.isfinite(leaf.reshape(len(values), -1)), axis=1) for leaf in leaves], axis=0)
-    status = np.where(
-        finite, np.where(is_complete, _STATUS_NUMBER["done"], _STATUS_NUMBER["absent"]), _STATUS_NUMBER["not_finite"]
-    ).astype(np.uint8)
+    is_absent = (endings == _STATUS_NUMBER["done"]) & ~is_complete
+    status = np.where(is_absent, _STATUS_NUMBER["absent"], endings).astype(np.uint8)
     status[list(errors)] = _STATUS_NUMBER["failed"]
     return Chunk(dict(zip(study.names, leaves, strict=True)), status, errors)
 
@@ -195,14 +202,14 @@ def _compute_cases(
     filled = np.repeat(values[cases[:1]], study.size, axis=0)
     filled[cases] = values[cases]
     try:
-        leaves, finite = _measure_cases_compiled(study.scene, jnp.asarray(filled), study.program, *study.choices)
-        return [np.asarray(leaf)[: len(values)] for leaf in leaves], np.asarray(finite)[: len(values)]
+        leaves, endings = _measure_cases_compiled(study.scene, jnp.asarray(filled), study.program, *study.choices)
+        return [np.asarray(leaf)[: len(values)] for leaf in leaves], np.asarray(endings)[: len(values)]
     except RuntimeError as error:  # raised by a running program; an error of its compilation would concern all cases
         if "RESOURCE_EXHAUSTED" in str(error):
             raise
         if len(cases) == 1:
             errors[int(cases[0])] = _sentence(error)
-            return study.placeholders(len(values)), np.ones(len(values), bool)
+            return study.placeholders(len(values)), np.full(len(values), _STATUS_NUMBER["done"])
         halves = [_compute_cases(study, values, half, errors) for half in np.array_split(cases, 2)]
     is_second_half = np.isin(np.arange(len(values)), np.array_split(cases, 2)[1])
     chosen = [

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.numerics.extrema import extremum_value, locate_extrema
+from jaxvib.numerics.extrema import extremum_value, locate_extrema, step_extrema
 
 
 def samples(per_turn, count, first=0.37):
@@ -20,6 +20,18 @@ def test_extrema_of_a_cosine_have_the_stated_error(per_turn, error):
     np.testing.assert_allclose(np.abs([low, high]), 1.0, rtol=0.0, atol=error + 1e-15)
     if per_turn == 16:
         assert np.max(np.abs(np.abs([low, high]) - 1.0)) > error / 100.0  # no better than it can be: the bound says something
+
+
+def test_extrema_of_steps_have_the_stated_error_and_no_overshoot():
+    h = 0.25
+    x, v = samples(2.0 * np.pi / h, 40)
+    low, high = step_extrema(jnp.stack([x, 3.0 * x], axis=1), jnp.stack([v, 3.0 * v], axis=1))
+    for sign, found in ((-1.0, low), (1.0, high)):
+        np.testing.assert_allclose(found, sign * np.asarray([1.0, 3.0]), rtol=h**4 / 384.0)
+    s = jnp.arange(8.0)
+    jump = jnp.where(s < 4.0, 0.01 * (s - 4.0), jnp.exp(-h * (s - 4.0)))  # force of a damper that begins at the fifth sample
+    slope = jnp.where(s < 4.0, 0.01, -h * jump)
+    assert 1.0 <= step_extrema(jump, slope)[1] < 1.01
 
 
 def test_each_half_has_its_own_and_the_whole_the_better_of_both():

@@ -10,6 +10,7 @@ import pytest
 import jaxvib as jv
 from jaxvib.motion.batch import PARTS_OF_RUN
 from jaxvib.sweeps.axes import Axis, Target, extreme_cases
+from jaxvib.sweeps.definition import CASE_STATUSES
 from jaxvib.sweeps.study import study
 
 SCENE = jv.Scene(
@@ -102,6 +103,36 @@ def test_the_stiffest_stop_sets_the_steps():
     rate = 4.0 * np.sqrt(fastest**2 + 1e7 / float(SCENE.machine.mass[0]))
     part = (2.0 - plan.window) / PARTS_OF_RUN
     assert plan.each == np.ceil(part * rate) and plan.each > 10 * part * fastest
+
+
+def forced(effect):
+    exciter = jv.Exciter(drive=jv.ConstantSpeed("60 rad/s"), unbalance=0.1)
+    return jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0), exciters=[exciter], effects=[effect])
+
+
+def test_forces_on_stiff_stops_are_those_of_all_steps(tmp_path):
+    """Samples of the window, 1.6 per contact with the stop of 1e8 N/m, gave 13956 N and a peak of 16306 N."""
+    stiffnesses, names = [1e7, 1e8], ["run.foundation_force", "run.peak_force"]
+    axes = {"effects.stop[0].stiffness": stiffnesses}
+    data = jv.sweep(forced(jv.Stop(1e7, gap=2e-3)), axes, names, tmp_path / "s.zarr", until=4.0).data
+    for k, stiffness in enumerate(stiffnesses):
+        run = jv.simulate(forced(jv.Stop(stiffness, gap=2e-3)), 4.0, samples=200_000, estimate=False)
+        force = np.asarray(run.trajectory.foundation_force)[:, 0]
+        np.testing.assert_allclose(data.peak_force[k], np.max(np.abs(force)), rtol=5e-3)
+        np.testing.assert_allclose(data.foundation_force[k], np.ptp(force[100_000:]) / 2.0, rtol=5e-3)
+
+
+def test_cases_with_steps_too_long_are_named(tmp_path):
+    """The stiffness of the cubic support at the displacement of the run, and the stop, are faster than 2 rad per step."""
+    for k, (effect, name, values, steps) in enumerate(
+        (
+            (jv.CubicSupport(1e7), "effects.cubic_support[0].stiffness", [1e7, 1e10], None),
+            (jv.Stop(1e6, gap=2e-3), "effects.stop[0].stiffness", [1e4, 1e8], 800),
+        )
+    ):
+        found = jv.sweep(forced(effect), {name: values}, ["run.foundation_force"], tmp_path / f"{k}", until=4.0, steps=steps)
+        assert [CASE_STATUSES[n] for n in found.data.status.values] == ["done", "not_resolved"]
+        assert "not_resolved: steps too long for contacts" in found.summary()
 
 
 def test_contacts_between_loads_have_four_steps_per_radian():

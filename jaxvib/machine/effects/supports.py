@@ -179,8 +179,15 @@ class Stop(_Support):
 
     def terms(self) -> tuple[Term, ...]:
         """Return the force of spring and damper."""
-        rates = {"stiffness": self.stiffness, "contact_damping": self.damping}
-        return (SupportForce(self.rows, self.energy, self.resistance, **rates, penetration=self.penetration),)
+        force = SupportForce(
+            self.rows,
+            self.energy,
+            self.resistance,
+            stiffness=self.stiffness,
+            contact_damping=self.damping,
+            penetration=self.penetration,
+        )
+        return (force,)
 
     def rows(self, machine: Machine) -> Array:
         """Return the matrix (1, nd) or (2, nd) that gives the displacement of the place on a `machine` with nd coordinates.

@@ -17,7 +17,7 @@ from jaxvib.equations.model import Model
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
+from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema, step_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.readable import Readable
@@ -183,16 +183,20 @@ def turning_directions(scene: Scene) -> np.ndarray:
     return np.repeat([e.direction for e in scene.exciters], [1 if e.loads is None else e.loads.count for e in scene.exciters])
 
 
-def measure(model: Model, field: Field, times: Array, states: State, unit: State) -> Measured:
+def measure(model: Model, field: Field, times: Array, states: State, unit: State, extremes: Extremes | None = None) -> Measured:
     """Measure the amplitudes and the load speed of an evenly sampled part of a motion, see `Measured`.
 
     Extrema and whole turns are computed from interpolants that use the rates of the equations of motion, not from the samples.
 
     **Arguments**: `field` returns the rates of a state at a time; it must be a pytree of its arrays, such as `Dynamics` or a
-    `jax.tree_util.Partial`, not a plain function; `unit`: the `natural_units` of the scene.
+    `jax.tree_util.Partial`, not a plain function; `unit`: the `natural_units` of the scene; `extremes` between each sample and
+    the next, if they are known; default: those of the interpolants.
     """
-    early, late, whole = _spans(model, field, times, states)
     nd, half = states.displacement.shape[1], times.shape[0] // 2
+    if extremes is None:
+        early, late, whole = _spans(model, field, times, states)
+    else:
+        early, late, whole = (extremes.part(steps).spans for steps in (slice(half - 1), slice(half, None), slice(None)))
 
     speeds, late_speeds = mean_speeds(times, *turning_angles(model.scene, lambda: times, states), (0, half))
     change = jnp.abs(late - early)
@@ -282,6 +286,43 @@ def locate_peaks(model: Model, field: Field, times: Array, states: State) -> Pea
     at, place = first[1, 2] + jnp.arange(NODES), position[1, 2]
     largest_force = jax.vmap(lambda x, v: extremum_value(x[at], v[at], place))(force, change)
     return Peaks(jnp.maximum(-low[2], high[2]), model.known_force(jnp.sqrt(jnp.sum(largest_force**2))))
+
+
+class Extremes(NamedTuple):
+    """Extrema of a motion whose forces have kinks and jumps, from all steps of a run; or of several parts of it.
+
+    **Attributes**: `low`, `high` (..., outputs): extrema of the displacements and foundation forces; `square` (...), N^2:
+    largest square of the magnitude of the foundation force.
+    """
+
+    low: Array
+    high: Array
+    square: Array
+
+    @property
+    def spans(self) -> Array:
+        """Half of the peak-to-peak values (..., outputs)."""
+        return (self.high - self.low) / 2.0
+
+    def part(self, steps: slice = slice(None)) -> Extremes:
+        """Return the extrema of some `steps` along the leading axis together."""
+        low, high, square = (x[steps] for x in self)
+        return Extremes(jnp.min(low, axis=0), jnp.max(high, axis=0), jnp.max(square, axis=0))
+
+    def peaks(self, model: Model) -> Peaks:
+        """Return the largest values."""
+        nd = model.carrier.mass.shape[0]
+        return Peaks(jnp.maximum(-self.low, self.high)[..., :nd], model.known_force(jnp.sqrt(self.square)))
+
+
+def extremes_of_steps(model: Model, field: Field, times: Array, states: State) -> Extremes:
+    """Return the extrema of consecutive steps of equal length, for arguments as in `measure`."""
+    nd = states.displacement.shape[1]
+    values, slopes = _sampled_outputs(model, field, times, states)
+    low, high = step_extrema(values.T, slopes.T)
+    force, change = values[nd:], slopes[nd:]
+    _, square = step_extrema(jnp.sum(force**2, axis=0), 2.0 * jnp.sum(force * change, axis=0))
+    return Extremes(low, high, square)
 
 
 def _sampled_outputs(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array]:
