@@ -229,6 +229,6 @@ class _Step(NamedTuple):
         # Equal contacts begin together and have equal gradients; `size` on the diagonal gives them the mean of their shifts.
         size = jnp.where(begins, jnp.sqrt(jnp.finfo(gram.dtype).eps) * jnp.max(jnp.diagonal(gram)), 1.0)
         displacement, angles = unravel(gradients.T @ jnp.linalg.solve(gram + jnp.diag(size), shift))
-        rates = [displacement, *(angle for each in angles for angle in each)]
         zero = jax.tree.map(jnp.zeros_like, state)
-        return self.system.pack(eqx.tree_at(lambda s: [s.velocity, *(r for e in s.exciters for r in e.rate)], zero, rates))
+        exciters = [ExciterState(own.angle, rate, own.rotor, own.spin) for own, rate in zip(zero.exciters, angles, strict=True)]
+        return self.system.pack(State(zero.displacement, displacement, exciters=tuple(exciters)))
