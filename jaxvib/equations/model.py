@@ -101,6 +101,12 @@ class Model(eqx.Module):
                 force = force + term.force(rows @ displacement, rows @ velocity)
         return force
 
+    @property
+    def has_kinked_force(self) -> bool:
+        """True if the force on the foundation is not a smooth function of the motion, because of a stop or dry friction."""
+        terms = terms_of(self.scene.all_effects, SupportForce)
+        return any(not (term.is_smooth or term.is_link) for term in terms)
+
     def known_force(self, force: Array) -> Array:
         """Return a force on the foundation, or NaN for a machine whose foundation is unknown (`Machine.has_foundation`)."""
         return force if self.scene.machine.has_foundation else jnp.full_like(force, jnp.nan)

@@ -129,6 +129,25 @@ def extremum_value(x: Array, v: Array, position: Array) -> Array:
     return _at(polynomial, s - move + jax.lax.stop_gradient(move))
 
 
+def between(begin: Sequence[Array], end: Sequence[Array], s: Array) -> tuple[Array, Array]:
+    """Return value and slope of a motion within a step, at the position `s` from 0 to 1.
+
+    They are those of the polynomial p of degree 5 through both ends: |x - p| <= max |d^6 x/ds^6| / 46080. A jump of the second
+    derivative has no influence on other steps.
+
+    **Arguments**: `begin` and `end`: value, slope and second derivative with respect to s at the ends of the step.
+    """
+    rise = end[0] - begin[0] - begin[1] - 0.5 * begin[2]
+    slope, bend = end[1] - begin[1] - begin[2], end[2] - begin[2]
+    cubic, quartic, quintic = (
+        10.0 * rise - 4.0 * slope + 0.5 * bend,
+        -15.0 * rise + 7.0 * slope - bend,
+        6.0 * rise - 3.0 * slope + 0.5 * bend,
+    )
+    polynomial = [begin[0], begin[1], 0.5 * begin[2], cubic, quartic, quintic]
+    return _at(polynomial, s), _at(_derivative(polynomial), s)
+
+
 def greatest(values: Array) -> Array:
     """Return the maximum of numbers (n,), with the derivatives of the largest one.
 

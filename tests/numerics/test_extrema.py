@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.numerics.extrema import extremum_value, locate_extrema, step_extrema
+from jaxvib.numerics.extrema import between, extremum_value, locate_extrema, step_extrema
 
 
 def samples(per_turn, count, first=0.37):
@@ -74,3 +74,10 @@ def test_samples_that_are_no_numbers_have_no_place():
     x, v = samples(16, 64)
     values, _, places = locate_extrema(x.at[40].set(jnp.nan), v)
     assert np.all(np.isfinite(values[:, 0])) and np.all(np.isnan(values[:, 1:])) and np.all(np.isnan(places[:, 1:]))
+
+
+def test_motion_between_two_samples_is_of_degree_five():
+    polynomial = np.polynomial.Polynomial([1.0, -2.0, 0.5, 3.0, -1.0, 0.7])
+    ends = [[jnp.asarray(polynomial.deriv(k)(s)) if k else jnp.asarray(polynomial(s)) for k in range(3)] for s in (0.0, 1.0)]
+    for s in (0.0, 0.3, 1.0):
+        np.testing.assert_allclose(between(*ends, jnp.asarray(s)), [polynomial(s), polynomial.deriv()(s)], rtol=1e-13)

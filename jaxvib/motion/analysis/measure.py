@@ -17,7 +17,7 @@ from jaxvib.equations.model import Model
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema, step_extrema
+from jaxvib.numerics.extrema import NODES, between, extremum_value, locate_extrema, step_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.readable import Readable
@@ -26,6 +26,10 @@ from jaxvib.runtime.programs import cached
 MIN_CHANGE_SCALE = 1e-4
 """Smallest scale for relative changes, in units of the unbalance radius S/M for amplitudes and of S n^2 for forces. It is
 needed because the amplitude and the force of a balanced rotor are almost zero."""
+
+_POINTS_IN_STEP = 8
+"""Number of points in each sampling step at which a kinked force is searched for extrema, and number of points in their
+distance in a second search: the error of a sine with 16 samples a period is 5e-7 of its amplitude."""
 
 Field = Callable[[Array, State], State]
 """Equations of motion: function from a time and a state to the rates of the state."""
@@ -194,7 +198,7 @@ def measure(model: Model, field: Field, times: Array, states: State, unit: State
     """
     nd, half = states.displacement.shape[1], times.shape[0] // 2
     if extremes is None:
-        early, late, whole = _spans(model, field, times, states)
+        early, late, whole = (_spans_of_kinked_force if model.has_kinked_force else _spans)(model, field, times, states)
     else:
         early, late, whole = (extremes.part(steps).spans for steps in (slice(half - 1), slice(half, None), slice(None)))
 
@@ -261,6 +265,80 @@ def _extrema(model: Model, field: Field, times: Array, states: State) -> tuple[A
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), values_and_places)
 
 
+def _spans_of_kinked_force(model: Model, field: Field, times: Array, states: State) -> Array:
+    """Return `_spans` for a force that jumps or has kinks. The polynomials of `locate_extrema` would overshoot at a jump."""
+
+    def outputs(displacement: Array, velocity: Array) -> Array:
+        return jnp.concatenate([displacement, model.foundation_force(displacement, velocity)])
+
+    low, high = _kinked_extrema(outputs, field, times, states)
+    return (high - low) / 2.0
+
+
+def _kinked_extrema(outputs: Callable[[Array, Array], Array], field: Field, times: Array, states: State) -> Array:
+    """Return extrema (2, 3, n) of outputs that are not smooth functions of displacement and velocity, ordered as those of
+    `locate_extrema`.
+
+    Between two samples, the outputs are computed from interpolated displacements and velocities. The search for the extrema is
+    not differentiated; their values are.
+
+    **Arguments**: `outputs` (n,): function of displacement and velocity; the others as in `measure`.
+    """
+    step, count, m = _step(times), times.shape[0], _POINTS_IN_STEP
+
+    def motion(states: State, rates: State) -> tuple[Array, Array, Array]:
+        return states.displacement, states.velocity * step, rates.velocity * step**2
+
+    def at(begin: Sequence[Array], end: Sequence[Array], share: Array) -> Array:
+        displacement, slope = between(begin, end, share)
+        return outputs(displacement, slope / step)
+
+    def first_sample(place: Array) -> Array:
+        return jnp.clip(place.astype(int), 0, count - 2)
+
+    samples = motion(states, scalarized_vmap(_rates)((times, states), field))
+    begin, end = [x[:-1] for x in samples], [x[1:] for x in samples]
+    points = jnp.asarray(np.arange(m) / m, times.dtype)
+    values = jax.vmap(lambda begin, end: jax.vmap(lambda share: at(begin, end, share))(points))(begin, end)
+    last = at([x[-1] for x in begin], [x[-1] for x in end], jnp.ones_like(step))
+    values = jnp.concatenate([values.reshape(-1, values.shape[-1]), last[None]])
+    numbers = jnp.arange(values.shape[-1])
+
+    def places_of_maxima(sign: Array) -> Array:
+        """Positions (3, n) of the maxima of `sign` times the outputs, in steps from the first sample."""
+
+        def place(start: int, stop: int) -> Array:
+            near = (start * m + jnp.argmax(sign * values[start * m : stop * m + 1], axis=0)) / m
+            near = jnp.clip(near[None] + np.linspace(-1.0 / m, 1.0 / m, 2 * m + 1)[:, None], start, stop).astype(times.dtype)
+
+            def value(output: Array, place: Array) -> Array:
+                k = first_sample(place)
+                return at([x[k] for x in begin], [x[k] for x in end], place - k)[output]
+
+            best = jnp.argmax(sign * jax.vmap(jax.vmap(value), in_axes=(None, 0))(numbers, near), axis=0)
+            return near[best, numbers]
+
+        half = count // 2
+        return jnp.stack([place(0, half - 1), place(half, count - 1), place(0, count - 1)])
+
+    places = jax.lax.stop_gradient(jax.vmap(places_of_maxima)(jnp.asarray([-1.0, 1.0], times.dtype)))
+
+    def extremum(output: Array, place: Array) -> Array:
+        k = first_sample(place)
+        moments, ends = jax.tree.map(lambda leaf: leaf[k + np.arange(2)], (times, states))
+        first, second = zip(*motion(ends, jax.vmap(field)(moments, ends)), strict=True)
+
+        def value(place: Array) -> Array:
+            return at(first, second, place - k)[output]
+
+        # A step of Newton's method, because the derivatives are those of the value at a fixed place. There is none at a kink.
+        slope, curvature = jax.grad(value)(place), jax.grad(jax.grad(value))(place)
+        is_smooth = jnp.abs(slope) * m**2 <= jnp.abs(curvature)
+        return value(place - jax.lax.stop_gradient(jnp.where(is_smooth, slope / jnp.where(is_smooth, curvature, 1.0), 0.0)))
+
+    return jax.vmap(jax.vmap(jax.vmap(extremum), in_axes=(None, 0)), in_axes=(None, 0))(numbers, places)
+
+
 class Peaks(NamedTuple):
     """Largest values of a motion.
 
@@ -279,6 +357,14 @@ def locate_peaks(model: Model, field: Field, times: Array, states: State) -> Pea
     the square of the force is largest.
     """
     nd = states.displacement.shape[1]
+    if model.has_kinked_force:
+
+        def squares(displacement: Array, velocity: Array) -> Array:
+            force = model.foundation_force(displacement, velocity)
+            return jnp.concatenate([displacement, jnp.sum(force**2)[None]])
+
+        low, high = _kinked_extrema(squares, field, times, states)
+        return Peaks(jnp.maximum(-low[2], high[2])[:nd], model.known_force(jnp.sqrt(high[2, nd])))
     values, slopes = _sampled_outputs(model, field, times, states)
     (low, high), _, _ = jax.vmap(locate_extrema, out_axes=-1)(values[:nd], slopes[:nd])
     force, change = values[nd:], slopes[nd:]
