@@ -7,16 +7,22 @@ import math
 from collections.abc import Sequence
 
 import diffrax
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import speed_text
 from jaxvib.equations.linear import linear_model, mean_speed
+from jaxvib.equations.model import assemble
 from jaxvib.equations.state import State
 from jaxvib.errors import ComputationError
+from jaxvib.machine.effects.base import terms_of
+from jaxvib.machine.effects.terms import SupportForce
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
+from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.regime import Regime, RegimeName
 from jaxvib.motion.analysis.separation import prepare_separation, would_separate
 from jaxvib.motion.integrate import WINDOW_SAMPLES, frequency_bounds, whole_turns
@@ -137,7 +143,7 @@ class _SettlePlan:
     **Attributes**: `first`: plan of the first segment; `segments`: their largest number; `drift`: the drift below which the
     motion has settled; `default_drift`: the default drift of the precision; `mean_segments`: the number of segments that
     show whether the motion is steady in the mean, None if the motion must reach the drift; `decay`: the slowest decay of the
-    carrier, 1/s.
+    carrier without friction at supports, 1/s.
     """
 
     first: RunPlan
@@ -203,7 +209,8 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
         if status_name(run.status) != "done":
             return run, False
         drifts.append(float(run.drift))
-        if drifts[-1] < plan.drift and _distance(drifts, run, plan.decay, length) < _MAX_DISTANCE_IN_DRIFTS * plan.drift:
+        decay = plan.decay or _slowest_decay(plan.first.scene, run.window)
+        if drifts[-1] < plan.drift and _distance(drifts, run, decay, length) < _MAX_DISTANCE_IN_DRIFTS * plan.drift:
             final = _with_final_status(run, "done")
             # If the loads are not at exactly one angle and would separate, the run continues until they have left this motion.
             if is_coincident or status_name(final.status) == "done" or not would_separate(run.scene, run.window):
@@ -215,7 +222,7 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
             if len(measured) >= plan.mean_segments and _steady_in_the_mean(np.array(measured[-plan.mean_segments :])):
                 return _with_final_status(run, "beating"), True
             is_plain = plan.first.scene.is_plain
-            if is_plain and drifts[-1] < SETTLED_DRIFT and plan.decay * length * len(measured) > -math.log(plan.default_drift):
+            if is_plain and drifts[-1] < SETTLED_DRIFT and decay * length * len(measured) > -math.log(plan.default_drift):
                 regimes.append(run.regime)
                 if _is_creeping(regimes[-_CREEP_SEGMENTS:]):
                     return _with_final_status(run, "creeping"), True
@@ -231,15 +238,27 @@ def _with_final_status(run: Run, name: str) -> Run:
 
 
 @cached
-def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
-    """Return the matrices (nd, nd) of mass, damping with gyroscopic terms, and stiffness."""
+def _matrices(scene: Scene, window: Trajectory | None) -> tuple[Array, Array, Array]:
+    """Return the matrices (nd, nd) of mass, damping with gyroscopic terms, and stiffness.
+
+    With a `window`, the damping contains the slopes of the resistances of supports, averaged over the motion in the window.
+    """
     model = linear_model(scene)
-    return model.mass, model.damping(mean_speed(scene)), model.carrier.stiffness
+    damping = model.damping(mean_speed(scene))
+    for term, rows in zip(terms_of(scene.all_effects, SupportForce), assemble(scene).supports, strict=True):
+        if window is not None and term.resistance is not None:
+            motion = (each @ rows.T for each in (window.state.displacement, window.state.velocity))
+            slopes = jax.vmap(jax.jacobian(term.resistance, argnums=1))(*motion)
+            damping = damping + rows.T @ jnp.mean(slopes, axis=0) @ rows
+    return model.mass, damping, model.carrier.stiffness
 
 
-def _slowest_decay(scene: Scene) -> float:
-    """Return the smallest decay rate of free vibrations of the carrier with its loads, 1/s; 0 if a vibration does not decay."""
-    poles = poles_of(*(np.asarray(matrix, float) for matrix in _matrices(scene)))
+def _slowest_decay(scene: Scene, window: Trajectory | None = None) -> float:
+    """Return the smallest decay rate of free vibrations of the carrier with its loads, 1/s; 0 if a vibration does not decay.
+
+    Friction at supports is included for the motion in a `window`: a small vibration beside this motion decays.
+    """
+    poles = poles_of(*(np.asarray(matrix, float) for matrix in _matrices(scene, window)))
     slowest = float(np.min(-poles.real))
     return slowest if slowest > 1e-12 * float(np.max(np.abs(poles))) else 0.0
 
