@@ -33,7 +33,7 @@ def contact(v, y):
     ids=["friction", "stop"],
 )
 def test_force_equals_that_of_scipy(effect, force, rtol):
-    """With the polynomial through four samples, which overshoots, the forces are 40 % and 2 % too large. A contact has two
+    """The polynomial through four samples overshoots; with it the forces are 40 % and 2 % too large. A contact has two
     samples."""
     period = 2.0 * np.pi / SPEED
     run = jv.simulate(scene(effect), TURNS * period, save="window", stepsize_controller=jv.Tolerance(1e-9))
