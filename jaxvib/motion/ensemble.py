@@ -328,7 +328,7 @@ def ensemble(
     return dataclasses.replace(result, seconds=on_device(np.asarray(time.perf_counter() - begun, plan.end.dtype)))
 
 
-def _resolved(plan: EnsemblePlan) -> Array:
+def _resolved(plan: EnsemblePlan) -> Array | np.ndarray:
     """Return True for each run whose steps resolve decay and contacts."""
     step = plan.end / (ENSEMBLE_PARTS * plan.each)
     resolved = plan.implicit | ~is_unresolved(plan.decay, step)

@@ -35,7 +35,7 @@ from jaxvib.ode.replay import solve
 from jaxvib.runtime.programs import cached
 
 WINDOW_SAMPLES = 4096
-"""Number of samples in the measuring window."""
+"""Number of samples in the measuring window, if no stop needs more."""
 
 MIN_SAMPLES_PER_TURN = 16
 """Smallest number of samples in a turn of the rotor; a vibration with the period of a turn is then interpolated with
@@ -174,6 +174,7 @@ class IntegrationPlan(NamedTuple):
     - `periods`: length of the measuring window in periods of the slowest motion
     - `bounds`, see `frequency_bounds`
     - `progress_meter` of diffrax
+    - `window_samples`: number of samples in the measuring window
     """
 
     solver: diffrax.AbstractSolver | None
@@ -184,6 +185,7 @@ class IntegrationPlan(NamedTuple):
     bounds: tuple[Array | np.ndarray, Array | np.ndarray]
     max_steps: int
     progress_meter: diffrax.AbstractProgressMeter | None = None
+    window_samples: int = WINDOW_SAMPLES
 
 
 @cached
@@ -270,7 +272,7 @@ def _saves(scene: Scene, end: Array, plan: IntegrationPlan) -> list[diffrax.SubS
     """Return the times of stored states: the measuring window, the end, and evenly spaced times over the whole run."""
     longest = 2.0 * jnp.pi * WINDOW_SAMPLES / (MIN_SAMPLES_PER_TURN * jax.lax.stop_gradient(scene.top_speed))
     window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * plan.periods / plan.bounds[1], longest), end / 2.0)
-    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW_SAMPLES)), diffrax.SubSaveAt(t1=True)]
+    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, plan.window_samples)), diffrax.SubSaveAt(t1=True)]
     if plan.samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, plan.samples)))
     return saves

@@ -22,10 +22,19 @@ from jaxtyping import PyTree
 from jaxvib.boundary import call_user
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
+from jaxvib.machine.effects.base import terms_of
+from jaxvib.machine.effects.terms import SupportForce
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns, validate_scene
-from jaxvib.motion.integrate import MIN_SAMPLES_PER_TURN, IntegrationPlan, StepControl, frequency_bounds
-from jaxvib.motion.integration.stiffness import contact_rate, equal_step_length, fastest_decay, fastest_motion, stiff_solver
+from jaxvib.motion.integrate import MIN_SAMPLES_PER_TURN, WINDOW_SAMPLES, IntegrationPlan, StepControl, frequency_bounds
+from jaxvib.motion.integration.stiffness import (
+    contact_rate,
+    equal_step_length,
+    fastest_decay,
+    fastest_motion,
+    sampling_rate,
+    stiff_solver,
+)
 from jaxvib.motion.start import Start, initial_state, require_start, start_state, with_spin, with_spin_up_drive
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.runtime.devices import known as numpy_of_known
@@ -45,6 +54,9 @@ _UNKNOWN_STEPS, _UNKNOWN_SAMPLES = 2**20, 2000
 """Maximum number of steps, and number of samples, of a run whose length or speeds are unknown."""
 
 _FEW_SAMPLES, _MANY_SAMPLES = 2**14, 2**18
+
+_MAX_WINDOW_SAMPLES = 2**17
+"""Largest number of samples in the measuring window of a run with stops."""
 
 _IMPLICIT_STEPS_FACTOR = 16.0
 """Factor by which the implicit method increases the default of `max_steps`."""
@@ -211,9 +223,10 @@ def plan_run(
         max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_STEPS_FACTOR) * fastest, end, steps)
     if (solver := stiff if solver is None else solver) is None and not known and end.dtype.itemsize >= 8:
         solver = _solver_for_derivatives(adjoint)
+    window_samples = _window_samples(scene, end, 2.0 * math.pi * periods / slowest) if known else WINDOW_SAMPLES
     saved_samples, step_limit = samples if save == "all" else 0, min(count(max_steps, "max_steps"), MAX_STEPS)
     integration = IntegrationPlan(
-        solver, control, adjoint, saved_samples, periods, (fastest, slowest), step_limit, progress_meter
+        solver, control, adjoint, saved_samples, periods, (fastest, slowest), step_limit, progress_meter, window_samples
     )
     return RunPlan(
         given_scene=given_scene,
@@ -226,6 +239,22 @@ def plan_run(
         is_estimated=is_estimated,
         accuracy=steps.error if isinstance(steps, Accuracy) else None,
     )
+
+
+def _window_samples(scene: Scene, end: Array | np.ndarray, length: Array | np.ndarray) -> int:
+    """Return the number of samples in a measuring window of a `length`, s, that is at most half of the run until `end`, s.
+
+    It is a power of 2 that resolves the forces of stops.
+
+    **Raises** `InputError` if a stop needs more than the largest number.
+    """
+    if not any(term.stiffness is not None for term in terms_of(scene.effects, SupportForce)):
+        return WINDOW_SAMPLES
+    needed = max(float(sampling_rate(scene)) * min(float(length), float(end) / 2.0), WINDOW_SAMPLES)
+    if needed > _MAX_WINDOW_SAMPLES:
+        problem = f"has such short contacts that the window needs {needed:.3g} samples, more than {_MAX_WINDOW_SAMPLES}"
+        raise InputError("scene", f"{problem}; give fewer window_periods, or a stop with less stiffness and damping")
+    return 2 ** math.ceil(math.log2(needed))
 
 
 def _solver_for_derivatives(adjoint: diffrax.AbstractAdjoint | None) -> LoopDopri8:

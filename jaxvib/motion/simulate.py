@@ -71,7 +71,8 @@ def simulate(
     - `samples` (default: 16384; 262144 for runs of more than 1024 turns of the rotor; 2000 under a JAX transformation);
       typical: 20 for each period of the vibration. Samples need memory, but hardly any time
     - `window_periods`: length of the measuring window at the end, in periods of the lowest natural frequency (at most half the
-      run, and 256 turns of the rotor); typical: 20 (the default)
+      run, and 256 turns of the rotor); typical: 20 (the default). The window has 4096 samples, with stiff stops up to 131072;
+      under a JAX transformation always 4096, which may miss short contacts
     - `estimate`: True to estimate the `error` of the run by a second run with larger steps, which needs about half as many
       evaluations. The default is True, but False under a JAX transformation and with a step size controller of diffrax
     - `stepsize_controller`: choice of the steps, see below

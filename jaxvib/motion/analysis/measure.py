@@ -321,9 +321,10 @@ def _kinked_extrema(outputs: Callable[[Array, Array], Array], field: Field, time
         half = count // 2
         return jnp.stack([place(0, half - 1), place(half, count - 1), place(0, count - 1)])
 
-    places = jax.lax.stop_gradient(jax.vmap(places_of_maxima)(jnp.asarray([-1.0, 1.0], times.dtype)))
+    signs = jnp.asarray([-1.0, 1.0], times.dtype)
+    places = jax.lax.stop_gradient(jax.vmap(places_of_maxima)(signs))
 
-    def extremum(output: Array, place: Array) -> Array:
+    def extremum(output: Array, place: Array, sign: Array) -> Array:
         k = first_sample(place)
         moments, ends = jax.tree.map(lambda leaf: leaf[k + np.arange(2)], (times, states))
         first, second = zip(*motion(ends, jax.vmap(field)(moments, ends)), strict=True)
@@ -331,12 +332,13 @@ def _kinked_extrema(outputs: Callable[[Array, Array], Array], field: Field, time
         def value(place: Array) -> Array:
             return at(first, second, place - k)[output]
 
-        # A step of Newton's method, because the derivatives are those of the value at a fixed place. There is none at a kink.
+        # A step of Newton's method, because the derivatives are those of the value at a fixed place. It fails at a kink.
         slope, curvature = jax.grad(value)(place), jax.grad(jax.grad(value))(place)
-        is_smooth = jnp.abs(slope) * m**2 <= jnp.abs(curvature)
-        return value(place - jax.lax.stop_gradient(jnp.where(is_smooth, slope / jnp.where(is_smooth, curvature, 1.0), 0.0)))
+        moved = place - slope / jnp.where(curvature == 0.0, 1.0, curvature)
+        near = (jnp.abs(moved - place) * m**2 <= 1.0) & (sign * value(moved) >= sign * value(place))
+        return value(jax.lax.stop_gradient(jnp.where(near, moved, place)))
 
-    return jax.vmap(jax.vmap(jax.vmap(extremum), in_axes=(None, 0)), in_axes=(None, 0))(numbers, places)
+    return jax.vmap(jax.vmap(jax.vmap(extremum, (0, 0, None)), (None, 0, None)), (None, 0, 0))(numbers, places, signs)
 
 
 class Peaks(NamedTuple):

@@ -140,6 +140,24 @@ def contact_rate(scene: Scene) -> Array | None:
     return functools.reduce(jnp.maximum, rates)
 
 
+@cached
+def sampling_rate(scene: Scene) -> Array:
+    """Return the number of samples per second that resolves the forces of stops; 0 without stops on the foundation.
+
+    It is 8 for a period of the vibration on a stop, 2 pi / sqrt(fastest^2 + k max(P M^-1 P^T)), and 2 for the decay time of its
+    damper, see `contact_rate`.
+    """
+    scene, rate = jax.lax.stop_gradient(scene), jnp.zeros_like(scene.top_speed)
+    fastest, linear = frequency_bounds(scene)[0], linear_model(scene)
+    for term, rows in zip(terms_of(scene.effects, SupportForce), linear.supports, strict=True):
+        if term.stiffness is not None and not term.is_link:
+            accelerance = _largest_accelerance(linear, rows)
+            damping = 0.0 if term.contact_damping is None else term.contact_damping
+            vibration = jnp.sqrt(fastest**2 + term.stiffness * accelerance) / (2.0 * np.pi)
+            rate = jnp.maximum(rate, jnp.maximum(8.0 * vibration, 2.0 * damping * accelerance))
+    return rate
+
+
 def has_contacts(scene: Scene) -> bool:
     """Return True if a scene has stops, or loads that touch each other."""
     stops = (term.stiffness is not None for term in terms_of(scene.effects, SupportForce))
