@@ -47,7 +47,7 @@ _SAME_DESIGN_DISTANCE = 1e-3
 """Distance of two designs, relative to the ranges of the free parameters, below which they count as the same machine."""
 
 _INITIAL_SPREAD = 1e-3
-"""Largest deviation of the initial angles of the loads from the exact motion, rad, or of displacements, relative."""
+"""Largest deviation of the start of a run from the exact motion: of the angles of loads, rad, or of displacements, relative."""
 
 _SAME_MOTION = 1e-2
 """Difference of amplitudes, relative to the largest, below which a run has settled in the working regime."""
@@ -55,7 +55,7 @@ _SAME_MOTION = 1e-2
 Progress = Callable[[str, float], None]
 
 _SEARCH_SHARE = 0.43
-"""Share of the search in the time of a search with verification, measured for the antiphase machine."""
+"""Part of the total time that the search takes if a verification follows, measured for the antiphase machine."""
 
 
 @validated
@@ -100,8 +100,8 @@ def synthesize(
       them are polished
     - `begin`: a `Synthesis` of this space; its final designs replace the random starts
     - `verify`: True to compute the exact motion of the best design. If it is stable, the full equations are integrated until
-      the motion has settled, from a state in which the loads deviate by up to 1e-3 rad, and the quantities are measured;
-      `unverified` states why there is no such run
+      the motion has settled, and the quantities are measured. The run starts near the exact motion: loads deviate by up to
+      1e-3 rad, for exciters with unbalances the displacements deviate by 0.1 %. `unverified` states why there is no such run
     - `throw`: True to raise `ComputationError` if no design meets all demands; False to return the design with the least
       violation, with the status "contradictory"
     - `progress`: a function that is called with the name of the present step and the finished share of the search (0 to 1)
@@ -112,8 +112,8 @@ def synthesize(
 
     **Raises** `InputError` for values that are not allowed, and `ComputationError` with one of two statuses:
 
-    - "no_feasible_start": for none of the random designs do the objective, the held quantities and the quantities of the
-      demands all exist; the message names the quantities that do not exist
+    - "no_feasible_start": in every random design at least one of the needed quantities (the objective, held quantities,
+      quantities of demands) does not exist; the message names the quantities that do not exist
     - "contradictory": no design meets all demands; the message states which demands are not met, and by how much
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -124,7 +124,7 @@ def synthesize(
     >>> space = DesignSpace(form.scene(), free={"machine.stiffness": (0.02, 0.3), "machine.link_stiffness": (0.2, 0.8)},
     ...                     hold=[hold(jam_frequency(mode=3), 1.0), hold(support_frequency_squared(), 2/9)])
     >>> best = synthesize(space, force_per_amplitude(mode=3), starts=8, verify=False)
-    >>> best.same, [round(k, 2) for k in best.after.parameters["machine.stiffness"]]     # the optimum has n2 = n1
+    >>> best.same, [round(k, 2) for k in best.after.parameters["machine.stiffness"]]     # equal supports are best
     (8, [0.11, 0.11])
 
     Source: the antiphase paper, section 5.1, where the optimum is derived by algebra.
@@ -312,8 +312,8 @@ _Motion = int | Literal["working"] | None
 
 
 def _motion_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> _Motion:
-    """Return the motion of a search: the jam mode of its objective, otherwise that of the first demand, otherwise that of the
-    first held quantity with a jam mode."""
+    """Return the jam mode of the first quantity that has one, in the order objective, demands, held quantities. Without a jam
+    mode, return "working" if a quantity belongs to the working regime, otherwise None."""
     quantities = objective, *(d.quantity for d in demands), *(h.quantity for h in space.held)
     modes = [q.mode for q in quantities if q.mode is not None]
     is_working = any(isinstance(part, RegimeQuantity) for q in quantities for part in walk(q))
@@ -371,7 +371,7 @@ def _exact_motion(scene: Scene, mode: int) -> Orbit | None:
 
 
 def _deviating_start(orbit: Orbit) -> State:
-    """Return a state of the exact motion with slightly separated loads, so that an unstable motion is left.
+    """Return a state of the exact motion with slightly separated loads, so that the run leaves the motion if it is unstable.
 
     From a start on the leading-order motion, a machine with little damping would need thousands of periods to reach the exact
     one.
@@ -454,8 +454,8 @@ class _SettledEvaluation(Evaluation):
 def _other_tiers(
     scene: Scene, quantities: Sequence[Quantity], verify: bool, run: Run | None, motion: _Motion
 ) -> tuple[list[float], list[float]]:
-    """Return the values of the quantities by the exact motion and by runs that have settled, such as `run` in `motion`; NaN for
-    a quantity that the tier cannot compute, and for the run of a mode that is unstable."""
+    """Return the values of the quantities by the exact motion and by settled runs; `run` is the settled run of `motion`. The
+    value is NaN for a quantity that the tier cannot compute, and for the run of a mode that is unstable."""
 
     def value(quantity: Quantity, evaluation: Evaluation, tier: Tier) -> float:
         at_tier = quantity.at_tier(tier)

@@ -38,7 +38,7 @@ single precision."""
 
 _AT_REST = (
     "linear machine with the masses of its loads at their places, at the rotor speed {speed:.6g} rad/s; inputs are forces on "
-    "the coordinates and at the exciter; loads do not turn"
+    "the coordinates and at each exciter; loads do not turn"
 )
 _IN_JAM = (
     "averaged equations linearized about a jam at the load speed {omega:.6g} rad/s and the rotor speed {speed:.6g} rad/s; "

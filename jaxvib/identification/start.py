@@ -1,7 +1,8 @@
-"""First values of an identification: the steady amplitudes of the machine are fitted to the amplitudes of the records.
+"""Start of an identification: a fit of the steady amplitudes of the machine to the amplitudes of the records.
 
 In a run-up the machine does not reach its steady amplitudes, but their peaks over speed lie near the peaks of the record. The
-whole records are then fitted twice: from the resulting values, and from the values of the scene. The better fit is used.
+whole records are then fitted twice: from the resulting values, and from the first values, those of the scene. The better fit is
+used.
 """
 
 from __future__ import annotations
@@ -100,7 +101,7 @@ def _track(unknowns: Unknowns, runs: tuple[Samples, ...], scene: Scene, data: tu
 
 
 def track_orders(problem: Problem) -> np.ndarray:
-    """Return first values x (p,) of the unknowns from the amplitudes of the runs.
+    """Return the values x (p,) of the unknowns that follow from the amplitudes of the runs, as the start of a fit.
 
     In four cases x is 0, that is, the unknowns have the values of the scene: for several unbalances, without unknown parameters
     of the scene, for runs with too few turns, and if the fit fails.

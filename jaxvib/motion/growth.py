@@ -73,9 +73,9 @@ class Growth(Result):
       quarters of this half, and 0.1 divided by the length of this half. (The last one is needed because exponents that are
       closer to each other cannot be separated.)
     - `horizon`: the time, s, after which rounding errors have grown to the size of the motion itself, ln(1/eps)/exponent, with
-      the relative rounding error eps. A derivative with respect to a parameter has then grown by 1/eps, and predicts nothing
-      about a change that is larger than rounding. The horizon is infinite for a regular motion; for an undecided one it is a
-      lower bound, ln(1/eps)/(exponent + 3 uncertainty)
+      the relative rounding error eps. A derivative with respect to a parameter has then grown by the factor 1/eps, and predicts
+      nothing about a change that is larger than rounding. The horizon is infinite for a regular motion; for an undecided one it
+      is a lower bound, ln(1/eps)/(exponent + 3 uncertainty)
     - `rates` (segments,): growth rate in each segment, 1/s; `time` (segments,): end of each segment, s
     """
 
@@ -232,7 +232,8 @@ def _sum_error(values: np.ndarray) -> float:
         s^2 = n c_0 + 2 (n - 1) c_1
 
     with the autocovariances c_k; the result is at least the error of one value. The correlation matters: if the phase of the
-    motion differs between the ends of segments, neighbouring logarithms of growth are large and cancel each other.
+    motion differs between the ends of segments, the logarithms of the growth in neighbouring segments are large and have
+    opposite signs.
     """
     deviation = values - np.mean(values)
     variance = float(np.sum(deviation**2)) / (values.size - 1)

@@ -63,9 +63,9 @@ def simulate(
       the time `spin_up`, default: half of `until`), or a `State`; see `initial_state`
     - `mode`: number of the jam mode for "jam"; typical: 1, 3, 5, the modes that are stable for light loads
     - `spin_up`, s; typical: 1 to 20
-    - `separation`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam 0. Loads
-      that start at exactly one angle (`separation=0`) stay at one angle (`Run.coincident`). If this motion settles although
-      slightly separated loads would leave it, the status is `would_separate`
+    - `separation`: angle between neighbouring loads at a named start, rad; default: 1 degree (loads with a `ball_radius`: side
+      by side), in a jam 0. Loads that start at exactly one angle (`separation=0`) stay at one angle (`Run.coincident`). If this
+      motion settles although slightly separated loads would leave it, the status is `would_separate`
     - `save`: "all" keeps `samples` evenly spaced states; "window" keeps the measured quantities and the window, but no
       trajectory
     - `samples` (default: 16384; 262144 for runs of more than 1024 turns of the rotor; 2000 under a JAX transformation);
@@ -100,12 +100,12 @@ def simulate(
 
     **Returns** `Run`, with its estimated `error` and its cost.
 
-    - Forward and reverse derivatives, `jit` and `vmap` are supported. First derivatives contain the shift of the time at which
-      a contact with a `Stop` or a `LoadContact` that has damping begins, and its force jumps. Second derivatives
+    - Forward and reverse derivatives, `jit` and `vmap` are supported. If a `Stop` or a `LoadContact` has damping, its force
+      jumps at the beginning of a contact; first derivatives contain the shift of this time. Second derivatives
       (`jax.hessian`) exist for scenes whose forces and torques are smooth
     - In single precision, the default methods of order 8 keep angles within one turn during the integration, and angles of the
-      window are relative to the number of turns at its beginning. Runs of one exciter at constant speed that keep only a
-      window are divided into segments of up to 20,000 turns of the fastest motion. Long runs therefore keep their phase
+      window do not contain the whole turns before the window. Runs of one exciter at constant speed that keep only a window
+      are divided into segments of up to 20,000 turns of the fastest motion. Long runs therefore keep their phase
 
     **Raises** `InputError` for values that are not allowed, `ComputationError` for a run that does not finish.
 
@@ -114,7 +114,7 @@ def simulate(
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
     ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
     >>> run = jv.simulate(scene, 10.0, start="jam", mode=1)
-    >>> bool(run.settled), round(float(run.omega), 2)      # caught just below the resonance at 28.1 rad/s
+    >>> bool(run.settled), round(float(run.omega), 2)      # jammed just below the resonance at 28.1 rad/s
     (True, 27.41)
 
     Source: the antiphase paper, section 5.3; for the method `UnrolledDopri8`.
@@ -203,7 +203,8 @@ def _with_limit_as_number(integration: IntegrationPlan) -> IntegrationPlan:
 def _run_in_segments(plan: RunPlan, control: Control, *, is_measured: bool) -> Run:
     """Return the run of the last of several segments.
 
-    Each segment begins at time 0 after a whole number of turns of the rotor, with angles within one turn.
+    The time of each segment begins at 0. All segments except the last have a whole number of turns of the rotor, and the
+    angles at the beginning of a segment are within one turn.
     """
     number, end = plan.segments, float(plan.end)
     if isinstance(control, StepControl) and control.steps is not None:
@@ -231,7 +232,7 @@ def _sum(counts: list[Array]) -> Array:
 
 
 _COARSE_TOLERANCE_RATIO = 100.0
-"""Tolerance of the second run (for the error estimate), in units of that of the first run."""
+"""Largest tolerance of the second run (for the error estimate), in units of that of the first run."""
 
 
 def _coarser(control: StepControl) -> StepControl:
@@ -381,5 +382,5 @@ def _hint(plan: RunPlan, run: Run, name: str) -> str:
         max_steps = plan.integration.max_steps
         hint += f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run{advice(run.scene)}"
     if name == "not_accurate":
-        hint += f" ({float(run.error):.1e}; requested {plan.accuracy:.1e}); give a larger accuracy, or a shorter run"
+        hint += f" ({float(run.error):.1e}; requested {plan.accuracy:.1e}); allow a larger error, or give a shorter run"
     return hint

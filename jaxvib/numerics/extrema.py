@@ -41,8 +41,8 @@ _EVEN, _ODD = _hermite()
 def _extrapolation() -> tuple[np.ndarray, np.ndarray]:
     """Return two matrices (2, 8) for extrapolation from the values and slopes of four samples.
 
-    They give the value and the slope of the polynomial through the samples, the first one step before the first sample, the
-    second one step after the last sample.
+    They give the value and the slope of the polynomial through the samples: the first matrix at one step before the first
+    sample, the second matrix at one step after the last sample.
     """
     powers = np.arange(2 * NODES)
 

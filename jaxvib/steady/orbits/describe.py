@@ -56,7 +56,8 @@ class Orbit(Result):
 
     - `status`: an `OrbitStatus`
     - `residual` of the torque balance, relative
-    - `error`: estimated relative error of the speeds, and error of psi in rad, due to the number of harmonics and to rounding
+    - `error`: the larger of the estimated relative error of the computed speed and the estimated error of psi in rad, due to
+      the number of harmonics and to rounding
     - `omega` and `rotor_speed`, rad/s; `slope`: dn/dOmega along the branch
     - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, (max - min)/2 over the period. For two
       directions of the force: root of the summed squares of their peaks (sqrt 2 times the force of a circular whirl)
@@ -64,8 +65,8 @@ class Orbit(Result):
     - `stable`: True if small deviations of the loads from this motion decay (`multiplier` < 1 - `multiplier_error`) and the
       loads do not separate
     - `multiplier`: largest modulus of the non-trivial Floquet multipliers; `multiplier_error`: its estimated numerical error
-    - `multipliers`: the Floquet multipliers, complex, without the trivial one; those of loads that separate from each other are
-      the last ones
+    - `multipliers`: the Floquet multipliers, complex, without the trivial one; the last ones belong to disturbances that
+      separate coincident loads
     - `trivial`: computed value of the trivial multiplier, that of a shift in time; its exact value is 1
     - `deviation_harmonics` (G, J), rad, `displacement_harmonics` (nd, K), m (rad for tilts), `force_harmonics` (nb, K), N: the
       c_k. Loads that have equal parameters have one deviation (G = 1), otherwise each has its own (G = count)
@@ -138,8 +139,8 @@ class Orbit(Result):
         """Return the greatest foundation force in each of 16 equal parts of the period, N, (16,); the largest is
         `foundation_force`.
 
-        `foundation_force` has a kink if another peak becomes the largest; these forces do not. For a force that does not change
-        its sign in half a period, or for two directions, the result is `foundation_force` alone, (1,).
+        `foundation_force` has a kink if another peak becomes the largest; these forces do not. For a force with even harmonics,
+        or with two directions, the result is `foundation_force` alone, (1,).
         """
         if self.force_harmonics.shape[0] > 1 or any(k % 2 == 0 for k in self.orders):
             return self.foundation_force[None]
@@ -189,7 +190,7 @@ def plot_period(
     """Plot a period of a motion over the angle Omega t from its harmonics.
 
     `named`: names and units of the coordinates; `deviation`: orders and harmonics of the bodies' deviations, the title of their
-    panel, and the labels of one of several bodies and of a single body.
+    panel, the label of each body (completed by its number) if there are several, and the label of a single body.
     """
     from jaxvib.draw.results import signals_chart  # slow imports
     from jaxvib.draw.style import length_unit
@@ -283,7 +284,7 @@ def orbits(
     tiny = jnp.finfo(slope.dtype).eps
     relative = jnp.abs(slope) * motion.omega / motion.rotor_speed
     met = residual < 4096.0 * tiny
-    speed_error = speed_error + tiny  # near a fold the load speed magnifies rounding too
+    speed_error = speed_error + tiny  # near a fold, rounding errors of the load speed are magnified too
     error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), deviation_error)
     flat = (relative < tiny**0.25) & (given == "rotor_speed")
     separates = contact_torque < 0.0
@@ -428,7 +429,8 @@ _PEAK_SEARCH_PARTS = 16
 def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array:
     """Return the maximum, (16,), of the signal with harmonics (K,) in each part of the period, including its ends.
 
-    For a signal that changes its sign in `half` a period, it is the maximum of the magnitude in each part of the half.
+    With `half`, the signal is repeated with the opposite sign after half a period, and the result is the maximum of its
+    magnitude in each of 16 parts of half a period.
     """
     each, width = max(16, int(orders[-1]) // 4), 2.0 * np.pi / _PEAK_SEARCH_PARTS
     if half:
@@ -463,7 +465,7 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
 
 def half_range(orders: np.ndarray, harmonics: Array) -> Array:
     """Return (max - min)/2 over the period, between samples too, of the signals with these harmonics (n, K)."""
-    symmetric = bool(np.all(orders % 2 == 1))  # the signal changes its sign in half a period
+    symmetric = bool(np.all(orders % 2 == 1))  # the signal is repeated with the opposite sign after half a period
 
     def highest(c: Array) -> Array:
         return greatest(_peaks(orders, c, half=symmetric))  # the maximum may lie between samples that are not the largest
