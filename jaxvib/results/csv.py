@@ -122,9 +122,11 @@ def _label(labels: Labels, axis: str, k: int, n: int) -> str:
 
 
 def _own_unit(unit: str, axes: tuple[str, ...], place: tuple[int, ...], units: Sequence[str]) -> str:
-    """Return the unit of a column, at one `place` of the `axes` after the first, from a unit such as "m or rad".
+    """Return the unit of a column; a `unit` such as "m or rad" becomes that of the coordinate of the column.
 
-    In a table along the coordinates it is their common unit; if their units differ, `unit` is returned.
+    In a table along the coordinates a column has their common unit; if their units differ, `unit` is returned.
+
+    **Arguments**: `place`: indices of the column along the `axes` after the first; `units` of the coordinates.
     """
     is_of_one = "coordinate" in axes[1:] and len(units) > 0
     return one_unit(unit, [units[place[axes.index("coordinate") - 1]]] if is_of_one else units)

@@ -67,8 +67,8 @@ class AbstractResponse(Readable):
       in two directions: the root of the sum of the squares of their peaks (for a rotating force sqrt 2 times its magnitude)
     - `transmissibility`: `foundation_force` divided by `exciter_force`; inf if the centrifugal forces cancel
     - `torque` (exciter,), N m: mean torque that each rotor needs to sustain the vibration; `power` (exciter,), W
-    - `motor_torque` (exciter,), N m: torque of each motor at this speed. An ideal drive supplies its own `torque`
-      and an equal part of the difference between `torque` and `motor_torque` of the exciters with motors
+    - `motor_torque` (exciter,), N m: torque of each drive at this speed. The torque that motors lack (their `torque` minus
+      their `motor_torque`) is supplied by the ideal drives in equal parts, in addition to the `torque` of their own rotors
     - `torque_share`: the sum of `torque` divided by that of `motor_torque`; inf above the no-load speed, where the motors brake
 
     At an undamped resonance the values other than `speed`, `exciter_force` and the `motor_torque` of motors are infinite.
@@ -121,8 +121,8 @@ class OperatingPoints(AbstractResponse):
 class TorqueFolds(Readable):
     """Folds: speeds at which `torque_share` is a maximum (at a resonance) or a minimum (beyond it).
 
-    **Attributes** (2 nd,), for a `TorqueTable` with n points up to n - 2 more (at most 8), ascending in `speed`; entries whose
-    `exists` is False are NaN
+    **Attributes**: arrays of 2 nd entries, ascending in `speed`; a `TorqueTable` with n points adds up to n - 2 entries (at
+    most 8); entries whose `exists` is False are NaN
 
     - `speed`, rad/s
     - `factor`: `torque_share` at the fold. With a motor of `factor` times the torque, two operating points merge here. At a
@@ -242,10 +242,10 @@ def response(
 
     The symbols are those of `synchronous_regimes`; Y are the complex amplitudes of the coordinates, and sigma is the mean of
     the directions of rotation (+1 or -1). The curve of the torque over the speed has a peak at each resonance (Sommerfeld
-    effect). A motor can turn at the speeds at which
-    its torque equals that of the curve, `operating`. If the torque of the motor changes, operating points appear and merge at
-    the `folds` of the curve. The phases of several exciters are fixed, by gears or a common shaft: their torques are added, and
-    they turn as one rotor with the sum of their inertias. For motors without gears use `synchronous_regimes`.
+    effect). A motor can turn at the speeds at which its torque equals that of the curve, `operating`. If the torque of the
+    motor changes, operating points appear and merge at the `folds` of the curve. The phases of several exciters are fixed, by
+    gears or a common shaft: their torques are added, and they turn as one rotor with the sum of their inertias. For motors
+    without gears use `synchronous_regimes`.
 
     **Arguments**
 
@@ -253,8 +253,8 @@ def response(
       the rotors, which excite the machine as well
     - `speeds`, rad/s, one or a list; typical: 100 to 1000 values; default: `points` speeds from a thousandth of the lowest
       resonance to `most`, denser near resonances
-    - `phases` (exciter,), rad or text, of the unbalances in their directions of rotation, which do not change with the speed;
-      default: 0
+    - `phases` (exciter,), rad or text, of the unbalances, each in its direction of rotation; the phases are the same at all
+      speeds; default: 0
     - `points`: number of the default speeds; typical: 200 to 2000 (default: 500)
     - `most`: highest of the default speeds, rad/s or text; default: 4/3 of the working speed
 
@@ -344,7 +344,8 @@ def _response(scene: Scene, speeds: Array, phases: Array) -> Response:
 
 
 def _slow_speed(resonances: Array) -> Array:
-    """Return a speed, rad/s, at which a response is its limit at speed 0, within about 1e-9 in double precision."""
+    """Return a speed, rad/s, at which a response is its limit at speed 0, within about 1e-9 (phases: 1e-5) in double
+    precision."""
     lowest = jnp.min(jnp.where(resonances > 0.0, resonances, jnp.inf))
     return float(jnp.finfo(lowest.dtype).eps) ** 0.3 * jnp.where(jnp.isfinite(lowest), lowest, 1.0)
 
@@ -403,7 +404,8 @@ def operation_of(model: UnbalancedModel) -> tuple[OperatingPoints, TorqueFolds]:
 def _balanced_speeds(model: UnbalancedModel, pieces: Pieces) -> tuple[Array, Array]:
     """Return the speed on each piece of the curve at which the motor supplies the required torque, and True if it exists."""
     top = model.shaft.speed
-    # The torque of the motor vanishes at the end of the last piece, whose root can be closer to it than the end of the grid.
+    # The grid ends just below the no-load speed, at which the torque of the motor vanishes. The root of the last piece can lie
+    # between these two speeds.
     high = jax.lax.stop_gradient(jnp.where(pieces.high < pieces.high[-1], pieces.high, top))
     gaps = (jax.vmap(partial(_torque_gap, model))(w) for w in (pieces.low, high))
     low_gap, high_gap = (jax.lax.stop_gradient(gap) for gap in gaps)

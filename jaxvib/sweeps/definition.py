@@ -45,7 +45,7 @@ CASE_STATUSES = enumeration_names(CaseStatus)
 """Names of the statuses in the order of their numbers in a store."""
 
 WITH_RESULTS = tuple(CASE_STATUSES.index(name) for name in ("done", "absent"))
-"""Numbers of the statuses of cases whose results are valid; those of an absent quantity are NaN."""
+"""Numbers of the statuses of cases whose results are valid; the results of an absent quantity are NaN."""
 
 
 class SweepStatus(eqx.Enumeration):
@@ -60,8 +60,9 @@ class Study:
     """Validated study, see `study`.
 
     **Attributes**: `scene`; `grid` of the cases; `names` of the `measures`; `plan`: steps and window of the runs, None without
-    runs; `start` and `mode` of the runs; `tier`; `specs`: the values of the axes as the user wrote them; `forms`: shape and
-    type of each measure in one case; `program`: the digest of the program of a case when the study was created.
+    runs; `start` and `mode` of the runs; `tier`: method by which quantities are computed, see `Tier`; `specs`: the values of
+    the axes as the user wrote them; `forms`: shape and type of each measure in one case; `program`: the digest of the program
+    of a case when the study was created.
     """
 
     scene: Scene

@@ -14,7 +14,7 @@ from optimize.search.polish import ACTIVE_DISTANCE, FEASIBILITY_TOLERANCE
 from optimize.search.problem import Problem
 
 _STEP = 0.01
-"""Relative change of a free parameter for its influence, and of a limit for the improvement of the objective."""
+"""Relative change for which effects on the objective are stated: of a free parameter (`Influence`), or of a limit (`Limit`)."""
 
 
 _EDGE = 2.0 * ACTIVE_DISTANCE

@@ -69,7 +69,7 @@ class NamedNumber(NamedTuple):
 
     @property
     def entries(self) -> set[tuple[_Path, int]]:
-        """Path and index of each parameter. If they occur under two names, these names share the parameter."""
+        """Path and index of each parameter. Two names with the same path and index mean the same parameter."""
         return {(self.path, k) for k in (range(self.size) if self.entry is None else (self.entry,))}
 
     def leaf(self, scene: Scene) -> Array:
@@ -180,7 +180,7 @@ def _is_continuous(value: object) -> bool:
 
 
 def _parts(scene: Scene) -> Iterator[tuple[str, _Path, eqx.Module]]:
-    """Yield each part of a scene after its name and its path. Repeatable effects are numbered from 0."""
+    """Yield the name, the path and the object of each part of a scene. Repeatable effects are numbered from 0."""
     yield "machine", ("machine",), scene.machine
     for k, exciter in enumerate(scene.exciters):
         place, path = scene.prefix_of(k), ("exciters", k)

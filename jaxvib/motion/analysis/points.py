@@ -189,7 +189,7 @@ def measures_text(
         return lines
     note = (
         f"only {100.0 * share:.3g} % of the amplitude is at the mean speed of the exciters, {speed_text(shaking.speed, 4)}; "
-        "g and mm/s are those of the whole amplitude at this speed, loads of supports are those of this part"
+        "g and mm/s are computed from the whole amplitude and this speed, forces on supports from this part only"
     )
     return [note, *lines]
 

@@ -2,12 +2,14 @@
 
 One mass stands for all loads of an exciter: it has the sum of their unbalances, moments of inertia and drags. In the averaged
 equations the loads can also separate. If the deviations of the phases of N equal loads from their mean add to 0, the force of
-the loads does not change, and neither does the acceleration a of their point. The averaged equation of each load becomes
+the loads does not change, and neither does the acceleration of the point about which they turn. The averaged equation of each
+load becomes
 
     I d'' + D d' - (S/2) Re(e^{-i psi} a) d = 0
 
-with the deviation d, the phase psi of the loads, and the unbalance S, the moment of inertia I and the drag D of one load. A
-regime is stable if the disturbances of the masses and these deviations decay.
+with the deviation d, the phase psi of the loads, and the unbalance S, the moment of inertia I and the drag D of one load. The
+complex number a = e^H A contains the amplitudes A of the acceleration of the point; e is the rotating direction. A regime is
+stable if the disturbances of the masses and these deviations decay.
 """
 
 from __future__ import annotations
@@ -81,7 +83,7 @@ def has_equal_loads(scene: Scene, exciter: int) -> bool:
 
 
 def _loads_per_mass(scene: Scene) -> tuple[int, ...]:
-    """Return the number of loads for which each mass of the scene with collected loads stands; 1 for an unbalance."""
+    """Return how many loads each mass of the scene with collected loads represents; 1 for an unbalance."""
     counts = [1 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters]
     if all(count == 1 or has_equal_loads(scene, k) for k, count in enumerate(counts)):
         return tuple(counts)
@@ -138,8 +140,8 @@ def _separation_growth(balance: TorqueBalance, fields: dict[str, Any]) -> Array:
 
 class FollowedRegimes(NamedTuple):
     """r regimes at n factors of the speeds of all drives: `factor` (n,); `speed` (r, n), rad/s; `phases` (r, n, rotating
-    masses), rad; `amplitude` (r, n, nd); `foundation_force` (r, n), N; `stable` (r, n). Values beyond the end of a regime are
-    NaN."""
+    masses), rad; `amplitude` (r, n, nd) of the nd coordinates, m or rad; `foundation_force` (r, n), N; `stable` (r, n). Beyond
+    the end of a regime the numbers are NaN, and `stable` is False."""
 
     factor: Array
     speed: Array
