@@ -45,7 +45,7 @@ def primitive(
     lowering: Callable[..., list[Array]] | None = None,
     abstract_eval: Callable[..., Sequence] | None = None,
 ) -> Callable[..., list[Array]]:
-    """Define a primitive with array operands and static keyword parameters from its rules.
+    """Define a primitive by its rules. Its operands are arrays, and its keyword parameters are static.
 
     **Arguments**: the rules, each a function
 

@@ -191,7 +191,7 @@ class StoredFunction(Generic[T]):
             if not results:  # the function itself raised the error
                 raise
             return _Program(jitted, results[0][1], UNKNOWN_STORED_SIZE)
-        exported = export.deserialize(bytearray(stored))  # frees the trace, 1 to 3 MB, to which the first one refers
+        exported = export.deserialize(bytearray(stored))  # the former `exported` would keep its trace, 1 to 3 MB, in memory
         (structure, result), name = results[0], self.function.__name__
         program = _Program(_compiled(name, exported, sharding), result, len(stored))
         if path is None or structure is None or code_state(look=True) != state:  # the code changed during the trace
@@ -265,7 +265,8 @@ def _no_garbage_collection() -> Iterator[None]:
 
 
 _ARRAYS = (jax.Array, np.ndarray, np.generic)
-"""Types of arrays. A call copies NumPy's arrays to the device in a tenth of the time of `jax.device_put`."""
+"""Types of arrays. A compiled program accepts NumPy arrays, and copies them to the device in a tenth of the time of
+`jax.device_put`."""
 
 _UNKNOWN = _Program(lambda *_: [], Skeleton(()))
 """Sentinel for a program that is not in memory."""

@@ -60,7 +60,7 @@ Key = tuple[tuple[Case, ...], Target]
 
 
 class TargetRecorder:
-    """Substitute for the argument `near_speeds` of an `Evaluation` that records which jams and folds quantities request."""
+    """Recorder of the jams and folds that quantities request. An `Evaluation` receives it in place of `near_speeds`."""
 
     def __init__(self) -> None:
         self.keys: list[Key] = []
@@ -234,7 +234,7 @@ def require_foundation(scene: Scene) -> None:
 
 
 def speed_of_target(modes: JamModes, target: Target) -> Array:
-    """Return the load speed of a target, rad/s, which is contained in the jam modes of a scene.
+    """Return the load speed of a target, rad/s, read from the jam modes of a scene.
 
     The value is NaN for a jam that does not exist, and -inf ("below") or inf ("above") for a fold that does not exist.
     """

@@ -24,7 +24,8 @@ _NEIGHBOURS = 5
 """Number of intervals on each side with which an interval is compared."""
 
 _MIN_SPEED = 0.02
-"""Speed relative to the largest one below which the error of a pulse's angle is not assumed to decrease further."""
+"""Lower limit of the rough speeds, relative to the largest. The error of a pulse's angle is assumed to be proportional to its
+rough speed, but at low speeds not smaller than at this limit."""
 
 _MAX_FAULTS = 0.1
 """Largest share of missed and false pulses."""

@@ -236,11 +236,11 @@ class SupportForce:
     - `rows`: function of the machine that returns a matrix (k, nd); rows q are the k displacements x of the supported point,
       see `Machine.rows_at`
     - `energy`, J: function of x
-    - `resistance`: function of x and its rate, the dissipative force on the foundation, (k,) N; or None
+    - `resistance`: function of x and its rate that returns the dissipative force on the foundation, (k,) N; or None
     - `is_smooth`: True if the force has all derivatives
     - `stiffness`: largest stiffness of the support, N/m, whose vibration equal steps must resolve; None if it has no limit
-    - `damping`: largest slope of a resistance that acts at any displacement, N s/m, whose decay explicit steps must resolve;
-      None for a contact, and without a resistance
+    - `damping`, N s/m: largest slope of the resistance over the velocity, for a resistance that acts at every displacement;
+      explicit steps must resolve the decay that it causes. None for a contact, and without a resistance
     - `contact_damping`: damping of a contact, N s/m, whose decay equal steps must resolve; None without a damper
     - `penetration`: function of x that returns the penetration, m, negative without contact, and its direction (k,), if the
       force jumps when a contact begins; otherwise None

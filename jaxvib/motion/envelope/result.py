@@ -60,7 +60,7 @@ class Envelopes(Readable):
 
     - `time` (nt,), s
     - `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s: complex amplitudes Y of q = Re(Y exp(i theta)), with the mean
-      angle theta of the loads. If exciters turn at different speeds, the amplitudes beat
+      angle theta of the loads. If exciters turn at different speeds, the amplitudes change periodically (beats)
     - `amplitude` (nt, nd), m, and `foundation_force` (nt, nb), N, zero to peak
     - `omega` (nt,): mean load speed, each load positive in the direction of its exciter, and `load_speed` (nt, count) of
       each load, positive anticlockwise, rad/s
@@ -87,7 +87,7 @@ class Envelopes(Readable):
 
 
 _OFFSET = "no spring returns the machine to its place: amplitudes include its displacement from the start"
-"""Sentence of the summary of machines without supports."""
+"""Sentence of the summary, for machines that can move without the force of a spring."""
 
 
 def _moves_without_spring(scene: Scene) -> bool:

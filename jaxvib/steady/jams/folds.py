@@ -39,7 +39,8 @@ _BLOCK_SIZE = 1024
 class Folds(Readable):
     """Points with dn/dOmega = 0, where two jam modes appear or merge.
 
-    **Attributes**, all (2 nd,), ascending in `omega`; `exists` is False for unused entries, which are at the end
+    **Attributes**, all (2 nd,), with two more entries for each of the `ExcitedModel.extra_peaks`, ascending in `omega`;
+    `exists` is False for unused entries, which are at the end
 
     - `omega`: load speed, rad/s
     - `rotor_speed`, rad/s
@@ -60,7 +61,7 @@ class DraggedModel(JammedModel):
 
     @property
     def highest_speed(self) -> Array:
-        """Speed just below the rotor speed, at which the factor has no bound."""
+        """Load speed just below the rotor speed. The factor has no bound where the load speed reaches the rotor speed."""
         return self.scene.drive.speed * (1.0 - float(jnp.finfo(self.mass.dtype).eps) ** 0.5)
 
 
@@ -169,9 +170,9 @@ def scanned_slopes(model: ExcitedModel, omegas: Array) -> Array:
 
 @eqx.filter_custom_jvp
 def _fold_speed(model: ExcitedModel, omega: Array) -> Array:
-    """Return `rotor_speed_at` in modal form; its derivatives are those of `rotor_speed_at`, which uses the full matrices.
+    """Return `rotor_speed_at` in modal form, or from the full matrices if the modal form is inaccurate.
 
-    The derivatives are computed only if they are needed.
+    The derivatives are those of `rotor_speed_at` from the full matrices, and are computed only if they are needed.
     """
     assert model.modal is not None
     return jax.lax.cond(model.modal.is_rough, rotor_speed_at, scanned_speed, model, omega)
@@ -291,8 +292,8 @@ def without_ripples(speeds: Array, count: Array, count_left: int) -> Array:
     """Return the indices of the `count_left` most relevant of 2 `count_left` folds; `speeds` are their rotor speeds, and the
     first `count` of them exist.
 
-    A branch has one peak for each resonance. If it has additional ripples, the pairs of folds with the smallest ratio of rotor
-    speeds are dropped.
+    A branch has one peak for each resonance. If it has additional ripples, the pairs of neighbouring folds whose rotor speeds
+    have the ratio closest to 1 are dropped.
     """
     index = jnp.arange(2 * count_left)
 

@@ -311,8 +311,8 @@ def jam_modes(scene: Scene) -> JamModes:
     **Raises** `InputError` for
 
     - loads without drag, at different stations, or not on a circle
-    - a machine whose coordinates couple through the rotor speed (`rotor`), and a body in a plane, which turns with the housing
-      of its exciter
+    - a machine whose coordinates couple through the rotor speed (`rotor`), and a body in a plane, with whose rotation the
+      housing of the exciter rotates
     - a motor in place of a prescribed speed
     - effects that this function does not include, such as `CubicSupport`, `Stop`, `FrictionSupport` and `Sliding`
 
@@ -383,9 +383,10 @@ def _fields(model: JammedModel, omega: Array, there: Array, at_fold: Array) -> d
 def jam_at(
     model: JammedModel, number: Array, omega: Array, rotor_speed: Array | None = None, at_fold: Array | None = None
 ) -> Jam:
-    """Return the jam of mode `number` with load speed `omega` rad/s at a rotor speed (rad/s) at which it exists, all scalars.
+    """Return the jam of the mode `number`.
 
-    **Arguments**: `rotor_speed` (default: that of the branch); `at_fold`: True if the jam is at a fold (default: if the slope
+    **Arguments**, all scalars: `omega`, rad/s, the load speed of the jam; `rotor_speed`, rad/s, at which the jam has this load
+    speed (default: that of the branch); `at_fold`: True if the jam is at a fold (default: if the slope
     of the branch is almost zero). The status is never `absent`, because the caller has checked that the mode exists.
     """
     speed, slope, displacement = branch_tangent(model, omega)
@@ -417,8 +418,9 @@ def jam_at(
 def _can_stay_together(model: JammedModel, omega: Array, rotor_speed: Array, displacement: Array) -> Array | bool:
     """Return True if the torque of the vibration can balance the drag of every load; always True for equal loads.
 
-    S w^2 |e^H B Y| / 2 is the largest torque of the vibration on a load, that at its best phase. It must reach the sum of the
-    torques of the drag, b_W R^2 (n - w), and of the dry friction of this load. The vibration is largest for coincident loads.
+    m R w^2 |e^H B Y| / 2 is the largest torque of the vibration on a load of mass m: the torque at the best phase of the load.
+    It must reach the sum of the torques of the drag, b_W R^2 (n - w), and of the dry friction of this load. The vibration is
+    largest for coincident loads.
     """
     loads = model.loads
     if loads.alike:

@@ -129,8 +129,8 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
 
         mean L(Omega) + factor (L_i(Omega) - mean L(Omega)) + V_i = 0
 
-    The factor is infinite if there are no differences, and if there is no fold up to a factor of 1e6. Its derivatives with
-    respect to parameters of the scene are those of the fold.
+    If an ideal drive turns an unbalance, the mean is replaced by 0. The factor is infinite if there are no differences, and if
+    there is no fold up to a factor of 1e6. Its derivatives with respect to parameters of the scene are those of the fold.
     """
     if x.size == 0:
         return jnp.full((), jnp.inf, balance.unbalance.dtype)

@@ -117,7 +117,7 @@ class AbstractSynchronousRegime(Result):
     - `quasi_static`, 1/s: the same according to the usual quasi-static criterion, which assumes that free vibrations of the
       machine decay infinitely fast; -inf if all speeds are prescribed
     - `margin`: the factor by which all differences of the driving torques can grow until the regime ends in a fold; inf if it
-      does not end
+      does not end. If an ideal drive turns an unbalance, the torques themselves grow
     - `torque` (mass,), N m: driving torque, by the motor or by the drag; for an ideal drive the torque that it must exert
     - `vibrational_torque` (mass,), N m: mean torque of the vibration on each mass; it balances `torque`
     - `power` (exciter,), W: mean power of each drive
@@ -159,7 +159,7 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
         return Harmonic(self.scene.machine, self.speed, self.displacement)
 
     def vibration(self) -> Vibration:
-        """Return the vibration, for `vibration_measures`. **Raises** `InputError` for a regime of some of the masses."""
+        """Return the vibration, for `vibration_measures`. **Raises** `InputError` unless it has all masses."""
         count = mass_owners(self.scene).size
         if self.phases.size != count:
             problem = f"has {self.phases.size} of the scene's {count} rotating masses"
@@ -353,8 +353,8 @@ def synchronous_regimes(
     >>> phases, found.stable.tolist()    # stable: half a turn apart, the body moves along a vertical line
     ([3.1416, 0.0], [True, False])
 
-    Source: I. I. Blekhman, Synchronization in Science and Technology, 1988; the eigenvalues of the linearized averaged
-    equations in place of his integral criterion.
+    Source: I. I. Blekhman, Synchronization in Science and Technology, 1988. The stability is not computed by his integral
+    criterion but from eigenvalues of the linearized averaged equations.
     """
     scene = validate_scene(scene)
     require_rotating_masses(scene)
@@ -439,10 +439,10 @@ def fields_of_balance(balance: TorqueBalance, omega: Array, phases: Array) -> di
 
 
 def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: Array | None = None) -> dict[str, Any]:
-    """Return the fields of a regime, without the scene, with derivatives with respect to the scene.
+    """Return the fields of a regime, except `scene`. They have derivatives with respect to parameters of the scene.
 
-    **Arguments**: unknowns `x` that solve the balance, and the `slopes` there, both without derivatives (None if there are no
-    unknowns); the `growth` of disturbances if it has been computed.
+    **Arguments**: unknowns `x` that solve the balance, and the `slopes` there (None if there are no unknowns), both without
+    derivatives; the `growth` of disturbances if it has been computed.
     """
     frozen = jax.lax.stop_gradient(balance)
     neutral = jnp.asarray(0) if slopes is None else slopes.neutral

@@ -111,7 +111,8 @@ CASES = (
     *(
         jam_case(
             f"fold of light loads, 1e-8 {side}",
-            hard="two modes merge: the load speed has an infinite slope, and the 8th digit of the rotor speed decides",
+            hard="two modes merge: the load speed has an infinite slope, and the 8th digit of the rotor speed decides "
+            "whether they exist",
             scene=lambda sign=sign: published(_LIGHT_FOLD * (1.0 + sign * 1e-8)),
             named=((), ("at_fold",)),
         )
