@@ -29,8 +29,7 @@ from jaxvib.exchange.model import DriveBy, Equations, equations_of, has_events, 
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units
-from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.integration.stiffness import fastest_decay
+from jaxvib.motion.integration.stiffness import fastest_decay, fastest_motion
 from jaxvib.motion.start import Start, start_state
 from jaxvib.ode.scalarize import NotScalarizable, scalar_program
 from jaxvib.runtime.compat import HAS_JAXPRS
@@ -183,7 +182,7 @@ def _describe_scene(scene: Scene) -> str:
 
 def _max_step(scene: Scene) -> float:
     """Return the longest step of co-simulation, s."""
-    fastest, decay = float(frequency_bounds(scene)[0]), float(fastest_decay(scene))
+    fastest, decay = float(fastest_motion(scene)), float(fastest_decay(scene))
     return float(f"{1.0 / max(_STEPS_PER_RADIAN * fastest, decay):.3g}")
 
 

@@ -585,3 +585,9 @@ def test_read_only_file_is_not_changed(tmp_path):
 def test_every_unit_of_a_scene_has_base_units():
     assert base_units("N m s/rad") == {"kg": 1, "m": 2, "s": -1, "rad": -1} and base_units("m/s^2") == {"m": 1, "s": -2}
     assert base_units("1/s") == {"s": -1} and base_units("N/m^3") == {"kg": 1, "s": -2, "m": -2}
+
+
+def test_steps_of_co_simulation_resolve_stiff_stops():
+    scene = jv.Scene(machines()["one_mass"], jv.balls(**BALLS), jv.ConstantSpeed(60.0), effects=[jv.Stop(1e9, gap=2e-3)])
+    rate = (1e9 / float(np.sum(scene.machine.mass))) ** 0.5
+    assert module._max_step(scene) < 1.0 / (15.0 * rate)
