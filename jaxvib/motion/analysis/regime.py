@@ -182,7 +182,7 @@ def regime(scene: Scene, segment: Trajectory) -> Regime:
     - `segment`: the part of the run, a `Trajectory` such as `run.window`; typical: 20 or more turns
 
     **Returns** `Regime`; `jit` and `vmap` are supported. If the motion is not steady, `name` is "unsettled" and no error is
-    raised.
+    raised. **Raises** `InputError` for a scene with several exciters.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -192,7 +192,9 @@ def regime(scene: Scene, segment: Trajectory) -> Regime:
     >>> bool(run.regime.name == jv.RegimeName.jammed), int(run.regime.mode)
     (True, 1)
     """
-    return _regime(validate_scene(scene), segment)
+    scene = validate_scene(scene)
+    _ = scene.exciter  # raises an error for several exciters
+    return _regime(scene, segment)
 
 
 @cached

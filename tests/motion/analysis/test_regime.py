@@ -249,3 +249,10 @@ def test_modes_of_equal_frequencies_are_those_of_jam_modes():
     natural = jnp.sort(jv.natural_frequencies(scene))
     modes = jv.jam_modes(scene).omega
     assert [int(_mode(natural, modes[k - 1], jnp.asarray(320.0))) for k in (1, 2, 5)] == [1, 2, 5]
+
+
+def test_regime_of_several_exciters_is_refused():
+    scene, segment = made([0.0] * 4, 460.0)
+    both = jv.Scene(scene.machine, exciters=[scene.exciters[0]] * 2)
+    with pytest.raises(jv.InputError, match="scene has 2 exciters; this function needs a scene with one exciter"):
+        jv.regime(both, segment)
