@@ -245,9 +245,9 @@ class VibrationMeasures(Readable):
             loads = zip(self.foundation_load, self.directions, strict=True)
             forces = ", ".join(f"{quantity_text(force, 'N', 4)} {name}" for force, name in loads)
             lines.append(f"foundation: {forces} (dynamic)")
-        ratio = float(self.transmissibility)
+        ratio, owner = float(self.transmissibility), "exciter's" if len(self.torque) == 1 else "exciters'"
         if ratio < _LARGEST_TRANSMISSIBILITY:
-            passed = f"of the exciter's {quantity_text(self.exciter_force, 'N', 4)}, {100.0 * ratio:.3g} % reach the foundation"
+            passed = f"of the {owner} {quantity_text(self.exciter_force, 'N', 4)}, {100.0 * ratio:.3g} % reach the foundation"
             lines.append(passed + (f" (isolation {100.0 * (1.0 - ratio):.3g} %)" if ratio < 1.0 else ""))
         elif float(self.exciter_force) == 0.0:
             lines.append("the forces of the exciters cancel: there is no transmissibility")

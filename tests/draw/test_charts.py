@@ -130,7 +130,7 @@ def test_the_rotor_is_drawn_beside_loads_at_its_speed(rotor, lines):
     arrays = (t, wave, 100.0 + 1e-6 * wave, np.full_like(wave, rotor), wave)
     axis = time_histories(arrays, arrays, names=("y",), directions=("up",), unit="rad/s").axes[3]
     assert len(axis.lines) == lines
-    assert [text.get_text() for text in axis.texts] == ["rotor outside the axis: 100.02 rad/s"][: 2 - lines]
+    assert [text.get_text() for text in axis.texts] == ["rotor speed (outside this panel): 100.02 rad/s"][: 2 - lines]
 
 
 def test_labels_of_close_critical_speeds_are_below_their_curves():

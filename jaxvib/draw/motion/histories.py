@@ -114,7 +114,7 @@ def time_histories(
     else:
         beyond = ", ".join(f"{x:.5g}" for x in scale * part[3][-1])
         at = {"transform": right.transAxes, "ha": "right", "va": "bottom"}
-        right.text(1.0, 1.02, f"rotor outside the axis: {beyond} {unit}", fontsize="small", color="#555555", **at)
+        right.text(1.0, 1.02, f"rotor speed (outside this panel): {beyond} {unit}", fontsize="small", color="#555555", **at)
     low, high = right.get_ylim()
     if high - low < (least := _MIN_SPEED_RANGE * max(abs(low), abs(high))):  # rounding errors of a constant speed
         right.set_ylim(0.5 * (low + high - least), 0.5 * (low + high + least))
