@@ -398,7 +398,10 @@ def operation_of(model: UnbalancedModel) -> tuple[OperatingPoints, TorqueFolds]:
     folds = pieces.folds
     torque = folds.rotor_speed * jax.vmap(model.motor_torque)(folds.omega)
     lands = _landing_speeds(jax.lax.stop_gradient(model), jax.lax.stop_gradient(pieces))
-    return _operating_points(model, speed, exists), TorqueFolds(folds.omega, folds.rotor_speed, torque, lands, folds.exists)
+    # A motor that drives at no speed, because it is switched off, has no folds.
+    drives = jax.vmap(lambda w: jnp.sum(model.balance.driving_torque(w)) > 0.0)(folds.omega)
+    fields = (jnp.where(drives, field, jnp.nan) for field in (folds.omega, folds.rotor_speed, torque, lands))
+    return _operating_points(model, speed, exists), TorqueFolds(*fields, folds.exists & drives)
 
 
 def _balanced_speeds(model: UnbalancedModel, pieces: Pieces) -> tuple[Array, Array]:

@@ -50,7 +50,9 @@ class CaptureStatus(eqx.Enumeration):
     found = "every start above the threshold was captured"
     all_captured = "every start was captured: the threshold is below the computed speeds"
     none_captured = "not every start at the highest speed was captured: the threshold is above the computed speeds"
-    not_converged = "the last doubling of the steps changed the threshold by more than the given resolution, or the spacing of the computed speeds"
+    not_converged = (
+        "the last doubling of the steps changed the threshold by more than its resolution, by default the spacing of speeds"
+    )
 
 
 class Capture(Result):
