@@ -277,20 +277,20 @@ def _search(
         missing = _missing(space, objective, demands, options)
         raise ComputationError(
             "no_feasible_start",
-            f"{missing}: does not exist for any of the {options.starts} random designs within the bounds; widen the bounds or "
+            f"{missing} for any of the {options.starts} random designs within the bounds; widen the bounds or "
             "choose another mode",
         )
     return best[0], best[1], best[2]._replace(existing=existing, drawn=drawn)
 
 
 def _missing(space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options) -> str:
-    """Return the names of the quantities of a search that exist for no random design, as text."""
+    """Return the names of the quantities of a search that exist for no random design, as the beginning of a message."""
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
     quantities = tuple(dict.fromkeys((objective, *(held.quantity for held in space.held), *sides)))
     z = np.random.default_rng(options.seed).uniform(size=(options.starts, space.size))
     values = evaluate_quantities(quantities, scenes_of(problem_of(space, objective, (), options.starts), space.numbers(z)))
     absent = [q.words for q, exists in zip(quantities, np.any(np.isfinite(values), axis=0).tolist(), strict=True) if not exists]
-    return " or ".join(absent) or "all of: " + ", ".join(q.words for q in quantities)
+    return f"{' or '.join(absent)}: does not exist" if absent else f"{', '.join(q.words for q in quantities)}: do not all exist"
 
 
 def _rank(result: SearchResult) -> tuple[bool, float]:

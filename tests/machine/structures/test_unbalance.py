@@ -102,7 +102,7 @@ def exciter(**more):
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: exciter(unbalance_mass=5.0), r"drive.inertia is 0.4 kg m\^2, less than .* S\^2/m = 0.8 kg m\^2; it must inc"),
+        (lambda: exciter(unbalance_mass=5.0), r"drive turns a rotor with the inertia 0.4 kg m\^2, less than .* S\^2/m = 0.8 kg m\^2; the inertia must inc"),
         (
             lambda: exciter(loads=BALLS, unbalance=None, unbalance_mass=5.0),
             "unbalance_mass is 5.0 without an unbalance; give unbalance",
@@ -128,7 +128,7 @@ def exciter(**more):
             lambda: jv.simulate(
                 eqx.tree_at(lambda s: s.exciters[0].drive.inertia, scene_of(SCREEN, unbalance_mass=40.0), 0.01), 1.0
             ),
-            r"drive.inertia is 0.01 kg m\^2, less than",
+            r"drive turns a rotor with the inertia 0.01 kg m\^2, less than",
         ),
     ],
 )
