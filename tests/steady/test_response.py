@@ -435,3 +435,11 @@ def test_the_figure_shows_curves_motor_and_folds():
     assert {"y1", "force on the foundation", "needed by the vibration", "of the motor", "fold: the speed jumps"} <= set(labels)
     with pytest.raises(jv.InputError, match="show"):
         found.plot(show=["speed"])
+
+
+def test_motor_that_is_off_has_no_folds():
+    for bearing in (0.0, 0.01):
+        off = jv.SwitchedOff(jv.DCMotor(460.0, stall_torque=20.0, inertia=0.1), at=5.0, bearing=bearing)
+        machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+        found = jv.response(jv.Scene(machine, exciters=[jv.Exciter(drive=off, unbalance=1e-3)]))
+        assert not np.any(found.folds.exists) and np.all(np.isnan(found.folds.factor)) and "fold" not in found.summary()
