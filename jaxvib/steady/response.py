@@ -400,8 +400,10 @@ def operation_of(model: UnbalancedModel) -> tuple[OperatingPoints, TorqueFolds]:
     lands = _landing_speeds(jax.lax.stop_gradient(model), jax.lax.stop_gradient(pieces))
     # A motor that drives at no speed, because it is switched off, has no folds.
     drives = jax.vmap(lambda w: jnp.sum(model.balance.driving_torque(w)) > 0.0)(folds.omega)
-    fields = (jnp.where(drives, field, jnp.nan) for field in (folds.omega, folds.rotor_speed, torque, lands))
-    return _operating_points(model, speed, exists), TorqueFolds(*fields, folds.exists & drives)
+    omega, factor, torque, lands = (
+        jnp.where(drives, value, jnp.nan) for value in (folds.omega, folds.rotor_speed, torque, lands)
+    )
+    return _operating_points(model, speed, exists), TorqueFolds(omega, factor, torque, lands, folds.exists & drives)
 
 
 def _balanced_speeds(model: UnbalancedModel, pieces: Pieces) -> tuple[Array, Array]:
