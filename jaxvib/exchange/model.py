@@ -56,7 +56,7 @@ def foundation_forces(machine: Machine) -> tuple[Signal, ...]:
     return tuple(Signal(f"foundation_force.{direction}", "N") for direction in directions)
 
 
-def known_forces(machine: Machine, force: Array) -> Array:
+def omit_unknown_force(machine: Machine, force: Array) -> Array:
     """Return the force on the foundation without entries if the foundation is unknown, see `foundation_forces`."""
     return force if machine.has_foundation else force[:0]
 
@@ -206,7 +206,7 @@ def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
         driven_exciters = [_with_input_drive(exciter, angle, inputs, by_input) for exciter, angle, inputs in cases]
         forced = Scene(scene.machine, exciters=driven_exciters, effects=(*scene.effects, _AppliedForce(values.force)))
         rate = dynamics_of(assemble(forced), solve_definite)(t, state)
-        force = known_forces(scene.machine, assemble(scene).foundation_force(state.displacement, state.velocity))
+        force = omit_unknown_force(scene.machine, assemble(scene).foundation_force(state.displacement, state.velocity))
         are_outputs = [exciter.drive.ideal and not by_input for exciter in scene.exciters]
         turning = [exciter.turning_drive for exciter in scene.exciters]
         rotor_outputs = [

@@ -16,7 +16,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.averaged import Amplitudes, averaged_field
 from jaxvib.equations.linear import linear_model, mean_speed
 from jaxvib.errors import InputError, optional_module, quoted, require_writable, with_ending, written
-from jaxvib.exchange.model import Signal, coordinate_signals, force_inputs, foundation_forces, known_forces
+from jaxvib.exchange.model import Signal, coordinate_signals, force_inputs, foundation_forces, omit_unknown_force
 from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import SupportForce
@@ -220,7 +220,7 @@ def _rest_matrices(scene: Scene, speed: Array) -> tuple[Array, Array, Array, Arr
     no_force = jnp.zeros_like(forces)
     a = jnp.block([[zero, identity], [solved[:, : 2 * nd]]])
     b = jnp.concatenate([no_force, solved[:, 2 * nd :]])
-    reaction = known_forces(scene.machine, jnp.concatenate(foundation, axis=1))
+    reaction = omit_unknown_force(scene.machine, jnp.concatenate(foundation, axis=1))
     c = jnp.concatenate([jnp.eye(2 * nd, dtype=model.mass.dtype), solved[:, : 2 * nd], reaction])
     d = jnp.concatenate([no_force, no_force, solved[:, 2 * nd :], jnp.zeros((len(reaction), forces.shape[1]), forces.dtype)])
     return a, b, c, d
@@ -280,7 +280,7 @@ def _jam_matrices(
 
     def outputs(x: Array, speed: Array) -> Array:
         moving = amplitudes(x)
-        force = known_forces(scene.machine, carrier.foundation_force(moving.displacement, moving.velocity))
+        force = omit_unknown_force(scene.machine, carrier.foundation_force(moving.displacement, moving.velocity))
         return jnp.concatenate([jnp.mean(moving.rate)[None], magnitude(moving.displacement), magnitude(force)])
 
     turned = displacement * jnp.exp(-1j * phase[0])
