@@ -143,7 +143,7 @@ class _SettlePlan:
     **Attributes**: `first`: plan of the first segment; `segments`: their largest number; `drift`: the drift below which the
     motion has settled; `default_drift`: the default drift of the precision; `mean_segments`: the number of segments that
     show whether the motion is steady in the mean, None if the motion must reach the drift; `decay`: the slowest decay of the
-    carrier without friction at supports, 1/s.
+    carrier without friction at supports, 1/s; `has_resistance`: True if effects at supports can damp it.
     """
 
     first: RunPlan
@@ -152,6 +152,7 @@ class _SettlePlan:
     default_drift: float
     mean_segments: int | None
     decay: float
+    has_resistance: bool
 
 
 def _plan_settle(
@@ -192,6 +193,7 @@ def _plan_settle(
         default_drift=default_drift,
         mean_segments=4 * math.ceil(_MEAN_SEGMENTS * max(1.0, 100.0 / periods) / 4.0) if drift is None else None,
         decay=_slowest_decay(scene),
+        has_resistance=any(term.resistance is not None for term in terms_of(scene.all_effects, SupportForce)),
     )
 
 
@@ -209,7 +211,7 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
         if status_name(run.status) != "done":
             return run, False
         drifts.append(float(run.drift))
-        decay = plan.decay or _slowest_decay(plan.first.scene, run.window)
+        decay = plan.decay or (_slowest_decay(plan.first.scene, run.window) if plan.has_resistance else 0.0)
         if drifts[-1] < plan.drift and _distance(drifts, run, decay, length) < _MAX_DISTANCE_IN_DRIFTS * plan.drift:
             final = _with_final_status(run, "done")
             # If the loads are not at exactly one angle and would separate, the run continues until they have left this motion.
