@@ -131,12 +131,8 @@ def contact_rate(scene: Scene) -> Array | None:
     scene, rates = jax.lax.stop_gradient(scene), []
     if has_term(scene.all_effects, LoadInteraction):
         rates.append(effects_rate(scene, LoadInteraction))
-    fastest, linear = frequency_bounds(scene)[0], linear_model(scene)
-    for term, rows in zip(terms_of(scene.effects, SupportForce), linear.supports, strict=True):
-        if term.stiffness is not None:
-            accelerance = _largest_accelerance(linear, rows)
-            rates.append(jnp.sqrt(fastest**2 + term.stiffness * accelerance))
-            rates += [] if term.contact_damping is None else [_DAMPER_FACTOR * term.contact_damping * accelerance]
+    for _, vibration, decay in _rates_on_stops(scene):
+        rates += [vibration] if decay is None else [vibration, _DAMPER_FACTOR * decay]
     return functools.reduce(jnp.maximum, rates)
 
 
@@ -144,18 +140,25 @@ def contact_rate(scene: Scene) -> Array | None:
 def sampling_rate(scene: Scene) -> Array:
     """Return the number of samples per second that resolves the forces of stops; 0 without stops on the foundation.
 
-    It is 8 for a period of the vibration on a stop, 2 pi / sqrt(fastest^2 + k max(P M^-1 P^T)), and 2 for the decay time of its
-    damper, see `contact_rate`.
+    It is 8 for each period of the vibration on a stop, and 2 for each decay time of its damper, see `contact_rate`.
     """
-    scene, rate = jax.lax.stop_gradient(scene), jnp.zeros_like(scene.top_speed)
-    fastest, linear = frequency_bounds(scene)[0], linear_model(scene)
+    scene = jax.lax.stop_gradient(scene)
+    rates = [jnp.zeros_like(scene.top_speed)]
+    for term, vibration, decay in _rates_on_stops(scene):
+        if not term.is_link:
+            rates += [8.0 * vibration / (2.0 * np.pi), *([] if decay is None else [2.0 * decay])]
+    return functools.reduce(jnp.maximum, rates)
+
+
+def _rates_on_stops(scene: Scene) -> list[tuple[SupportForce, Array, Array | None]]:
+    """Return each stop, the rate of the vibration on it, rad/s, and the decay rate of its damper, 1/s, None without one."""
+    fastest, linear, rates = frequency_bounds(scene)[0], linear_model(scene), []
     for term, rows in zip(terms_of(scene.effects, SupportForce), linear.supports, strict=True):
-        if term.stiffness is not None and not term.is_link:
+        if term.stiffness is not None:
             accelerance = _largest_accelerance(linear, rows)
-            damping = 0.0 if term.contact_damping is None else term.contact_damping
-            vibration = jnp.sqrt(fastest**2 + term.stiffness * accelerance) / (2.0 * np.pi)
-            rate = jnp.maximum(rate, jnp.maximum(8.0 * vibration, 2.0 * damping * accelerance))
-    return rate
+            decay = None if term.contact_damping is None else term.contact_damping * accelerance
+            rates.append((term, jnp.sqrt(fastest**2 + term.stiffness * accelerance), decay))
+    return rates
 
 
 def has_contacts(scene: Scene) -> bool:
