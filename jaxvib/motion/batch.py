@@ -15,11 +15,11 @@ from jaxvib.equations.model import assemble
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import (
-    Extremes,
+    Extrema,
     Measured,
     Peaks,
     Trajectory,
-    extremes_of_steps,
+    extrema_of_steps,
     locate_peaks,
     measure,
     trajectory,
@@ -186,7 +186,7 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     model = assemble(scene)
     field = dynamics_of(model)
     motion = pack_batch(scene, field, state, implicit=plan.implicit)
-    sharp = has_contacts(scene)
+    has_contact = has_contacts(scene)
     begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS_OF_RUN
     spacing = plan.window / (plan.samples - 1)
 
@@ -194,18 +194,18 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
         packed, _ = advance(motion, packed, *at, jnp.asarray(length / plan.each, dtype), implicit=plan.implicit)
         return packed, (packed, None)
 
-    def sample(packed: IntegratorState, k: Array) -> tuple[IntegratorState, tuple[IntegratorState, Extremes | None]]:
+    def sample(packed: IntegratorState, k: Array) -> tuple[IntegratorState, tuple[IntegratorState, Extrema | None]]:
         at, length = begin + k * spacing, jnp.asarray(spacing, dtype)
-        if sharp:  # a contact may be shorter than the time between two samples
+        if has_contact:  # a contact may be shorter than the time between two samples
             moved, steps = advance_by_steps(motion, packed, at, length, plan.between, implicit=plan.implicit)
-            return moved, (moved, extremes_of_steps(model, field, *steps))
+            return moved, (moved, extrema_of_steps(model, field, *steps))
         moved, _ = advance(motion, packed, at, length, jnp.asarray(spacing / plan.between, dtype), implicit=plan.implicit)
         return moved, (moved, None)
 
     def block(packed: IntegratorState, at: tuple[Array, Array]) -> tuple[IntegratorState, Peaks]:
         """Advance by a block, and return the largest values in it."""
         last, steps = advance_by_steps(motion, packed, *at, plan.each // plan.blocks, implicit=plan.implicit)
-        return last, extremes_of_steps(model, field, *steps).peaks(model) if sharp else locate_peaks(model, field, *steps)
+        return last, extrema_of_steps(model, field, *steps).peaks(model) if has_contact else locate_peaks(model, field, *steps)
 
     def part_with_peaks(
         packed: IntegratorState, at: tuple[Array, Array]
@@ -219,7 +219,7 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     sizes = jnp.asarray(length, dtype), jnp.asarray(length / plan.each, dtype)
     packed, begins, lengths = divide_run(motion, first, *sizes, PARTS_OF_RUN, implicit=plan.implicit)
     packed, (parts, part_peaks) = jax.lax.scan(part_with_peaks if plan.blocks else part, packed, (begins, lengths))
-    _, (later, extremes) = jax.lax.scan(sample, packed, jnp.arange(plan.samples - 1, dtype=dtype))
+    _, (later, extrema) = jax.lax.scan(sample, packed, jnp.arange(plan.samples - 1, dtype=dtype))
     packed_history = _prepended(first, parts)
     azimuth, _ = turning_angles(
         scene, lambda: length * jnp.arange(PARTS_OF_RUN + 1, dtype=dtype), motion.unpack(packed_history)
@@ -229,12 +229,12 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     window = trajectory(model, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length
     unit, last = natural_units(scene), jax.tree.map(lambda leaf: leaf[-1], states)
-    measured = measure(model, field, times, states, unit, extremes)
+    measured = measure(model, field, times, states, unit, extrema)
     kind = regime(scene, window) if scene.is_plain else None
     finite = is_finite(states) & ~is_unbounded(unit, state, last)
     peaks, largest = None, states.displacement
     if part_peaks is not None:
-        last_peaks = locate_peaks(model, field, times, states) if extremes is None else extremes.part().peaks(model)
+        last_peaks = locate_peaks(model, field, times, states) if extrema is None else extrema.part().peaks(model)
         peaks = jax.tree.map(lambda parts, last: jnp.maximum(jnp.max(parts, axis=0), last), part_peaks, last_peaks)
         largest = jnp.concatenate([largest, peaks.displacement[None]])
     resolved = resolves(scene, max(length / plan.each, spacing / plan.between), largest, implicit=plan.implicit)

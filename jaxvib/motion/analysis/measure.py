@@ -28,8 +28,8 @@ MIN_CHANGE_SCALE = 1e-4
 needed because the amplitude and the force of a balanced rotor are almost zero."""
 
 _POINTS_IN_STEP = 8
-"""Number of points in each sampling step at which a kinked force is searched for extrema, and number of points in their
-distance in a second search: the error of a sine with 16 samples a period is 5e-7 of its amplitude."""
+"""Number of points in each sampling step at which a kinked force is searched for extrema. A second search next to each extremum
+has as many points in the distance of two of these."""
 
 Field = Callable[[Array, State], State]
 """Equations of motion: function from a time and a state to the rates of the state."""
@@ -187,20 +187,20 @@ def turning_directions(scene: Scene) -> np.ndarray:
     return np.repeat([e.direction for e in scene.exciters], [1 if e.loads is None else e.loads.count for e in scene.exciters])
 
 
-def measure(model: Model, field: Field, times: Array, states: State, unit: State, extremes: Extremes | None = None) -> Measured:
+def measure(model: Model, field: Field, times: Array, states: State, unit: State, extrema: Extrema | None = None) -> Measured:
     """Measure the amplitudes and the load speed of an evenly sampled part of a motion, see `Measured`.
 
     Extrema and whole turns are computed from interpolants that use the rates of the equations of motion, not from the samples.
 
     **Arguments**: `field` returns the rates of a state at a time; it must be a pytree of its arrays, such as `Dynamics` or a
-    `jax.tree_util.Partial`, not a plain function; `unit`: the `natural_units` of the scene; `extremes` between each sample and
+    `jax.tree_util.Partial`, not a plain function; `unit`: the `natural_units` of the scene; `extrema` between each sample and
     the next, if they are known; default: those of the interpolants.
     """
     nd, half = states.displacement.shape[1], times.shape[0] // 2
-    if extremes is None:
+    if extrema is None:
         early, late, whole = (_spans_of_kinked_force if model.has_kinked_force else _spans)(model, field, times, states)
     else:
-        early, late, whole = (extremes.part(steps).spans for steps in (slice(half - 1), slice(half, None), slice(None)))
+        early, late, whole = (extrema.part(steps).spans for steps in (slice(half - 1), slice(half, None), slice(None)))
 
     speeds, late_speeds = mean_speeds(times, *turning_angles(model.scene, lambda: times, states), (0, half))
     change = jnp.abs(late - early)
@@ -376,7 +376,7 @@ def locate_peaks(model: Model, field: Field, times: Array, states: State) -> Pea
     return Peaks(jnp.maximum(-low[2], high[2]), model.known_force(jnp.sqrt(jnp.sum(largest_force**2))))
 
 
-class Extremes(NamedTuple):
+class Extrema(NamedTuple):
     """Extrema of a motion whose forces have kinks and jumps, from all steps of a run; or of several parts of it.
 
     **Attributes**: `low`, `high` (..., outputs): extrema of the displacements and foundation forces; `square` (...), N^2:
@@ -392,10 +392,10 @@ class Extremes(NamedTuple):
         """Half of the peak-to-peak values (..., outputs)."""
         return (self.high - self.low) / 2.0
 
-    def part(self, steps: slice = slice(None)) -> Extremes:
+    def part(self, steps: slice = slice(None)) -> Extrema:
         """Return the extrema of some `steps` along the leading axis together."""
         low, high, square = (x[steps] for x in self)
-        return Extremes(jnp.min(low, axis=0), jnp.max(high, axis=0), jnp.max(square, axis=0))
+        return Extrema(jnp.min(low, axis=0), jnp.max(high, axis=0), jnp.max(square, axis=0))
 
     def peaks(self, model: Model) -> Peaks:
         """Return the largest values."""
@@ -403,14 +403,14 @@ class Extremes(NamedTuple):
         return Peaks(jnp.maximum(-self.low, self.high)[..., :nd], model.known_force(jnp.sqrt(self.square)))
 
 
-def extremes_of_steps(model: Model, field: Field, times: Array, states: State) -> Extremes:
+def extrema_of_steps(model: Model, field: Field, times: Array, states: State) -> Extrema:
     """Return the extrema of consecutive steps of equal length, for arguments as in `measure`."""
     nd = states.displacement.shape[1]
     values, slopes = _sampled_outputs(model, field, times, states)
     low, high = step_extrema(values.T, slopes.T)
     force, change = values[nd:], slopes[nd:]
     _, square = step_extrema(jnp.sum(force**2, axis=0), 2.0 * jnp.sum(force * change, axis=0))
-    return Extremes(low, high, square)
+    return Extrema(low, high, square)
 
 
 def _sampled_outputs(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array]:
