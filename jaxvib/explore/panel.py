@@ -1,4 +1,4 @@
-"""Axes, lines and legend of a chart as outlines and texts of an SVG figure, which take a tenth of the time of matplotlib."""
+"""Axes, lines and legend of a chart in an SVG figure. Drawing them takes a tenth of the time of matplotlib."""
 
 from __future__ import annotations
 

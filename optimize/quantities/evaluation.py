@@ -56,11 +56,13 @@ Target = tuple[str, int]
 mode with the lower, or the higher, load speed."""
 
 Key = tuple[tuple[Case, ...], Target]
-"""Followed jam or fold of a scene. The scene is identified by the cases that lead to it from the scene of the design."""
+"""A jam or fold that is followed, and its scene. The scene is described by its load cases: the first one is applied to the
+scene of the design, and each further one to the resulting scene. Without cases it is the scene of the design itself."""
 
 
 class TargetRecorder:
-    """Recorder of the jams and folds that quantities request. An `Evaluation` receives it in place of `near_speeds`."""
+    """Recorder of the jams and folds that quantities request. It is used as the argument `near_speeds` of an `Evaluation`, and
+    returns the speed 1 rad/s for every key."""
 
     def __init__(self) -> None:
         self.keys: list[Key] = []

@@ -31,7 +31,7 @@ _SMALL_DERIVATIVE_SHARE = 1e-3
 """Smallest scale for the relative error of a derivative, as a share of the largest derivative."""
 
 _NOISE_FACTOR = 3.0
-"""Factor on the error of finite differences below which a deviation counts as noise."""
+"""A deviation below this factor times the error of the finite differences counts as noise."""
 
 _MIN_LARGE_CHANGE, _MAX_ROUNDING_CHANGE = 1e-2, 1e4 * float(np.finfo(float).eps)
 """Share of the largest change above which the change at a small step counts as large; share of the quantity below which a
