@@ -107,8 +107,8 @@ def export_uff(
       direction) and a force (exciter and direction)
     - Natural modes of a `Scene`: undamped (normal modes) for machines that move up and down; damped, at the rotor speed
       (complex modes, the whirl), for machines that move horizontally and vertically
-    - Histories of a `Run`: the motion of every node and the force on the foundation (node 0), and the amplitude spectra at the
-      end of the run
+    - Histories of a `Run`: the motion of every node and the force on the foundation (node 0; not of a machine from matrices
+      without a foundation), and the amplitude spectra at the end of the run
 
     Header, units (SI), nodes and lines come first, because programs for modal analysis reject functions without them. Numbers
     have 12 digits; those of the abscissa and of mode shapes have 6 digits, as the format prescribes.
@@ -295,12 +295,11 @@ def _histories(run: Run, quantity: str) -> list[dict[str, Any]]:
         for k, direction in enumerate(directions)
     ]
     force, frequency = np.asarray(trajectory.foundation_force, float), np.asarray(spectrum.frequency) / (2.0 * np.pi)
-    functions += [
-        _function(time, force[:, k], _HISTORY, "force", (0, direction), (0, 0), _TIME) for k, direction in enumerate(directions)
-    ]
+    known = list(enumerate(directions)) if run.scene.machine.has_foundation else []
+    functions += [_function(time, force[:, k], _HISTORY, "force", (0, direction), (0, 0), _TIME) for k, direction in known]
     functions += [
         _function(frequency, spectrum.force[-1, :, k], _GENERAL, "force", (0, direction), (0, 0), _FREQUENCY)
-        for k, direction in enumerate(directions)
+        for k, direction in known
     ]
     for name, unit, values in zip(spectrum.coordinates, spectrum.units, spectrum.amplitude[-1].T, strict=True):
         if unit == "m":

@@ -100,6 +100,13 @@ def test_nodes_of_a_matrix_model_are_the_places_of_its_exciters(home):
     assert read.nodes == {1: (1.0, 0.0, 0.0), 2: (2.0, 0.0, 0.0)}
 
 
+def test_a_run_without_a_foundation_has_no_force(home):
+    machine = jv.from_matrices(np.diag([2.0, 3.0]), np.diag([4.0, 5.0]), np.diag([2e4, 8e4]), places=[[0], [1]])
+    scene = jv.Scene(machine, exciters=[jv.Exciter(at=1, drive=jv.ConstantSpeed(50.0), unbalance=0.01)])
+    read = jv.read_uff(jv.export_uff(jv.simulate(scene, 1.0, estimate=False), home / "no_foundation.unv"))
+    assert read.functions and all(each.quantity != "force" and np.all(np.isfinite(each.values)) for each in read.functions)
+
+
 def test_histories_of_a_body_follow_at_its_points(home):
     run = jv.simulate(screen(), 1.0, estimate=False)
     read = {e.response: e for e in jv.read_uff(jv.export_uff(run, home / "screen_run.unv")).functions if e.kind == "history"}
