@@ -151,10 +151,12 @@ class MeasuredRun(Readable):
         return cls.from_arrays(channels, times, values, change, source)
 
     def to_sep005(self) -> list[dict[str, Any]]:
-        """Return the channels as dictionaries in the format SEP-005, in SI units: `name`, `data`, `unit_str`, `fs` (Hz) and
-        `quantity`.
+        """Return the channels as dictionaries in the format SEP-005, in SI units, with these entries:
 
-        Channels of pulses, and channels that do not begin at 0 s, have a list `time` (s).
+        - `name`, `data` and `unit_str`
+        - `quantity` for accelerations, velocities, displacements and forces
+        - `fs` (Hz), except for channels of pulses
+        - `time` (s), a list, for channels of pulses and for channels that do not begin at 0 s
         """
         entries = []
         for channel in self.channels:
@@ -213,9 +215,9 @@ def parse_change(value: Number, field: str) -> Change:
         return Change("set", float(number(value, "", field)))
     text = value.strip()
     if text[:1] in ("+", "-"):
-        if text.endswith("%") and is_number(text[1:-1], ","):
-            return Change("scale", 1.0 + float(text[:-1]) / 100.0)
         rest = text[1:].strip()
+        if rest.endswith("%") and is_number(rest[:-1], ","):
+            return Change("scale", 1.0 + float(f"{text[0]}1") * float(rest[:-1]) / 100.0)
         return Change("add", f"-{rest}" if text[0] == "-" else rest)
     if not text:
         raise InputError(field, "is empty; write for example '+10 kg' or '95 kg'")

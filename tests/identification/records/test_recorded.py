@@ -198,7 +198,7 @@ def test_range_of_a_sensor_clips():
     ("text", "change"),
     [
         ("+10 kg", ("add", "10 kg")), ("- 10 kg", ("add", "-10 kg")), ("+5 %", ("scale", 1.05)), ("-5%", ("scale", 0.95)),
-        (" 95 kg ", ("set", "95 kg")), (95, ("set", 95.0)), ("+a %", ("add", "a %")),
+        ("- 5 %", ("scale", 0.95)), (" 95 kg ", ("set", "95 kg")), (95, ("set", 95.0)), ("+a %", ("add", "a %")),
     ],
 )  # fmt: skip
 def test_changes_in_words(text, change):
