@@ -35,8 +35,8 @@ class TorusBalls(Loads):
 
     - w is the rotor speed, g the acceleration of gravity, and e the unit vector against gravity
     - A ball rolls without sliding and without drilling spin. Its rotation adds the inertia (kappa - 1) m and the terms with w,
-      which do no work. In the second equation the contribution of the rotation is then - (2/5) m B f' (f' - w) cos a. It is 0
-      for a ball that turns with the tube (f' = w), so that the centrifugal force on this ball is that of its mass alone
+      which do no work. On a ball that turns with the tube (f' = w) the centrifugal force is that of its mass alone: in the
+      second equation the term with w then cancels the part of the inertia of rotation, (2/5) m B f'^2 cos a
     - The acceleration of the wall when w changes is neglected, as in the gyroscopic matrix of a rotor
     - A ball on the equator moves like a ball in a plane track of radius R + rho
 
@@ -166,7 +166,7 @@ def torus_balls(
 
     **Raises** `InputError` for
 
-    - wrong units and values that are not positive
+    - wrong units, a negative `drag`, and other values that are not positive
     - a ball that fills its tube or is larger
     - a `tube` that is not less than the `radius` of the ring
     - balls that have no room side by side on the outer equator

@@ -39,14 +39,16 @@ from jaxvib.steady.orbits.whole import (
 from jaxvib.units import Bounds
 
 _STEP = 0.1
-"""Distance between two points of a branch: change of the phase, rad, or of the speed in units of `_SPEED_PER_STEP`."""
+"""Distance between two points of a branch: change of the phase, rad, or relative change of the speed divided by
+`_SPEED_PER_RADIAN`."""
 
-_SPEED_PER_STEP = 0.1
+_SPEED_PER_RADIAN = 0.1
 """Relative change of the speed that counts as a phase of 1 rad, if no phase is free."""
 
 _SAME_VALUE = 1e-4
-"""Relative difference of the parameter's value at the first point of the branch from that of the scene, above which the motion
-does not depend on the parameter."""
+"""Largest relative difference between the parameter's value at the first point of the branch and its value in the scene. The
+first point has the phase of the given motion, so that the values agree. They differ if the parameter has no effect on the
+motion: its value is then not determined."""
 
 _MAX_BRANCH_POINTS = 70
 """Largest number of points of a branch up to its fold; their phases cover more than a full turn."""
@@ -163,12 +165,12 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
     def at(point: _Point, along: float) -> _Point:
         phases, speed = np.array(point.phases), np.asarray(point.speed)
         if exciter is None:
-            speed = np.asarray(unit * (1.0 + _SPEED_PER_STEP * along), speed.dtype)
+            speed = np.asarray(unit * (1.0 + _SPEED_PER_RADIAN * along), speed.dtype)
         else:
             phases[exciter] = along
         solution = map(np.asarray, _branch_point(scene, over, point.value, speed, phases, exciter, points))
         new = _Point(*solution, along=np.asarray(along))
-        return new if exciter is not None else new._replace(slope=new.slope * unit * _SPEED_PER_STEP)
+        return new if exciter is not None else new._replace(slope=new.slope * unit * _SPEED_PER_RADIAN)
 
     first = at(near, 0.0 if exciter is None else float(near.phases[exciter]))
     has_effect = bool(first.is_met) and abs(float(first.value) - value) <= _SAME_VALUE * max(abs(value), 1e-6)
@@ -207,8 +209,8 @@ class _Point(NamedTuple):
     - `speed`, rad/s, and `phases` (N,), rad, of the motion
     - `slope`: derivative of the value with respect to the coordinate along the branch
     - `is_met`: True if the equations are satisfied
-    - `along`: coordinate along the branch, the phase of one exciter, rad, or the change of the speed in units of
-      `_SPEED_PER_STEP`
+    - `along`: coordinate along the branch: the phase of one exciter, rad, or the relative change of the speed divided by
+      `_SPEED_PER_RADIAN`
     """
 
     value: np.ndarray

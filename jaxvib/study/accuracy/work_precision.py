@@ -55,8 +55,8 @@ SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver | None]] = {
 
 _TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
 _REFERENCE_ROWS, _ALGEBRAIC_ROWS = 8.0, 4.0
-"""Time of the reference, and of a row of an algebraic method with its compilation, in units of the time of a row of an
-integration, measured for the two-mass machine; for the share that `progress` reports."""
+"""Computing times of the reference, and of one row of an algebraic method with its compilation, divided by the time of one row
+of an integration. `progress` reports the finished share with these weights, which were measured for the two-mass machine."""
 
 _ORBIT_POINTS = (8, 16)
 _ENVELOPE_TOLERANCES = (1e-3, 1e-6)
