@@ -234,8 +234,8 @@ def _written_sum(weights: Array, stages: Array) -> Array:
 
 @_written_sum.defjvp
 def _written_sum_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return the derivative as a product, because the transposed sum would add a whole array of stages for each pair of
-    stages."""
+    """Return the derivative as a matrix product. Reverse mode transposes the derivative; the transpose of an unrolled sum would
+    add a whole array of stages for each pair of stages."""
     (weights, stages), (_, change) = primals, tangents  # the weights of the method are constant
     return _written_sum(weights, stages), linear_combination(weights, change[: len(weights)])
 

@@ -202,7 +202,10 @@ def _target_of(scene: Scene, name: str) -> tuple[Target, str]:
     entry = None if match[2] is None else int(match[2])
     if entry is not None and entry >= size:
         raise InputError(f"axes.{name}", f"does not exist; start.{match[1]} has {size} entries, counted from 0")
-    return Target(None, match[1], entry), _START[match[1]]
+    unit = _START[match[1]]
+    if entry is not None and unit in ("m", "m/s"):
+        unit = unit.replace("m", scene.machine.structure().units[entry])  # a coordinate may be a rotation
+    return Target(None, match[1], entry), unit
 
 
 def require_disjoint(scene: Scene, axes: Sequence[Axis]) -> None:

@@ -49,7 +49,7 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
     """Plot the kind of figure that suits the axes of a study.
 
     - two axes or more: a map, of regimes if they were measured
-    - random samples as the only axis: the distribution of the first measure
+    - samples as the only axis: the distribution of the first measure
     - one axis: up to four measures as points; with samples, the shares of regimes if they were measured
 
     For a measure with several values in a case, such as an amplitude for each coordinate, the largest value is shown.
@@ -130,9 +130,9 @@ def plot_map(
     **Arguments**
 
     - `measure`: its name in the store; default: the regime if it was measured, otherwise the first measure
-    - `x`, `y`: names of the axes of the map; default: the rotor speed, if it is an axis, and the first other axes. The map
-      shows the cases in which all other axes have their middle value. For a measure with several values in a case, the largest
-      value is shown
+    - `x`, `y`: names of the axes of the map; default for `x`: the rotor speed if it is an axis, otherwise the first axis;
+      default for `y`: the first of the remaining axes. The map shows the cases in which all other axes have their middle
+      value. For a measure with several values in a case, the largest value is shown
     - `theory`: True to draw lines on which exact jams have a fold or lose their stability, computed by
       `branches(scene, exact=True)`; this needs the rotor speed as one of the axes
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pint
 import pytest
-from scenes import scene
+from scenes import BALLS, ROTOR, scene
 
 import jaxvib as jv
 from jaxvib.sweeps.axes import Axis, Grid, Target, axis_of, put, put_start, samples, tile_of
@@ -91,6 +91,13 @@ def test_values_are_put_into_the_named_numbers():
     assert put_in.machine.stiffness.tolist() == [5e4, 7e4] and float(put_in.loads.drag) == 2.5
     assert state.rate[0].tolist() == [0.0, 0.0, 30.0] and np.allclose(state.angle[0], 0.4 + np.deg2rad([-1.0, 0.0, 1.0]))
     assert state.velocity.tolist() == [-0.1, -0.1] and state.displacement.tolist() == [0.0, 0.0]
+
+
+def test_an_axis_of_a_tilt_has_the_unit_rad():
+    tilting = jv.Scene(jv.rotor(**ROTOR), jv.balls(**BALLS), jv.ConstantSpeed(120.0))
+    units = {name: axis_of(tilting, name, [0.1]).unit for name in ("start.displacement[1]", "start.displacement[2]")}
+    assert units == {"start.displacement[1]": "m", "start.displacement[2]": "rad"}
+    assert axis_of(tilting, "start.velocity[3]", ["1 deg/s"]).unit == "rad/s"
 
 
 def test_an_axis_of_an_array_adds_no_spring():

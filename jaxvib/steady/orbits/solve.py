@@ -1,12 +1,15 @@
-"""Periodic motions of jammed loads, by collocation of their phase deviation; the carrier is eliminated by harmonics.
+"""Periodic motions of jammed loads, by collocation of their phase deviation.
+
+The unknowns are the deviations and one speed. The motion of the carrier is not an unknown: the carrier is linear, and each
+harmonic of its motion is computed from the same harmonic of the motion of the loads.
 
 Symbols: the carrier has the matrices K (stiffness), M (mass), C (damping) and G (gyroscopic, multiplied by the rotor speed n),
 and B maps its coordinates to the displacement of the mount. The loads form bodies g with the unbalances S_g and the moments of
 inertia I_g (see `JammedBodies`); e(phi) is the point of the unit circle at the angle phi, in the directions of the mount. m_j
 is the mass of load j. Omega is the load speed.
 
-Sizes of arrays: G bodies, M points of the grid, K harmonics of the carrier, J harmonics of the deviation, nd coordinates of the
-carrier, p directions of the mount.
+In shapes of arrays the letters are numbers: G bodies, M points of the grid, K harmonics of the carrier, J harmonics of the
+deviation, nd coordinates of the carrier, p directions of the mount.
 """
 
 from __future__ import annotations
@@ -306,7 +309,7 @@ def branch_tangent(model: JammedBodies, grid: Grid, motion: PeriodicSolution) ->
 
 
 def _append_mean_condition(residual: Array) -> Array:
-    """Append the residual of the condition mean psi = 0, which is zero, or its derivative, to those of the balance."""
+    """Append a zero to the residuals of the balance, or to their derivative: the residual of the condition mean psi = 0."""
     return jax.lax.pad(residual, np.zeros((), residual.dtype), [(0, 1, 0)])
 
 
