@@ -151,8 +151,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def largest_displacement(self) -> Array:
-        """Largest displacement of each coordinate from rest during the run, (nd,), m (rad for tilts), among the stored
-        states; NaN for a run that failed."""
+        """Largest displacement of each coordinate from static equilibrium during the run, (nd,), m (rad for tilts), among the
+        stored states; NaN for a run that failed."""
         return known_maximum(jnp.abs(self._stored.state.displacement), axis=-2)
 
     @property

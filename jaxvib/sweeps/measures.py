@@ -21,8 +21,8 @@ from jaxvib.steady.measures import vibration_measures
 from optimize.quantities.quantity import Quantity
 
 _SETTLED_SPEED_SHARE = 0.01
-"""Difference between a mean speed and the final speed of a load or rotor, relative to the rotor speed, below which it is
-settled."""
+"""A load or rotor has settled if its mean speed in a part of the run differs from its final speed
+by less than this share of the rotor speed."""
 
 
 @dataclass(frozen=True)
@@ -158,8 +158,9 @@ RUN_MEASURES = {
 - regime (see `regime`), jam mode (0: not jammed), ripple and rotor speed. They need a scene with one exciter that
   turns anticlockwise and has loads and no unbalance
 - mean load speed, amplitudes and foundation force (zero to peak), drift (see `AbstractMeasured`)
-- peak displacement and peak force: the largest displacement of each coordinate from rest and the largest magnitude of the
-  foundation force of the whole run (start, passage through resonances, stop), as the quantity `peak_force`
+- peak displacement and peak force: the largest displacement of each coordinate from static equilibrium, and the largest
+  magnitude of the foundation force. Both are those of the whole run (start, passage through resonances, stop), as in the
+  quantity `peak_force`
 - relative rotation: the largest difference between the angles through which two loads, or rotors without loads, turn in the
   measuring window
 - settling time: the time after which each load speed differs from its final value by less than 1 % of the rotor speed, with a

@@ -344,8 +344,8 @@ def _kinked_extrema(outputs: Callable[[Array, Array], Array], field: Field, time
 class Peaks(NamedTuple):
     """Largest values of a motion.
 
-    **Attributes**: `displacement` (nd,), m or rad: largest displacement of each coordinate from rest; `force`, N: largest
-    magnitude of the foundation force.
+    **Attributes**: `displacement` (nd,), m or rad: largest displacement of each coordinate from static equilibrium; `force`, N:
+    largest magnitude of the foundation force.
     """
 
     displacement: Array

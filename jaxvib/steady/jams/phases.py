@@ -62,7 +62,9 @@ def degrees(angle: float) -> float:
 
 
 class AbstractPhaseJam(Result):
-    """One or several jams whose loads may be at different angles, phi_j = Omega t + phase_j. Values are NaN if there is no jam.
+    """One or several jams whose loads may be at different angles, phi_j = Omega t + phase_j.
+
+    If there is no jam, values are NaN, except for `rotor_speed` and `residual`.
 
     **Attributes**
 
