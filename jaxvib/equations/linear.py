@@ -375,8 +375,9 @@ def turning_loads(
 ) -> CircularLoads:
     """Return the loads of a scene, for an analysis of loads on circles in a rotor of prescribed speed.
 
-    **Raises** `InputError` that names the property or the term: for loads that are not `circular`, for a drive that is not
-    `ideal`, and for effects with terms that are not `included`; with `at_one_point` also for loads at several stations.
+    **Raises** `InputError` that names the property or the term: for a body in a plane (the housing of its exciter rotates), for
+    loads that are not `circular`, for a drive that is not `ideal`, and for effects with terms that are not `included`; with
+    `at_one_point` also for loads at several stations.
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")

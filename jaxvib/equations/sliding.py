@@ -70,8 +70,8 @@ def contact_force(
 
     The motion requires this force in addition to the generalized `force` Q.
 
-    **Arguments**: `acceleration` u''; `a`, the acceleration of the points that carry the loads, by axis; `kappa`, which is 1
-    for the mass without rotation.
+    **Arguments**: `acceleration` u''; `a`, the acceleration of the points that carry the loads, by axis; `kappa`: 1 for the
+    translation of the loads alone, or their inertia factor to include the inertia of their rotation.
     """
     curvature, needed = found.curvature_along, []
     for i, (column, metric, f, size) in enumerate(zip(found.columns, found.metric, force, found.sizes, strict=True)):
