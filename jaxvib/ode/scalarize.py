@@ -168,7 +168,8 @@ def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared
     of operations. It processes a large batch in blocks, therefore its memory does not grow with the batch. Its derivatives are
     correct but may be slow.
 
-    **Arguments**: `function(x, shared)` returns a tree of arrays; the first leaf of x is a time or another finite scalar.
+    **Arguments**: `function(x, shared)` returns a tree of arrays. The first leaf of x must be a finite scalar, such as a time,
+    because `fenced` makes its hidden 1 from this number.
 
     >>> import jax.numpy as jnp
     >>> scalarized_vmap(lambda x, c: c * x)(jnp.asarray([1.0, 2.0]), jnp.asarray(3.0)).tolist()

@@ -27,10 +27,10 @@ _MAX_STORED_DESIGNS = 200
 """Number of the latest designs whose jams are stored."""
 
 _POLISHED_DESIGNS = 8
-"""Number of designs that are polished."""
+"""Largest number of designs that are polished."""
 
 _MIN_DESIGN_DISTANCE = 1e-2
-"""Smallest distance between polished designs in one free parameter, relative to its range."""
+"""Smallest distance between two polished designs: the largest difference of a free parameter, relative to its range."""
 
 _MERIT_WITHOUT_OBJECTIVE = 1e12
 """Merit of a design for which a quantity does not exist."""
@@ -63,10 +63,11 @@ def _evaluate_designs(problem: Problem, z: Array, near: tuple[Array, ...]) -> tu
 
 
 class PopulationValues:
-    """Values (s, 1 + me + mi) of populations, without derivatives.
+    """Values of populations, without derivatives.
 
-    The jams of each design are followed from the nearest of the latest designs. If this fails, they are searched for on the
-    whole branch.
+    The values (s, 1 + me + mi) of a population of s designs are the objective, the deviations of me held quantities and the
+    excesses of mi demands. The jams of each design are followed from the nearest of the latest designs. If this fails, they
+    are searched for on the whole branch.
     """
 
     def __init__(self, problem: Problem):
