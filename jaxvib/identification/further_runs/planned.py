@@ -87,8 +87,11 @@ class PlannedRun(Readable):
 class Expected(NamedTuple):
     """Planned run, evaluated with the parameters of a fit.
 
-    **Attributes**: `fitted`: the run as a fit without iterations; `indices_in_run` and `indices_in_fit` of the unknowns
-    that the run shares with the fit, among the unknowns of the run and in the information of the fit.
+    **Attributes**
+
+    - `fitted`: the run as a fit without iterations
+    - `indices_in_run` and `indices_in_fit` (k,): the positions of the k unknowns that the run and the fit have in common, the
+      former among the unknowns of the run, the latter in the information of the fit
     """
 
     fitted: Fitted
