@@ -1,4 +1,4 @@
-"""Vibrations that do not turn with the rotor: loads that are jammed at a resonance, another shaft, another machine."""
+"""Vibrations of other frequencies than the rotor speed: of jammed loads, of another shaft, of another machine."""
 
 from __future__ import annotations
 
