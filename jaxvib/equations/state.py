@@ -136,7 +136,7 @@ class State(Readable):
 
     @property
     def rotor(self) -> tuple[Array, ...] | None:
-        """Angle and speed of the rotor of the only exciter, if a motor drives it."""
+        """Angle, speed and states of the motor that drives the only rotor; None under an ideal drive."""
         return self.exciter.rotor
 
     @property

@@ -210,8 +210,8 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
 
 
 def _tooth_after_gap(number: np.ndarray, per_turn: int) -> int | None:
-    """Return the number, 0 to `per_turn` - 1, of the tooth after the gap of a wheel; None without a gap, if no tooth differs
-    from the others.
+    """Return the number, 0 to `per_turn` - 1, of the tooth after the gap of a wheel; None for a wheel without a gap or with
+    several gaps.
 
     **Arguments**: `number` (n,) of the pulses, of at least two turns.
 
@@ -236,8 +236,8 @@ def drive_of_spline(spline: Any) -> RecordedDrive:
 def recorded_drive(time: np.ndarray, columns: Sequence[np.ndarray]) -> RecordedDrive:
     """Return the drive whose angle and errors are interpolated by polynomials of degree 5.
 
-    **Arguments**: evenly spaced times (n,), s; `columns`: three arrays (n, 1 + m) with the angle and its m errors at these
-    times and with their first and second derivatives.
+    **Arguments**: `time` (n,), s, evenly spaced; `columns`: three arrays (n, 1 + m): the angle and its m errors at these times,
+    their first derivatives, and their second derivatives.
     """
     width = (time[-1] - time[0]) / (time.size - 1)
     value, slope, curvature = (each[:, : 1 + MAX_ERRORS] * width**order for order, each in enumerate(columns))
