@@ -149,8 +149,8 @@ def _segment(
 
 
 def _recorded(samples: Samples) -> tuple[Array, Array]:
-    """Return the readings (n, C) of a record without their means, each at the time of the motion, and True for those that
-    count. Delays are rounded to whole samples."""
+    """Return the readings (n, C) of a record without their means, and True for the readings that count. Readings of a channel
+    with a delay are shifted to the time of the motion, by whole samples."""
     delays = np.array([channel.delay for channel in samples.channels])
     recorded, weights = (each.reshape(-1, each.shape[2]) for each in (samples.readings, samples.weights))
     used = weights > 0.0

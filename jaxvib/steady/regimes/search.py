@@ -171,7 +171,8 @@ def _regular_sets(n: int) -> np.ndarray:
 def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return speeds (n,) and phases (n, count) at which the sum of all torques passes 0, one for each root.
 
-    Between two of the given speeds lie two roots or none if the sum nearly touches 0 there; Newton's method starts from both.
+    If the sum nearly touches 0 at one of the given speeds, it has two roots near this speed, or none. Newton's method then
+    starts from both neighbouring speeds.
     """
     if balance.is_prescribed.any():
         return np.full(len(sets), np.asarray(balance.speed)), sets
