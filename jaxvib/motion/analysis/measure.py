@@ -28,8 +28,8 @@ MIN_CHANGE_SCALE = 1e-4
 needed because the amplitude and the force of a balanced rotor are almost zero."""
 
 _POINTS_IN_STEP = 8
-"""Number of points in each sampling step at which a kinked force is searched for extrema. A second search next to each extremum
-has as many points in the distance of two of these."""
+"""Number of points in each sampling step at which a kinked force is searched for extrema. A second search covers the distance
+of two neighbouring points on each side of the extremum, and divides each of these distances into as many parts."""
 
 Field = Callable[[Array, State], State]
 """Equations of motion: function from a time and a state to the rates of the state."""
