@@ -129,7 +129,8 @@ def read_table(path: str | Path, needs: str) -> TextTable:
     while count < min(2, len(texts)) and not _has_number(texts[count], mark):
         count += 1
     start = 0
-    if not _is_table(texts[: count + 2], mark):
+    # A second row without a number is a line of names below lines such as "serial 5".
+    if not _is_table(texts[: count + 2], mark) or not all(_has_number(text, mark) for text in texts[count + 1 : count + 2]):
         for k in range(1, len(texts) - 1):
             this = _mark(texts[k:])
             if _has_number(texts[k], this) or not _has_number(texts[k + 1], this) or not _is_table(texts[k : k + 3], this):

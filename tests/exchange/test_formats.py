@@ -181,6 +181,13 @@ def rows(*columns, sign=","):
     return "\n".join(sign.join(f"{x:.6g}" for x in row) for row in zip(*columns, strict=True)) + "\n"
 
 
+def test_lines_with_numbers_above_the_names_are_skipped(tmp_path):
+    (tmp_path / "run.txt").write_text("Device X\n\nSerial 5\ntime\tframe\ns\tg\n0\t1\n0.1\t2\n")
+    assert [(each.name, each.unit, each.values.tolist()) for each in read_channels(tmp_path / "run.txt", None)] == [
+        ("frame", "g", [1.0, 2.0])
+    ]
+
+
 def test_first_column_without_a_head_is_the_time(tmp_path):
     path = tmp_path / "run.txt"
     path.write_text(rows(T, np.sin(T), np.cos(T)))
