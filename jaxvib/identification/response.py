@@ -252,10 +252,11 @@ def _march(power: Array, forcing: Array, start: Array) -> tuple[Array, Array]:
 
 
 def _readings(steps: _Steps, force: Array, start: Array) -> tuple[Array, Array]:
-    """Return derivatives with respect to the state at the first sample and the components of the unbalances: of the readings
-    of a segment (n, C, ns + 2 E), and of the state at the end of the segment (ns, ns + 2 E).
+    """Return the derivatives of the readings of a segment (n, C, ns + 2 E), and those of the state at its end (ns, ns + 2 E).
 
-    **Arguments**: `start` (ns, ns + 2 E): derivatives of the state at the start of the segment.
+    They are derivatives with respect to the state at the first sample and the components of the unbalances.
+
+    **Arguments**: `start` (ns, ns + 2 E): the derivatives of the state at the start of the segment.
     """
     ns = steps.power.shape[0]
     n, exciters = force.shape[0], steps.inputs.shape[2]
@@ -347,7 +348,8 @@ def _linear_columns(steps: _Steps, samples: Samples):
 
 @cached
 def linear_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> Array:
-    """Return the products Z^T Z of the weighted columns Z = (linear unknowns of the run, readings) at the unknowns `x`."""
+    """Return Z^T Z at the unknowns `x`, with the weighted columns Z = (derivatives of the readings with respect to the linear
+    unknowns of the run, readings)."""
     first, columns = _linear_columns(_built(unknowns, samples, scene, x), samples)
 
     def segment(carry, part):

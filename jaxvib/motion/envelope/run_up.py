@@ -176,9 +176,9 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
 
     With gravity, the weight of an unbalance S acts on its rotor with the torque S g cos theta. The speed of the rotor therefore
     changes within each turn by a share of about S g / (I w^2) (I: inertia of the rotor, w: a natural frequency). This change
-    excites the resonance w already at the speed w/2, and the vibration that remains changes the later peak. The peak increases
-    or decreases, depending on the initial angle, by up to about this share (`weight_error`), which can exceed 20 % for screens.
-    Use `simulate` from rest for peaks with less error.
+    excites the resonance w already at the speed w/2. When the rotor reaches w, a part of this vibration has not decayed yet. It
+    raises or lowers the peak, depending on the initial angle, by up to about this share (`weight_error`), which can exceed 20 %
+    for screens. Use `simulate` from rest for peaks with less error.
 
     **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between passing a
     resonance and being caught use `simulate`. The torque of a motor with currents is its steady torque here. This changes
