@@ -41,7 +41,8 @@ _KIND_OF_OPTION = {
 )
 @click.option(
     "--rotor-speed",
-    help=("Rotor speed of the machine at rest (state space without --mode, or UFF), such as '3000 rpm' [speed of the drive]."),
+    help="Rotor speed of the gyroscopic coupling, in a state space without --mode or in UFF, such as '3000 rpm' [mean speed of "
+    "the drives].",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print only one JSON document on stdout.")
 def export(scene: Path, to: str, out: Path, as_json: bool, **options: object) -> None:

@@ -83,8 +83,8 @@ class MachineFit(Result):
     - `noise`: standard deviation of the residuals of each run's channels, SI
     - `p_value`: smallest p-value of all channels. It is the probability that the vibrations of pure noise at orders of the
       rotor speed are at least as strong as those of the residuals
-    - `time` (n,), s, `readings` (n, C) and `fitted` (n, C), the readings of the fitted model, SI, of each run with n samples of
-      C channels; NaN for readings that do not count
+    - `time` (n,), s, `readings` (n, C) and `fitted` (n, C), SI: times, readings and values of the fitted model, for each run
+      with n samples of C channels; NaN for readings that do not count
     """
 
     status: FitStatus

@@ -35,9 +35,10 @@ class Dimensionless(Readable):
         v_i = y_i/(rho_i y~), rho_i = M2S/M_i, n = speed/w, n_i^2 = k_i/(M_i w^2), n_ij^2 = k_ij/(M2S w^2),
         h_i = b_i/(2 M_i w), h_ij = b_ij/(2 M2S w), eps = y~/(kappa R), beta = b_W/(eps kappa m w)
 
-    Platform i has the displacement y_i, the mass M_i, the stiffness k_i and the damping b_i. The N loads have the mass m, the
-    radius R, the drag b_W and kappa = 1 + (moment of inertia about the centre of mass)/(m R^2). phi_j are the angles of the
-    loads, and s_y is the vertical component of their dimensionless unbalance s.
+    Platform i has the displacement y_i, the mass M_i, the stiffness k_i and the damping b_i. For the platform with the exciter,
+    M2S replaces M_i in these formulas, so that its rho_i is 1. The N loads have the mass m, the radius R, the drag b_W and
+    kappa = 1 + (moment of inertia about the centre of mass)/(m R^2). phi_j are the angles of the loads, and s_y is the vertical
+    component of their dimensionless unbalance s.
 
     The two papers scale the unbalance differently, and therefore also eps and v_i:
 

@@ -434,8 +434,8 @@ def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes
     """Return True if every rotating mass can make full turns in the potential of gravity.
 
     At the end of the run a mass must have the energy to pass the top from the mean height, where it has its averaged speed w:
-    I w^2/2 > (max V - min V)/2. If it does not have this energy at the start, its drag or its motor must be able to lift it:
-    D n or T(0) > max |dV/dphi|.
+    I w^2/2 > (max V - min V)/2. If it does not have this energy at the start, something must be able to lift it: for a load the
+    drag, D n > max |dV/dphi|; for an unbalance the motor, see `can_start`.
     """
     starts, gravity = can_start(scene), total_gravity(scene.all_effects).get(1)
     each, begins = [], np.cumsum([0, *(max(count, 1) for count in field.counts)])
