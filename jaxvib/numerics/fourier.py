@@ -91,7 +91,7 @@ def _synthesis(orders: np.ndarray, theta: np.ndarray) -> np.ndarray:
 def analyzed(values: Array, matrix: np.ndarray) -> Array:
     """Return the complex harmonics (..., K) of real values (..., M) at the points.
 
-    **Arguments**: `matrix` (M, 2K): `Grid.analysis` or `deviation_analysis`. A product of real matrices needs a quarter of the
+    **Arguments**: `matrix` (M, 2K): `Grid.analysis` or `deviation_analysis`. A product of real matrices needs half of the
     operations of a complex product.
     """
     return jax.lax.complex(*jnp.split(values @ matrix, 2, -1))

@@ -156,7 +156,7 @@ def criterion(scene: Scene) -> Criterion:
     - effects whose potential exerts a torque on each single load (`Gravity`), or that damp the machine at rest
       (`FrictionSupport`)
     - a mount that moves with no coordinate
-    - a spring that is too stiff for the precision compared with the others
+    - a spring that is so much stiffer than the others that a resonance is lost in rounding errors
     - a gyroscopic machine that has a motion without a spring
 
     >>> import jaxvib as jv

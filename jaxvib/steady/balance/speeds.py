@@ -159,8 +159,8 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     Two sign changes closer to each other than 1e-11 of the highest resonance count as none. `vmap` over scenes evaluates many
     machines.
 
-    **Raises** `InputError` if no coordinate moves the mount, a spring is too stiff for the precision compared with the
-    others, a gyroscopic carrier has a motion without a spring, or loads have different stations.
+    **Raises** `InputError` if no coordinate moves the mount, a spring is so much stiffer than the others that a resonance is
+    lost in rounding errors, a gyroscopic carrier has a motion without a spring, or loads have different stations.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,
