@@ -112,6 +112,7 @@ def test_growth_in_proportion_to_time_is_regular():
         (1.0 / np.arange(21, 41), "regular"),
         (np.log1p(2.0 / np.arange(21, 41)), "undecided"),  # with the square of time
         (np.geomspace(4.0, 1e-3, 20), "undecided"),  # a passage, after which nothing grows
+        (np.repeat([1.0, 0.4], 10) + np.tile([0.05, -0.05], 10), "undecided"),  # falls by far more than it scatters
         (np.geomspace(0.05, 1e-4, 20), "regular"),
     ],
 )

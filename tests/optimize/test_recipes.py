@@ -105,6 +105,15 @@ def test_a_straight_throw_needs_two_directions():
     assert circular_screen(alike, points=points, stroke="7 mm").notes() == []
 
 
+@pytest.mark.parametrize("recipe", [linear_screen, circular_screen, feeder])
+def test_unbalances_keep_their_ratio(recipe):
+    first = SCREEN.exciters[0].unbalance
+    uneven = eqx.tree_at(lambda s: s.exciters[1].unbalance, SCREEN, 2.0 * first)
+    space = recipe(uneven, points=DECK, stroke="7 mm").space
+    heaviest = space.scene_of(jnp.asarray(space.high))
+    np.testing.assert_allclose([e.unbalance for e in heaviest.exciters], [3.0 * first, 6.0 * first], rtol=1e-12)
+
+
 def test_recipes_create_no_absent_springs():
     hung = eqx.tree_at(lambda s: s.machine.stiffness, SCENE, jnp.array([5e4, 0.0]))
     assert [place.name for place in widest_range(hung, mode=3).space.free] == [

@@ -37,7 +37,7 @@ NOT_SHOWN = {"kkt"}
 @pytest.mark.parametrize("name", sorted(RESULTS))
 def test_numbers_of_results_have_a_unit(name):
     for field in dataclasses.fields(RESULTS[name]):
-        if str(field.type).split("[")[0] in ("Array", "float") and field.name not in NOT_SHOWN:
+        if str(field.type).split("[")[0] in ("Array", "np.ndarray", "float") and field.name not in NOT_SHOWN:
             assert field.metadata.keys() & {"unit", "part", "write"}, field.name
         units = field.metadata["unit"].split(" or ") if "axes" in field.metadata else []
         for unit in set(units) - {"", "SI"}:  # SI: the unit of each number is among the labels
