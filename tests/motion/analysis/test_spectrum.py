@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import jaxvib as jv
 from jaxvib.motion.analysis.measure import Trajectory
@@ -48,6 +49,14 @@ def test_rounded_times_do_not_move_a_peak():
     motion = Trajectory(time, jv.State(wave, wave, (wave,), (0.0 * wave,)), wave, (time,), (0.0 * time + 60.0,))
     found = spectrum_of(SCENE, motion, None, 1)
     assert abs(found.frequency[np.argmax(found.amplitude[0, :, 0])] - 28.0) <= found.frequency[1] / 2.0
+
+
+def test_waterfall_is_drawn_onto_given_axes():
+    time = jnp.linspace(0.0, 40.0, 4000)
+    wave = jnp.sin(28.0 * time)[:, None]
+    motion = Trajectory(time, jv.State(wave, wave, (wave,), (0.0 * wave,)), wave, (time,), (0.0 * time + 60.0,))
+    axes = Figure().subplots()
+    assert spectrum_of(SCENE, motion, motion, 3).plot(ax=axes) is axes and axes.has_data()
 
 
 def test_an_unknown_force_has_no_figure():
