@@ -123,7 +123,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
             else "no jam mode at this speed",
         ]
         if rows:
-            lines.append("stable, no: after a small disturbance the loads (balls, rollers, pendulums) leave this jam")
+            lines.append("not stable: after a small disturbance the loads (balls, rollers, pendulums) leave this jam")
         lines += [text] if (text := modes_found.unresolved_text()) else []
         if tolerances:
             lines.append(tolerance_table(ranges, tolerances))

@@ -54,8 +54,8 @@ class TorqueBalance(eqx.Module):
     - `model`: the linear model
     - `averaged`: the averaged equations at the working speed of ideal drives
     - `direction` B_k^T e_k (count, nd), complex: generalized force of each mass per unit of its centrifugal force
-    - `motor_torque` (count,) N m: largest torque of the motor of an unbalance from rest to its working speed; 1 if the motor
-      has no torque, 0 for a load
+    - `motor_torque` (count,) N m: largest torque of the motor of an unbalance from rest to its working speed; 1 for an ideal
+      drive and for a motor without torque, 0 for a load
     """
 
     model: LinearModel

@@ -84,7 +84,7 @@ def sliders_of(scene: Scene) -> list[Slider]:
     - positions of exciters and angles of supports on bodies in a plane, in a range around the scene's value
     - number of loads, if all loads have equal parameters
 
-    A parameter that is 0 has no slider, because a factor does not change it.
+    A parameter that is 0 has no slider, because a factor does not change it; positions and angles always have one.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),

@@ -219,7 +219,7 @@ def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
 
     The unbalance swings past the height at which the torque would hold it: torque x > S g (1 - cos x) for every angle x.
 
-    The list has an entry for each exciter. It is None if the exciter has no motor or no unbalance, if the torque at rest
+    The list has an entry for each exciter. An entry is None if the exciter has no motor or no unbalance, if the torque at rest
     changes during a run (`Motor.starting_torque`), or without gravity.
     """
     gravity = total_gravity(scene.all_effects)

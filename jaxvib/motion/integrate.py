@@ -361,8 +361,8 @@ def whole_turns(scene: Scene, segment: float) -> float:
     """Return the longest time within `segment`, s, that is a whole number of turns of all rotors, but at least one turn.
 
     The rotors of motors are ignored, because their angles are part of the state; a period of their supply counts as a turn. If
-    there are several rotors, only those with an unbalance are considered. **Raises** `InputError` for rotors with an unbalance
-    at different speeds.
+    there are several rotors, only those with an unbalance or an imbalance are considered. **Raises** `InputError` if the speeds
+    of these rotors and the frequencies of supplies are not all equal.
     """
     is_single = len(scene.exciters) == 1
     counted = [

@@ -62,8 +62,9 @@ def versions() -> dict[str, str]:
 class Store:
     """Open store.
 
-    **Attributes**: `path`; `attributes`: the record of the study, versions and seed; `arrays` by name; `shape`: number of cases
-    along each dimension; `tile`: number of cases of a chunk along each dimension; `names` of the measures.
+    **Attributes**: `path`; `attributes` of the whole store, such as the versions of packages; `record` of the study, see
+    `Study`; `arrays` by name; `shape`: number of cases along each dimension; `tile`: number of cases of a chunk along each
+    dimension; `names` of the measures; `dims`: names of the dimensions.
     """
 
     def __init__(self, path: Path, writable: bool = False):

@@ -17,8 +17,8 @@ from jaxvib.errors import InputError
 @click.option("--fit", type=click.Path(path_type=Path), help="File fit.npz of `jaxvib identify`, in place of a new fit.")
 @shared
 def plan(identification: Path, fit: Path | None, output: Output) -> None:
-    """Rank the candidate runs of an IDENTIFICATION file: the best one most reduces the expected errors of the unknown
-    parameters per minute of test.
+    """Rank the candidate runs of an IDENTIFICATION file by how much they reduce the expected errors of the unknown parameters
+    per minute of test.
 
     The file names the runs recorded so far, as for `identify`, and has a table [[candidate]] for each run that could be
     recorded next: a ramp, a dwell or a coast-down, other places of sensors, or changed parameters of the machine, such as an

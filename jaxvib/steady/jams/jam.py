@@ -125,8 +125,8 @@ class JamModes(AbstractJam):
 
     Returned by `jam_modes`.
 
-    - A mode that does not exist has NaN values and the status `absent`. Its derivatives are 0 in place of NaN, which keeps the
-      derivatives of a batch finite: test the status, not the gradient
+    - A mode that does not exist has NaN values, except for `rotor_speed`, and the status `absent`. Its derivatives are 0 in
+      place of NaN, which keeps the derivatives of a batch finite: test the status, not the gradient
     - A mode at an undamped resonance has NaN amplitudes and the status `unbounded`
 
     **Additional attributes**: `resonances` (nd,), rad/s, and the `folds` of the branch.

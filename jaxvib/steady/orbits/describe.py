@@ -50,7 +50,8 @@ class Orbit(Result):
 
     Returned by `jam_orbit`.
 
-    Values are NaN if the status is `absent` or `not_converged`. Signals are Re sum_k c_k exp(i k theta).
+    Values are NaN if the status is `absent`, or `not_converged` (then except for `residual` and `offsets`). Signals are
+    Re sum_k c_k exp(i k theta).
 
     **Attributes** (nd coordinates, nb directions of the force, J and K harmonics)
 

@@ -339,8 +339,8 @@ def synchronous_regimes(
 
     **Returns** `SynchronousRegimes`, or `SynchronousRegime` with `near`.
 
-    **Raises** `InputError` for exciters with both loads and an unbalance, loads with a motor, ideal drives of different speeds,
-    and effects that this theory does not include.
+    **Raises** `InputError` for exciters with both loads and an unbalance, loads with a motor, unbalances whose ideal drives
+    have different speeds, and effects that this theory does not include.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
