@@ -50,7 +50,7 @@ def display_units(*, speed: SpeedUnit = "rpm", si: bool = False) -> None:
     """Set the units of all texts, tables and figures of this process; without arguments, the units that are usual in
     engineering.
 
-    The command-line option `--unit` sets `speed`.
+    The command-line option `--unit` sets `speed`; with `--unit SI` speeds are in rad/s, and `si` is True.
 
     **Arguments**
 

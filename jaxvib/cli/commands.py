@@ -70,7 +70,7 @@ new.help = f"{inspect.cleandoc(new.help or '')}\n\nMachines: {', '.join(_MACHINE
 @SEPARATION
 @click.option("--spin-up", help="Duration of the spin-up, with --start spin_up [half of --until].")
 @click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-8].")
-@click.option("--accuracy", type=float, help="Allowed error of the final state, in place of --step-tolerance.")
+@click.option("--accuracy", type=float, help="Allowed error of the motion at the end, in place of --step-tolerance.")
 @click.option("--max-steps", type=int, help="Largest number of time steps.")
 @click.option("--window", is_flag=True, help="Save only the measurements over the last turns, and no trajectory.")
 @deck_options

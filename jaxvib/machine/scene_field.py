@@ -14,7 +14,7 @@ def mass_names(scene: Scene) -> tuple[str, ...]:
     """Return the names of the loads, and of the rotors of exciters without loads.
 
     The first load has the name "1" in a scene with one exciter; with several exciters, "2.1" is the first load of exciter 2,
-    and "2" its rotor.
+    and "2" its rotor. A single exciter without loads has no names.
     """
     counts = [0 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters]
     if len(counts) == 1:

@@ -28,8 +28,8 @@ def spectrum_chart(
     """Draw spectra as lines, with amplitudes on a logarithmic scale.
 
     `frequency` has nf values. `series` contains the amplitudes (nf,) of each spectrum by its name, which includes the unit.
-    Vertical lines mark the rotor speeds (1, exciters), the load speeds (1, loads) and the resonances. Frequencies and speeds
-    are in rad/s, drawn in `unit`.
+    Vertical lines mark the rotor speeds (1, exciters), the load speeds (1, exciters with loads) and the resonances. Frequencies
+    and speeds are in rad/s, drawn in `unit`.
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.0), ax=ax)
@@ -68,8 +68,8 @@ def waterfall_chart(
 ) -> Drawn:
     """Draw amplitudes (P, nf) as shades of grey over P times, s, and nf frequencies.
 
-    `name` is that of the amplitudes, with their unit. The rotor speeds (P, exciters) and the load speeds (P, loads) are drawn
-    as lines, resonances as horizontal lines. Frequencies and speeds are in rad/s, drawn in `unit`.
+    `name` is that of the amplitudes, with their unit. The rotor speeds (P, exciters) and the load speeds (P, exciters with
+    loads) are drawn as lines, resonances as horizontal lines. Frequencies and speeds are in rad/s, drawn in `unit`.
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.4), ax=ax)

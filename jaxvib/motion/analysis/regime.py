@@ -182,7 +182,7 @@ def regime(scene: Scene, segment: Trajectory) -> Regime:
     - `segment`: the part of the run, a `Trajectory` such as `run.window`; typical: 20 or more turns
 
     **Returns** `Regime`; `jit` and `vmap` are supported. If the motion is not steady, `name` is "unsettled" and no error is
-    raised. **Raises** `InputError` for a scene with several exciters.
+    raised. **Raises** `InputError` for a scene that is not plain, see `Scene.is_plain`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
