@@ -203,8 +203,13 @@ def _target_of(scene: Scene, name: str) -> tuple[Target, str]:
     if entry is not None and entry >= size:
         raise InputError(f"axes.{name}", f"does not exist; start.{match[1]} has {size} entries, counted from 0")
     unit = _START[match[1]]
-    if entry is not None and unit in ("m", "m/s"):
-        unit = unit.replace("m", scene.machine.structure().units[entry])  # a coordinate may be a rotation
+    if unit in ("m", "m/s"):
+        units = scene.machine.structure().units  # a coordinate may be a rotation
+        changed = set(units if entry is None else units[entry : entry + 1])
+        if len(changed) > 1:
+            problem = "sets displacements and rotations to one number; give an index"
+            raise InputError(f"axes.{name}", f"{problem}, such as start.{match[1]}[0]")
+        unit = unit.replace("m", changed.pop())
     return Target(None, match[1], entry), unit
 
 

@@ -196,7 +196,7 @@ def sweep(
 
     - a parameter of the scene, with the same name as in a `DesignSpace` ("machine.stiffness[0]", "loads.drag", "drive.speed")
     - a parameter of the initial state ("start.rate" rad/s, "start.angle" rad, "start.displacement[0]" m, "start.velocity[0]"
-      m/s; without an index, all entries change together)
+      m/s, for tilts rad and rad/s; without an index, all entries change together)
 
     The values of an axis are a list, or a table of `from`, `to`, `count` and `scale` ("even" or "log"). The cases are all
     combinations of these values. Parameters whose table has no `count` are sampled together, `samples` times for each

@@ -98,6 +98,8 @@ def test_an_axis_of_a_tilt_has_the_unit_rad():
     units = {name: axis_of(tilting, name, [0.1]).unit for name in ("start.displacement[1]", "start.displacement[2]")}
     assert units == {"start.displacement[1]": "m", "start.displacement[2]": "rad"}
     assert axis_of(tilting, "start.velocity[3]", ["1 deg/s"]).unit == "rad/s"
+    with pytest.raises(jv.InputError, match=r"axes.start.velocity sets displacements and rotations to one number"):
+        axis_of(tilting, "start.velocity", [0.1])
 
 
 def test_an_axis_of_an_array_adds_no_spring():

@@ -23,7 +23,7 @@ _MAX_ASYMMETRY = 1e-9
 """Largest asymmetry of a matrix, relative to its largest entry, in double precision."""
 
 _EQUAL_SQUARES = 1e-6
-"""Relative difference of squared natural frequencies that are equal, in addition to rounding."""
+"""Largest relative difference of squared natural frequencies that count as equal, in addition to rounding."""
 
 _REDUCTION_ERROR = 1e-6
 """Largest error of the eigenvalues of a reduced matrix, relative to its largest entry: rounding at omitted high frequencies."""

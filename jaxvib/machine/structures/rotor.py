@@ -282,7 +282,7 @@ def _without_equal(stations: Array) -> Array:
 
 
 def _distinct(stations: np.ndarray | float) -> np.ndarray:
-    """Return stations (n,) of which those that differ by rounding are equal; one station (1,) if all are equal."""
+    """Return stations (n,), made equal where they differ only by rounding; one station (1,) if all are equal."""
     places, which = np.unique(np.atleast_1d(stations), return_inverse=True)
     rounding = max(1e-9, 32.0 * float(np.finfo(places.dtype).eps)) * np.max(np.abs(places))
     is_new = np.diff(places, prepend=-np.inf) > rounding
@@ -397,7 +397,7 @@ def planar_rotor(
 
 
 def _require_one_value(**values: Number) -> None:
-    """**Raises** `InputError` for a list of 2 values, with the notation of two directions and of two supports."""
+    """**Raises** `InputError` for a list of 2 values; the message shows how to write two directions and two supports."""
     for name, value in values.items():
         if isinstance(value, (list, tuple)) and len(value) == 2:
             across, up = map(quoted, value)

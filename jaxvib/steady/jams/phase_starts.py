@@ -43,8 +43,8 @@ there are more divisions, they are not searched separately, and every load has a
 
 
 def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return speeds (n,) and phases (n, count) of solutions of the torque balance, from `number` random sets of phases in
-    total.
+    """Return speeds (n,) and phases (n, count) of solutions of the torque balance, from about `number` random sets of phases
+    in total, or more if the loads have many divisions (see below).
 
         T_j = (w^4/2) S_j Im(e^{-i a_j} F_j),      F_j = sum_k S_k H_jk e^{i a_k}
 
@@ -91,8 +91,8 @@ def _at_resonances(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarr
     """Return starts at every natural frequency below the rotor speed, from each of the `phases`.
 
     Two clusters of equal size have a jam at the speed at which the phase lag of the carrier is exactly 90 degrees; no grid of
-    load speeds contains this speed. For two loads this jam is not searched: it exists at any drag, and the diagram over the
-    drag has no curve for it.
+    load speeds contains this speed. For two loads this jam is left out: its speed does not depend on the drag, so that the
+    diagram over the drag has no curve for it.
     """
     frequencies = np.asarray(estimated_frequencies(balance.model.scene))
     inside = frequencies[(frequencies > 0.0) & (frequencies < float(balance.speed))]
@@ -276,7 +276,8 @@ def load_speeds(balance: TorqueBalance) -> np.ndarray:
 
 
 def _regular_phases(balance: TorqueBalance) -> np.ndarray:
-    """Return regular sets of phases (ns, count): all equal, and every division into two opposite groups."""
+    """Return regular sets of phases (ns, count): all equal, and every division of the loads into two opposite groups. Of more
+    than six loads, only the first five change their group."""
     n = balance.unbalance.shape[0]
     return np.array([[np.pi * ((k >> j) & 1) for j in range(n)] for k in range(2 ** min(n - 1, 5))])
 

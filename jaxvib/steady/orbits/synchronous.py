@@ -220,8 +220,8 @@ def synchronous_orbit(
     - `regime`: a motion of the averaged theory with `speed` and `phases` of all masses, with the loads of each exciter at one
       angle; or these two arguments:
     - `speed`: starting value of Omega, rad/s or text; default: the mean of the motors' no-load speeds; typical: 60 to 320
-    - `phases` (N,): starting values of alpha, rad; default: 0. The first phase that is free keeps its value, because it defines
-      the origin of time
+    - `phases` (N,): starting values of alpha, rad; default: 0. If no ideal drive turns an unbalance, the first phase keeps its
+      value, because it defines the origin of time
     - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-8 (the default; in
       single precision 1e-3)
     - `points`: a fixed number of points on a period in place of an accuracy; typical: 17 to 65. Under `jit` and `vmap` the
