@@ -91,11 +91,14 @@ def speed_unit(unit: SpeedUnit | None = None) -> tuple[SpeedUnit, float]:
 def shown_unit(unit: str, size: float) -> tuple[str, float]:
     """Return the display unit of values of about `size`, and the factor from the SI value to it.
 
-    >>> shown_unit("m", 0.02), shown_unit("N", 120.0)
-    (('mm', 1000.0), ('N', 1.0))
+    >>> shown_unit("m", 0.02), shown_unit("N", 120.0), shown_unit("rad/s^2", 10.0)[0]
+    (('mm', 1000.0), ('N', 1.0), 'rpm/s')
     """
     if unit == "rad/s":
         return speed_unit()
+    if unit == "rad/s^2":
+        name, factor = speed_unit()
+        return ("rad/s^2" if name == "rad/s" else f"{name}/s"), factor
     if unit == ELECTRICAL:
         return ("rad/s", 1.0) if _CurrentUnits.si else ("Hz", _SPEED_FACTORS["Hz"])
     if _CurrentUnits.si:

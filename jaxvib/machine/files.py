@@ -24,6 +24,7 @@ from jaxvib.machine.drives.electrical import DCMotorElectrical, InductionMotorCi
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS
 from jaxvib.machine.loads import Loads, ball_mass, balls, pendulums, rollers
+from jaxvib.machine.numbers import PLAIN, NumberSpec, number_specs, with_display_units
 from jaxvib.machine.scene import Exciter, Scene, unbalance
 from jaxvib.machine.structures.plane_body import body, plane_body, plane_network, support
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
@@ -384,7 +385,7 @@ def rebuild_part(part: Any, section: str) -> Any:
     build = {**MACHINES, **LOADS, **DRIVES, **EFFECTS}.get(part.kind)
     if build is None or not all(hasattr(part, name) for name in inspect.signature(build).parameters):
         return part
-    return build_part(build, _fields(part, build), section)
+    return build_part(build, _fields(part, build, _si_numbers), section)
 
 
 @validated
@@ -404,39 +405,74 @@ def scene_to_toml(scene: Scene) -> str:
     import tomli_w  # slow import
 
     require_known(scene, "scene", "scene_to_toml", "write the scene outside")
-    tables: Tables = {"machine": _part_table("machine", scene.machine)}
+    return tomli_w.dumps(_scene_tables(scene, _si_numbers))
+
+
+def scene_text(scene: Scene) -> str:
+    """Return the text of a scene file with display units and 10 digits, for readers; arguments as for `scene_to_toml`.
+
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),
+    ...                  jv.balls(count=2, mass=[0.5, 0.6], radius=0.1, drag=1.0), jv.ConstantSpeed("600 rpm"))
+    >>> [line for line in scene_text(scene).splitlines() if line.startswith(("stiff", "mass", "speed"))]
+    ['mass = "50 kg"', 'stiffness = "40 N/mm"', 'mass = ["500 g", "600 g"]', 'speed = "600 rpm"']
+    """
+    import tomli_w  # slow import
+
+    require_known(scene, "scene", "scene_text", "print the scene outside")
+    text = tomli_w.dumps({name: table for name, table in _scene_tables(scene, with_display_units).items() if table})
+    return re.sub(r"\[\n.*?\n\]", lambda array: _in_one_line(array[0]), text, flags=re.S)
+
+
+def _in_one_line(array: str) -> str:
+    return " ".join(array.split()).replace("[ ", "[").replace(", ]", "]")
+
+
+_Write: TypeAlias = Callable[[NumberSpec, Any], Any]
+"""Function from the specification and the SI value of a number or an array to the value or the nested list of a file."""
+
+
+def _si_numbers(spec: NumberSpec, value: Any) -> Any:
+    return np.asarray(value, dtype=float).tolist()
+
+
+def _scene_tables(scene: Scene, write: _Write) -> Tables:
+    tables: Tables = {"machine": _part_table("machine", scene.machine, write)}
     if len(scene.exciters) == 1 and scene.exciters[0].is_plain and scene.exciters[0].place is None:
-        tables |= {"loads": _part_table("loads", scene.loads), "drive": _part_table("drive", scene.drive)}
-        return tomli_w.dumps({**tables, "effects": _effect_tables(scene.all_effects)})
-    tables["exciters"] = list(map(_exciter_table, scene.exciters))
-    return tomli_w.dumps({**tables, "effects": _effect_tables(scene.effects)})
+        tables |= {"loads": _part_table("loads", scene.loads, write), "drive": _part_table("drive", scene.drive, write)}
+        return {**tables, "effects": _effect_tables(scene.all_effects, write)}
+    tables["exciters"] = [_exciter_table(exciter, write) for exciter in scene.exciters]
+    return {**tables, "effects": _effect_tables(scene.effects, write)}
 
 
-def _part_table(section: str, part: Any) -> Tables:
-    return {"kind": part.kind, **_fields_of_kind(section, part, SECTIONS[section])}
+def _part_table(section: str, part: Any, write: _Write) -> Tables:
+    return {"kind": part.kind, **_fields_of_kind(section, part, SECTIONS[section], write)}
 
 
-def _fields_of_kind(section: str, part: Any, kinds: Mapping[str, Callable[..., object]]) -> Tables:
+def _fields_of_kind(section: str, part: Any, kinds: Mapping[str, Callable[..., object]], write: _Write) -> Tables:
     """Return the fields of a part. **Raises** `InputError` for a part of a kind from outside the package."""
     if part.kind not in kinds:
         problem = f"is {part.kind!r}, which scene files do not describe; build it in Python"
         raise InputError(f"{section}.kind", problem)
-    return _fields(part, kinds[part.kind])
+    return _fields(part, kinds[part.kind], write)
 
 
-def _exciter_table(exciter: Exciter) -> Tables:
-    at = exciter.position if exciter.platform is None else exciter.platform
-    values = {"at": at, "body": exciter.body or None, "unbalance": exciter.unbalance, "unbalance_mass": exciter.unbalance_mass}
-    table = {name: np.asarray(value).tolist() for name, value in values.items() if value is not None}
+def _exciter_table(exciter: Exciter, write: _Write) -> Tables:
+    specs = number_specs(Exciter)
+    table: Tables = {} if exciter.platform is None else {"at": exciter.platform}
+    numbers = {"at": "position", "unbalance": "unbalance", "unbalance_mass": "unbalance_mass"}
+    values = {key: (specs[name], getattr(exciter, name)) for key, name in numbers.items()}
+    table |= {key: write(spec, value) for key, (spec, value) in values.items() if value is not None}
+    table |= {"body": exciter.body} if exciter.body else {}
     parts = {name: part for name in ("loads", "drive") if (part := getattr(exciter, name)) is not None}
-    table |= {"direction": exciter.direction, **{name: _part_table(name, part) for name, part in parts.items()}}
-    return {**table, "effects": _effect_tables(exciter.effects)} if exciter.effects else table
+    table |= {"direction": exciter.direction, **{name: _part_table(name, part, write) for name, part in parts.items()}}
+    return {**table, "effects": _effect_tables(exciter.effects, write)} if exciter.effects else table
 
 
-def _effect_tables(effects: tuple[Effect, ...]) -> Tables:
+def _effect_tables(effects: tuple[Effect, ...], write: _Write) -> Tables:
     tables: Tables = {}
     for effect in effects:
-        fields = _fields_of_kind("effects", effect, EFFECTS)
+        fields = _fields_of_kind("effects", effect, EFFECTS, write)
         if effect.repeatable:
             tables.setdefault(effect.kind, []).append(fields)
         else:
@@ -444,26 +480,24 @@ def _effect_tables(effects: tuple[Effect, ...]) -> Tables:
     return tables
 
 
-def _fields(part: object, build: Callable[..., object]) -> Tables:
+def _fields(part: object, build: Callable[..., object], write: _Write) -> Tables:
     fields: Tables = {}
+    specs = number_specs(type(part))
     for name in inspect.signature(build).parameters:
         value = getattr(part, name)
         if value is None:  # an option that is not set
             continue
         if isinstance(value, tuple):
-            fields[name] = [_fields(each, _ENTRIES[name]) if name in _ENTRIES else list(each) for each in value]
+            fields[name] = [_fields(each, _ENTRIES[name], write) if name in _ENTRIES else list(each) for each in value]
         elif isinstance(value, (int, str)):
             fields[name] = value
         elif isinstance(value, Drive):
-            fields[name] = _part_table("drive", value)
+            fields[name] = _part_table("drive", value, write)
         else:
             # For a machine, an array with one value is written as a number. For loads it stays a list, because a number is the
             # value of all loads, and a list contains the value of each load.
-            plain = when_known(partial(_plain, unwrap=isinstance(part, Machine)), value)
+            plain = when_known(partial(write, specs.get(name, PLAIN)), value)
+            if isinstance(part, Machine) and isinstance(plain, list) and len(plain) == 1 and not isinstance(plain[0], list):
+                plain = plain[0]
             fields[name] = value if plain is None else plain  # `rebuild_part` passes traced values to the constructor
     return fields
-
-
-def _plain(value: np.ndarray | float, *, unwrap: bool) -> float | list:
-    array = np.asarray(value, dtype=float)
-    return array.item() if array.ndim == 0 or (array.size == 1 and unwrap) else array.tolist()

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.display import ELECTRICAL
+from jaxvib.display import ELECTRICAL, shown_unit
 from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.startup import start
 from jaxvib.units import Bounds, number, numbers
@@ -143,8 +143,8 @@ class Part(eqx.Module):
     """Base of the parts of a scene: its text representation shows values with their units.
 
     >>> import jaxvib as jv
-    >>> jv.ConstantSpeed("60 rad/s")
-    constant_speed(speed=60.0 rad/s)
+    >>> jv.ConstantSpeed("157.08 rad/s")
+    constant_speed(speed='1500.003508 rpm')
     """
 
     def __repr__(self) -> str:
@@ -170,5 +170,23 @@ class Part(eqx.Module):
 def _shown(value: object, spec: NumberSpec) -> str:
     if not hasattr(value, "dtype"):
         return repr(value)
-    text = when_known(lambda known: f"{np.asarray(known).tolist()} {spec.unit}".rstrip(), value)
+    text = when_known(lambda known: repr(with_display_units(spec, known)), value)
     return eqx.tree_pformat(value) if text is None else text
+
+
+def with_display_units(spec: NumberSpec, value: Any) -> Any:
+    """Return a number, or the nested list of an array, as texts with 10 digits and the display unit, which constructors read.
+
+    A number without a unit, or one that is not finite, stays a number.
+
+    >>> with_display_units(NumberSpec(("N/m",), Bounds()), [5e4, 0.0]), with_display_units(PLAIN, 0.1)
+    (['50 N/mm', '0 N/mm'], 0.1)
+    """
+    array = np.asarray(value)
+    if len(spec.units) > 1:
+        units = zip(spec.units, array, strict=True)
+        return [with_display_units(spec._replace(units=(each,)), entry) for each, entry in units]
+    if not spec.unit or array.dtype.kind != "f" or not np.all(np.isfinite(array)):
+        return array.tolist()
+    shown, factor = shown_unit(spec.unit_of_tables, float(np.max(np.abs(array), initial=0.0)))
+    return np.vectorize(lambda number: f"{factor * number:.10g} {shown}", otypes=[object])(array).tolist()
