@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 )
 @click.option("--fps", type=int, default=20, show_default=True, help="Frames per second.")
 @click.option(
-    "--magnify", type=float, help="Factor by which displacements are drawn larger than the circle of the loads [automatic]."
+    "--magnify", type=float, help="Magnification of the displacements relative to the circle of the loads [automatic]."
 )
 @click.option("--width", type=float, default=6.4, show_default=True, help="Width of the animation, in hundreds of pixels.")
 @click.option(
@@ -62,6 +62,8 @@ def animate(
             raise InputError(
                 "--until", "is missing; give the duration of the simulation, or --mode with the number of a jam mode"
             )
+        elif start is not None:
+            raise InputError("--start", "needs a simulation: give --until with its duration, or leave --start out")
         else:
             motion, scene = jv.jam_orbit(loaded, mode=mode), loaded
     animation = jv.animate(motion, scene=scene, **options)

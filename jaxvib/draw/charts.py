@@ -173,7 +173,8 @@ def scaled_amplitudes(
 def log_limits(
     curves: Sequence[np.ndarray], rotor_speed: np.ndarray, omega: np.ndarray, resonances: np.ndarray
 ) -> tuple[float, float]:
-    """Return the limits of a logarithmic axis from the range of the curves at load speeds above half the lowest resonance.
+    """Return the limits of a logarithmic axis; the lower one follows from the curves at load speeds above half the lowest
+    resonance.
 
     At lower load speeds the loads turn with the rotor, and the curves approach zero.
     """

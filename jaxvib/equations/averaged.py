@@ -396,7 +396,8 @@ def averaged_field(scene: Scene) -> Averaged:
     """Return the averaged equations of `scene`; the module docstring derives them and states their error.
 
     **Returns** `Averaged`; `jit`, `vmap` and `grad` apply to it and to the scene. **Raises** `InputError` for loads that do not
-    move on a circle, for loads with a motor, and for effects other than potentials such as gravity, whose mean torque is 0.
+    move on a circle, loads with a motor, a body in a plane, and effects other than potentials such as gravity, whose mean
+    torque is 0.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jax.numpy as jnp, jaxvib as jv

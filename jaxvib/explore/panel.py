@@ -120,8 +120,8 @@ def dot(x: float, y: float, look: Look, square: bool = False) -> Part:
 def legend(groups: Sequence[Mapping[str, Look]]) -> tuple[list[Part], list[Text]]:
     """Return the legend above the charts, with two entries in a column: samples of lines and dots with their names.
 
-    A style with a fill colour ("fc") is drawn as a dot, other styles as a line. Each of `groups` begins a column, the second
-    one above the second chart or to the right of it.
+    A style with a fill colour ("fc") is drawn as a dot, other styles as a line. The first of the `groups` begins above the
+    first chart, the second one above the second chart.
     """
     parts, texts = [], []
     for columns, looks in zip(_COLUMNS, groups, strict=False):

@@ -62,7 +62,8 @@ class Dimensionless(Readable):
       typical: 1 each, or 50 to 5000 kg, 10 to 100 rad/s and 0.05 to 0.3 m
     - `kappa`, at least 1: inertia factor of the loads, which are pendulums; typical: 1 to 1.5
 
-    **Raises** `InputError` for lengths that do not fit, values that are not positive, or loads heavier than M2S.
+    **Raises** `InputError` for lengths that do not fit, negative values, 0 for other arguments than `natural`, `damping`,
+    `link_natural` and `link_damping`, a `kappa` below 1, and loads that are not lighter than M2S.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -138,7 +139,7 @@ class Dimensionless(Readable):
 
     @property
     def length_unit(self) -> Array:
-        """Length y~ = s~/M2S in m, the unit of v_2; it equals eps kappa R in both forms."""
+        """Length y~ = s~/M2S in m, the unit of v_i of the platform with the exciter; it equals eps kappa R in both forms."""
         return self.eps * self.kappa * self.radius
 
     @property

@@ -236,7 +236,7 @@ class CircularLoads(Loads):
 
     @property
     def alike(self) -> bool:
-        """True if all loads have equal parameters."""
+        """True if each parameter is a single number that all loads share; False for arrays, even of equal numbers."""
         return all(x is None or x.ndim == 0 for x in (self.mass, self.radius, self.drag, self.inertia))
 
     def position(self, *u: Array) -> tuple[Array, Array]:

@@ -1,8 +1,8 @@
 """Files of results: NumPy archives of arrays, with a JSON text that describes the structure of the result.
 
-Reading is safe: nothing is unpickled, and no constructor named in a file is called. Objects are rebuilt from their fields,
-named tuples from their entries, and only classes that jaxvib and optimize define are allowed. An archive contains a digest of
-its contents.
+Reading is safe: nothing is unpickled, and only classes that jaxvib and optimize define are allowed. Objects are rebuilt from
+their fields without a call of their constructors, and named tuples from their entries. An archive contains a digest of its
+contents.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def prepare_cpu(devices: int | None = 1) -> str:
     OpenBLAS, which does the linear algebra of JAX and SciPy, is limited to one thread by OPENBLAS_NUM_THREADS=1, because its
     waiting threads take the cores from all other computations.
 
-    Flags that are already set are not changed. Flags that the installed jaxlib does not know are omitted, because XLA would
+    Options that are already set are not changed. Flags that the installed jaxlib does not know are omitted, because XLA would
     end the process.
 
     **Arguments**: `devices`: number of CPU devices, at least 1; typical: 1 (the default); None: the number of cores that this

@@ -120,7 +120,7 @@ def branches(
 
     **Arguments**
 
-    - `scene`; its rotor speed only determines the default of `most`
+    - `scene`; its rotor speed only determines the defaults of `most` and `least`
     - `points` along Omega, denser near the resonances, at least 2; typical: 200 to 2000 (the default). The time is
       proportional to this number
     - `most`: the greatest load speed, rad/s or text; default: 4/3 of the scene's rotor speed

@@ -426,6 +426,7 @@ def test_animate_and_sketch_write_an_animation_and_a_drawing(typed, tmp_path):
     [
         (["animate", ".", "--out", "a"], "there is no such file"),
         (["animate", "machine.toml", "--out", "a"], "--until is missing; give the duration of the simulation, or --mode"),
+        (["animate", "machine.toml", "--mode", "3", "--start", "jam"], "--start needs a simulation: give --until"),
         (["animate", "run.npz", "--mode", "3", "--out", "a"], "--until and --start and --mode apply to a scene file"),
         (["animate", "missing.npz", "--out", "a"], "there is no such file"),
     ],

@@ -272,7 +272,7 @@ def amplitude_histories(
 
     **Arguments** (nt times, nd coordinates)
 
-    - `time` (nt,), s; `amplitude` (nt, nd), m or rad according to `units` (nd,), drawn in mm or µm, and in mrad
+    - `time` (nt,), s; `amplitude` (nt, nd), m or rad according to `units` (nd,), drawn in mm or µm, mrad or µrad
     - `load_speed` (nt, count), `rotor_speed` (nt, exciters), rad/s, drawn in `unit`
     - `force` (nt, directions): foundation force, N
     - `resonances`: natural frequencies, rad/s; those below the largest rotor speed are dotted lines in the panel of the speeds

@@ -55,7 +55,7 @@ def fit_spline(
     """Return a smoothing spline of degree 5 with 1 + m columns (the values and their m errors), and the scatter.
 
     The scatter is the standard deviation of the values about the spline; with `rates` it is the standard deviation of the
-    times, s. The errors are principal components of the covariance of the coefficients, the largest first.
+    times, s. The errors are the principal components of the covariance of the curve at evenly spaced times, the largest first.
 
     **Arguments**
 

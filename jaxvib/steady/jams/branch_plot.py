@@ -87,7 +87,8 @@ def plot_branch(
     - `modes`: number of the jam mode at each point, default: from the folds between the points
     - `resonances` (nd,) rad/s, default: computed here
 
-    **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or panel.
+    **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or panel, and for `most` below
+    all rotor speeds of the branch.
     """
     from jaxvib.draw.charts import branch_diagram  # slow import
 

@@ -93,8 +93,8 @@ class SynchronousOrbit(PathsOfPoints, Result):
     """Exact synchronous motion: th_k = sigma_k (theta + alpha_k + psi_k(theta)), theta = Omega t, psi_k of mean 0.
 
     th_k is the angle of the rotor of exciter k, or of its loads if its rotor is balanced; sigma_k is the direction of the
-    exciter. Returned by `synchronous_orbit`. Values are NaN if the status is `not_converged` or `different_speeds`. Signals
-    are Re sum_k c_k exp(i k theta).
+    exciter. Returned by `synchronous_orbit`. Values except `residual` are NaN if the status is `not_converged` or
+    `different_speeds`. Signals are Re sum_k c_k exp(i k theta).
 
     **Attributes**
 
