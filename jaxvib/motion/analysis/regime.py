@@ -181,8 +181,8 @@ def regime(scene: Scene, segment: Trajectory) -> Regime:
     - `scene` of the run
     - `segment`: the part of the run, a `Trajectory` such as `run.window`; typical: 20 or more turns
 
-    **Returns** `Regime`; `jit` and `vmap` are supported. If the motion is not steady, `name` is "unsettled" and no error is
-    raised. **Raises** `InputError` for a scene that is not plain, see `Scene.is_plain`.
+    **Returns** `Regime`; `jit` and `vmap` are supported. If the motion is not steady, or unknown because the run failed, `name`
+    is "unsettled" and no error is raised. **Raises** `InputError` for a scene that is not plain, see `Scene.is_plain`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -211,7 +211,9 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
     reference = jnp.maximum(jnp.abs(rotor), jnp.finfo(rotor.dtype).tiny)
     change = jnp.max(jnp.abs(late - early)[:-1]) / reference
     is_steady = change < _MAX_EQUAL_SPEED_DIFFERENCE
-    swings = jnp.max(phi, axis=0) - jnp.min(phi, axis=0) < 2.0 * jnp.pi
+    # XLA's maximum of NaN is -inf on CPUs.
+    is_known = jnp.isfinite(speed)
+    swings = is_known & (jnp.max(phi, axis=0) - jnp.min(phi, axis=0) < 2.0 * jnp.pi)
     lags = [speeds[:-1] - speeds[-1] for speeds in (early, late)]
     is_behind = jnp.abs(phi[-1] - phi[0] - (turn[-1] - turn[0])) > _LOCKED_PHASE_CHANGE
     is_behind = is_behind & (jnp.abs(lags[1] - lags[0]) < _STEADY_SLIP * jnp.abs(lags[1] + lags[0]) / 2.0)
@@ -242,7 +244,7 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
         pattern=phase_pattern(jnp.where(all_with_rotor, to_rotor, to_first)),
         load_speed=speed,
         rotor_speed=rotor,
-        ripple=jnp.max(jnp.max(rate, axis=0) - jnp.min(rate, axis=0)) / 2.0,
+        ripple=jnp.where(jnp.all(is_known), jnp.max(jnp.max(rate, axis=0) - jnp.min(rate, axis=0)) / 2.0, jnp.nan),
         phase=jnp.where(all_with_rotor, to_rotor, to_first),
         unbalance=unbalance,
         resonance=nearest + 1,

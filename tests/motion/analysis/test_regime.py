@@ -251,6 +251,16 @@ def test_modes_of_equal_frequencies_are_those_of_jam_modes():
     assert [int(_mode(natural, modes[k - 1], jnp.asarray(320.0))) for k in (1, 2, 5)] == [1, 2, 5]
 
 
+def test_a_motion_that_does_not_exist_has_no_regime():
+    """The states of a run without a start are NaN, those after max_steps infinite."""
+    loads = jv.balls(count=2, mass=0.3, radius=0.09, drag=300.0)
+    scene = jv.Scene(jv.one_mass(mass=60.0, stiffness=2.5e5, damping=120.0), loads, jv.ConstantSpeed(64.65))
+    for status, arguments in ("no_start", dict(start="jam", mode=1)), ("max_steps_reached", dict(max_steps=100)):
+        run = jv.simulate(scene, 10.0, throw=False, estimate=False, **arguments)
+        assert run.status_name == status and np.all(np.isnan(run.regime.load_speed))
+        assert run.regime.label == "unsettled" and np.isnan(run.regime.ripple)
+
+
 def test_regime_of_several_exciters_is_refused():
     scene, segment = made([0.0] * 4, 460.0)
     both = jv.Scene(scene.machine, exciters=[scene.exciters[0]] * 2)
