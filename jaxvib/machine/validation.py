@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import weakref
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Any
 
 import jax
@@ -239,6 +239,41 @@ def first_moment(exciter: Exciter) -> Array | None:
     own = jnp.zeros_like(exciter.drive.speed) if exciter.unbalance is None else exciter.unbalance
     vectors = [term.at(jnp.zeros_like(term.phase)).static for term in terms]
     return jnp.hypot(own + sum(x for x, _ in vectors), sum(y for _, y in vectors))
+
+
+def weight_accelerations(scene: Scene) -> dict[int, float]:
+    """Return S g / I, rad/s^2: the largest angular acceleration of a rotor of inertia I by the weight of its unbalance S.
+
+    The keys are the numbers, from 0, of the exciters with a motor and an unbalance. At the speed w, the weight changes the
+    speed of the rotor within a turn by the share S g / (I w^2).
+    """
+    g = float(np.hypot.reduce([float(each) for each in total_gravity(scene.all_effects).values()] or [0.0]))
+    found = {}
+    for k, exciter in enumerate(scene.exciters):
+        moment, drive = first_moment(exciter), exciter.drive
+        if moment is not None and isinstance(drive, Motor):
+            found[k] = g * float(moment / drive.inertia)
+    return found
+
+
+_MIN_SHOWN_WEIGHT = 0.05
+"""Smallest share by which the weight changes a speed within a turn for which there is a note. It is 0.005 to 0.03 at the
+working speeds of screens, and up to 0.4 at their lowest resonances."""
+
+
+def weight_notes(scene: Scene, slowest: Mapping[int, float]) -> list[str]:
+    """Return a sentence about the exciter on whose speed the weight of its unbalance acts most, if this effect is large.
+
+    `slowest`: lowest speed, rad/s, of stable averaged motions, for each exciter by its number from 0.
+    """
+    shares = {k: each / slowest[k] ** 2 for k, each in weight_accelerations(scene).items() if k in slowest}
+    k = max(shares, key=lambda k: shares[k], default=None)
+    if k is None or shares[k] < _MIN_SHOWN_WEIGHT:
+        return []
+    share = f"{100.0 * shares[k]:.0f} %"
+    effect = f"the weight of an unbalance, which averaging omits, changes the speed by {share} within a turn"
+    remedy = "and can make the motion unstable; synchronous_orbit and simulate include it"
+    return [f"at {speed_text(slowest[k], 6)} {effect} {remedy}"]
 
 
 def start_notes(scene: Scene, exciters: Iterable[int] | None = None) -> list[str]:

@@ -13,7 +13,7 @@ from scenes import BALLS, machines, scene
 import jaxvib as jv
 from jaxvib.machine import validation as module
 from jaxvib.machine.files import SCREENS
-from jaxvib.machine.validation import implausible_numbers, lifting_torques, start_notes, validate_scene
+from jaxvib.machine.validation import implausible_numbers, lifting_torques, start_notes, validate_scene, weight_notes
 
 
 def changed(where, value, s=None):
@@ -223,6 +223,20 @@ def test_unbalance_of_a_tenth_of_a_metre_is_noted():
 def test_units_of_screens_that_were_confused_are_noted(old, new, says):
     (note,) = implausible_numbers(jv.scene_from_toml(SCREENS["linear_screen"].replace(old, new)))
     assert re.match(says, note)
+
+
+def test_largest_effect_of_the_weight_on_a_speed_has_a_note():
+    """S g / (I w^2) is 0.245 for the first exciter, 0.49 for the second one, and not defined for an ideal drive."""
+    machine, motor = jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), jv.DCMotor(100.0, stall_torque=25.0, inertia=0.4)
+    drives = (motor, motor, jv.ConstantSpeed(10.0))
+    exciters = [jv.Exciter(drive=drive, unbalance=s) for drive, s in zip(drives, (1.0, 2.0, 9.0), strict=True)]
+    scene = jv.Scene(machine, exciters=exciters, effects=jv.Gravity(9.8))
+    (note,) = weight_notes(scene, dict.fromkeys(range(3), 10.0))
+    assert note.startswith("at 95.493 rpm the weight of an unbalance, which averaging omits, changes the speed by 49 %")
+    assert "changes the speed by 24 % within" in weight_notes(scene, {0: 10.0, 2: 10.0})[0]
+    assert "at 190.986 rpm" in weight_notes(scene, {0: 20.0, 1: 30.0})[0]  # shares 0.061 and 0.054
+    assert weight_notes(scene, {0: 23.0, 1: 32.0}) == weight_notes(scene, {}) == weight_notes(scene, {2: 1.0}) == []
+    assert weight_notes(jv.Scene(machine, exciters=exciters), {0: 10.0}) == []
 
 
 def test_equal_motors_that_cannot_start_have_one_note():

@@ -36,8 +36,7 @@ from jaxvib.errors import InputError
 def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], csv: Path | None, output: Output) -> None:
     """List the synchronous regimes of SCENE: motions in which all exciters turn at one speed; --out adds a figure of
     phases."""
-    from jaxvib.machine.validation import off_notes, start_notes  # slow imports, which --help does not need
-    from jaxvib.results.status import status_name
+    from jaxvib.results.status import status_name  # slow import, which --help does not need
 
     loaded = loaded_scene(scene, without)
     require_tolerances(loaded, tolerances)
@@ -85,7 +84,7 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
             "margin: factor by which the differences of the motors' torques can grow; inf for",
             "equal motors",
             *([] if status_name(result.search) == "done" else [jv.RegimeSearchStatus[result.search]]),
-            *(textwrap.fill(note, 80) for note in (*off_notes(loaded), *start_notes(loaded))),
+            *(textwrap.fill(note, 80) for note in result.notes()),
         ]
         blocks = (
             indented(f"at {speed_text(regime.speed)}, stable, {_place_among(float(regime.speed), frequencies)}:", figures)

@@ -16,10 +16,9 @@ from jaxvib.equations.model import assemble
 from jaxvib.errors import InputError
 from jaxvib.machine.drives.controlled import SwitchedOff
 from jaxvib.machine.drives.drive import Motor, MotorWrapper
-from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.machine.validation import first_moment, lifting_torques, start_notes, validate_scene
+from jaxvib.machine.validation import lifting_torques, start_notes, validate_scene, weight_accelerations
 from jaxvib.motion.analysis.ensemble_regimes import catching_resonance
 from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.motion.envelope.result import Envelope, plot_histories
@@ -96,11 +95,9 @@ class MotorRunUp(Result):
         It is the largest S g / (I w^2) of all motors, with the unbalance S, the inertia I and the lowest natural frequency w; 0
         without gravity.
         """
-        g = np.hypot.reduce([float(each) for each in total_gravity(self.scene.all_effects).values()] or [0.0])
-        turned = [each for each in self.scene.exciters if isinstance(each.drive, Motor)]
-        ratios = [float(moment / each.drive.inertia) for each in turned if (moment := first_moment(each)) is not None]  # pyright: ignore[reportAttributeAccessIssue]
         resonances = np.asarray(self.resonances)
-        return float(max(ratios, default=0.0) * g / np.min(resonances[resonances > 0.0], initial=np.inf) ** 2)
+        lowest = np.min(resonances[resonances > 0.0], initial=np.inf)
+        return float(max(weight_accelerations(self.scene).values(), default=0.0) / lowest**2)
 
     def summary(self) -> str:
         """Return the outcome as text: a line for each exciter, the peaks and the weakest motors."""

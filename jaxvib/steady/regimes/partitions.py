@@ -30,7 +30,7 @@ from jaxvib.equations.torque_balance import assemble_for_search, assemble_torque
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.machine.validation import validate_scene
+from jaxvib.machine.validation import validate_scene, weight_notes
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -106,7 +106,8 @@ class RegimePartitions(Result):
         return regimes
 
     def summary(self) -> str:
-        """Return a line of text for each motion: the masses of each group, counted from 1, and its speed."""
+        """Return a line of text for each motion: the masses of each group, counted from 1, and its speed. A note follows if the
+        weight of the unbalances can change the stability of a motion."""
         lines = []
         for group, speed, stable, growth, interaction in zip(
             self.group, self.speed, self.stable, self.growth, self.interaction, strict=True
@@ -117,7 +118,9 @@ class RegimePartitions(Result):
                 named.append(f"{', '.join(map(str, masses + 1))}: {speed_text(speed[masses[0]], 6)}")
             judged = f"{'stable' if stable else 'unstable'} ({growth:.3g} 1/s), interaction {interaction:.2g}"
             lines.append(f"{'; '.join(named)}; {judged}")
-        return "\n".join(lines) or RegimeSearchStatus[RegimeSearchStatus.none]
+        slowest = np.min(np.asarray(self.speed)[np.asarray(self.stable)], axis=0, initial=np.inf)
+        notes = weight_notes(self.scene, dict(zip(mass_owners(self.scene).tolist(), slowest.tolist(), strict=True)))
+        return "\n".join([*lines, *notes]) or RegimeSearchStatus[RegimeSearchStatus.none]
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:

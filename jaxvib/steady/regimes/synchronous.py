@@ -34,7 +34,7 @@ from jaxvib.equations.torque_balance import (
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.machine.validation import off_notes, start_notes, validate_scene
+from jaxvib.machine.validation import off_notes, start_notes, validate_scene, weight_notes
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -224,13 +224,18 @@ class SynchronousRegimes(AbstractSynchronousRegime):
         fields = {name: getattr(self, name) for name in SynchronousRegime.__dataclass_fields__ if name != "scene"}
         return SynchronousRegime(**jax.tree.map(lambda leaf: leaf[index], fields), scene=self.scene)
 
+    def notes(self) -> list[str]:
+        """Return sentences about motors that are switched off or cannot start, and about the weight of the unbalances."""
+        owners = np.unique(mass_owners(self.scene)[np.ravel(self.masses)]).tolist() or range(len(self.scene.exciters))
+        stable = np.asarray(self.speed)[np.asarray(self.stable)]
+        slowest = dict.fromkeys(owners, float(np.min(stable))) if stable.size else {}
+        return [*off_notes(self.scene), *start_notes(self.scene, owners), *weight_notes(self.scene, slowest)]
+
     def summary(self) -> str:
-        """Return a line of text for each regime, and for motors that are switched off or cannot start from rest."""
+        """Return a line of text for each regime, and the `notes`."""
         lines = [self.select(k).summary() for k in range(self.speed.shape[0])]
         complete = lines and status_name(self.search) == "done"
-        owners = np.unique(mass_owners(self.scene)[np.ravel(self.masses)]).tolist()
-        notes = [*off_notes(self.scene), *start_notes(self.scene, owners or None)]
-        return "\n".join([*lines, *([] if complete else [RegimeSearchStatus[self.search]]), *notes])
+        return "\n".join([*lines, *([] if complete else [RegimeSearchStatus[self.search]]), *self.notes()])
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
@@ -321,6 +326,9 @@ def synchronous_regimes(
     - The relative error of the torques is of the order S^2/(2 M I), where M is the mass of the machine and I the inertia of a
       rotor. Close to the parameters at which two regimes exchange their stability, the error of the phases is some tenths of a
       radian
+    - Gravity is omitted. The weight of an unbalance S changes the speed of its rotor within a turn by the share
+      S g/(I Omega^2). If this share is large, as in regimes caught at a low resonance, the weight can make a stable regime
+      unstable
     - In this approximation exciters with different speeds do not act on each other. `masses` selects a group that turns at one
       speed; `regime_partitions` returns the motions of all divisions into such groups
     - With more than 6 masses the number of regimes, most of them unstable, is too large for a complete list. The starts then

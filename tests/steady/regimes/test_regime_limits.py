@@ -165,3 +165,21 @@ def test_margin_is_infinite_for_equal_drives():
     scene = jv.Scene(jv.plane_body(mass=300.0, inertia=75.0, supports=springs), exciters=exciters)
     regime = jv.synchronous_regimes(scene, near=(99.0, jnp.array([0.0, 2.5])))
     assert regime.status_name == "degenerate" and float(regime.margin) == np.inf
+
+
+def test_weight_can_make_a_caught_regime_unstable():
+    """Phases that swing with about half the speed grow by S g / (4 I w), w: frequency of the swing, less their decay."""
+    caught = jv.DCMotor(100.0, stall_torque=20.0, inertia=0.5)
+    springs = [jv.support(at=(x, -0.2), stiffness=(3e4, 3e4), damping=(150.0, 150.0)) for x in (-0.6, 0.6)]
+    machine = jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
+    pair = scene_of([(-0.3, 0.4), (0.3, 0.4)], (1, -1), [caught] * 2, machine, unbalance=2.0, effects=jv.Gravity(0.0))
+    heavy = eqx.tree_at(lambda s: s.effects[0].g, pair, jnp.asarray(9.81))
+    regime, growth, swing = jv.synchronous_regimes(pair, near=(13.7, jnp.array([0.0, np.pi]))), [], []
+    for scene in (pair, heavy):
+        orbit = jv.synchronous_orbit(scene, regime, points=33)
+        rates = np.log(np.asarray(orbit.multipliers)) * orbit.speed / (2.0 * np.pi)
+        fastest = rates[np.argmax(np.where(np.abs(rates.imag) > 0.4 * orbit.speed, rates.real, -np.inf))]
+        growth, swing = [*growth, fastest.real], [*swing, abs(fastest.imag)]
+        assert bool(orbit.stable) == (scene is pair)
+    np.testing.assert_allclose(growth[0], regime.growth, rtol=0.05)
+    np.testing.assert_allclose(growth[1] - growth[0], 2.0 * 9.81 / (4.0 * 0.5 * swing[1]), rtol=0.05)

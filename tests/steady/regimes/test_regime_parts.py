@@ -473,6 +473,8 @@ def test_summary_and_plot_of_regimes(two):
     assert [float(several.select(k).speed) for k in range(3)] == [float(regime.speed) - k for k in range(3)]
     assert len(several.summary().splitlines()) == 3 and several.summary().startswith(regime.summary())
     assert as_list(regime, 0).summary() == STATUSES[STATUSES.none]
+    heavy = eqx.tree_at(lambda r: r.scene, several, jv.Scene(TWO.machine, exciters=TWO.exciters, effects=jv.Gravity(9.81)))
+    assert heavy.summary().startswith(f"{several.summary()}\nat 280.901 rpm the weight") and "by 9 %" in heavy.summary()
     assert [text.get_text() for text in as_list(regime, 0).plot().axes[0].texts] == ["no synchronous regime"]
     for index in (3, -1):
         with pytest.raises(jv.InputError, match=rf"^index is {index}; there are 3 regimes, counted from 0"):
@@ -512,6 +514,8 @@ def test_motions_in_groups_are_listed_and_selected(monkeypatch):
         "1, 2: 90 rpm; 3: 60 rpm; stable (-2 1/s), interaction 0.12",
         "1, 3: 90 rpm; 2: 30 rpm; unstable (0.5 1/s), interaction 0.034",
     ]
+    scene = jv.Scene(THREE.machine, exciters=THREE.exciters, effects=jv.Gravity(9.81))
+    assert "\nat 60 rpm the weight of an unbalance" in eqx.tree_at(lambda r: r.scene, found, scene).summary()
     monkeypatch.setattr(partitions, "synchronous_regimes", lambda *args, **given: asked.append((*args, given)) or len(asked))
     assert found.select(1) == [1, 2] and all(scene is THREE for scene, _ in asked)
     assert [given["masses"] for _, given in asked] == [[0, 2], [1]]
