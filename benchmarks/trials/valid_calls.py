@@ -139,7 +139,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     form = dict(form="antiphase", **numbers, eps=1e-3, beta=1.0, speed=3.0, count=1)
     scales = dict(mass_scale=1.0, frequency_scale=1.0, radius=1.0, kappa=1.0)
     yield call("Dimensionless", **form, **scales)
-    one = dict(omega=1.0, amplitude=1e-3, force=1.0)
+    one = dict(omega=1.0, amplitude=(1e-3, 1e-3), force=1.0)
     yield call(
         "Dimensionless.convert_results",
         lambda: jv.Dimensionless(**form).convert_results,

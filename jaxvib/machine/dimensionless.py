@@ -195,7 +195,7 @@ class Dimensionless(Readable):
         **Arguments**
 
         - `omega`, rad/s, any shape
-        - `amplitude`, m, real or complex; its last axis has one entry for each platform
+        - `amplitude`, m, real or complex; its last axis has one entry for each platform (a single number for one platform)
         - `force`, N, any shape
 
         NaN in an array (modes that do not exist) stays NaN.
@@ -211,10 +211,8 @@ class Dimensionless(Readable):
         """
         units = {"omega": self.frequency_scale, "amplitude": self.length_units, "force": self.force_unit}
         given = {"omega": omega, "amplitude": amplitude, "force": force}
-        if amplitude is not None and jnp.shape(amplitude)[-1:] not in ((), (1,), jnp.shape(self.length_units)):
-            shape = jnp.shape(amplitude)
-            raise InputError(
-                "amplitude",
-                f"has shape {shape}; its last axis must have {self.length_units.shape[0]} entries, one for each platform",
-            )
+        platforms = self.length_units.shape[0]
+        if amplitude is not None and (jnp.shape(amplitude) or (1,))[-1] != platforms:
+            problem = f"has shape {jnp.shape(amplitude)}; its last axis must have {platforms} entries, one for each platform"
+            raise InputError("amplitude", problem)
         return {name: value / units[name] for name, value in given.items() if value is not None}

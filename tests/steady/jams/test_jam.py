@@ -81,6 +81,12 @@ def test_both_scalings_are_the_same_machine():
     np.testing.assert_allclose(first["force"], 3 * second["force"], rtol=1e-14)
 
 
+@pytest.mark.parametrize("amplitude", [1e-3, np.ones(1), np.ones((2, 3))])
+def test_an_amplitude_of_other_platforms_is_refused(amplitude):
+    with pytest.raises(jv.InputError, match="its last axis must have 2 entries, one for each platform"):
+        published().convert_results(amplitude=amplitude)
+
+
 def every_scene():
     six = jv.network(
         mass=[5.0, 6.0, 7.0, 8.0, 9.0, 4.0],
