@@ -78,6 +78,8 @@ def test_quantities_agree_with_an_independent_calculation(screen):
     np.testing.assert_allclose(foundation_force()(screen), total, rtol=1e-6)
     np.testing.assert_allclose(force_per_throw(**at)(screen), total / size.max(), rtol=1e-6)
     np.testing.assert_allclose(throw_number(**at)(screen), w**2 * abs(u[0][1]) / 9.80665, rtol=1e-6)
+    upward = np.abs(u[0] @ [-np.sin(-0.1), np.cos(-0.1)])  # normal to a deck that falls along x by 0.1 rad
+    np.testing.assert_allclose(throw_number(**at, slope=-0.1)(screen), w**2 * upward / (9.80665 * np.cos(0.1)), rtol=1e-6)
     np.testing.assert_allclose(
         conveying_speed(**at, slope="-5 deg")(screen), jv.conveying_speed(u[0], w, slope="-5 deg"), rtol=1e-6
     )
