@@ -13,6 +13,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
+import jaxvib.cli
 from jaxvib.cli.modes import _left_out
 from jaxvib.cli.output import Output, _wrapped
 from jaxvib.machine.files import SCREENS, TEMPLATES
@@ -503,7 +504,6 @@ def test_an_interrupt_ends_a_command_at_once(moment, options):
 
 INTERRUPTED = """
 import signal, sys, threading, time
-import jaxvib.cli.app
 from jaxvib_command import main
 
 def interrupted(arguments):
@@ -533,7 +533,6 @@ def test_interrupts_end_a_search_whose_threads_compile():
 LOST = """
 import signal, sys, time, weakref
 from importlib.machinery import ExtensionFileLoader
-import jaxvib.cli.app
 from jaxvib_command import main
 
 def callback():
@@ -562,6 +561,20 @@ def test_an_interrupt_of_a_search_is_repeated_if_lost(moment):
     script = LOST.replace("MOMENT", moment)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600.0)
     assert (done.returncode, done.stdout.strip(), done.stderr) == (1, "goes on", "\njaxvib: interrupted\n")
+
+
+@pytest.mark.parametrize(("words", "raises"), [([], False), (["simulate", "optimize"], False), (["sweep", "-h"], True)])
+def test_interrupts_are_exceptions_in_three_commands_only(words, raises, monkeypatch):
+    seen, nothing = [], lambda *_: None
+    monkeypatch.setattr(sys, "argv", ["jaxvib", *words])
+    monkeypatch.setattr("jaxvib.cli._raise_interrupts", seen.append)
+    monkeypatch.setattr("jaxvib.cli.prepare", nothing)
+    monkeypatch.setattr("jaxvib.cli.gc", SimpleNamespace(disable=nothing, enable=nothing, freeze=nothing))
+    monkeypatch.setattr("jaxvib.cli.signal", SimpleNamespace(signal=nothing, SIGINT=2, SIG_IGN=1))
+    monkeypatch.setattr("jaxvib.cli.app.run", lambda given: len(given))
+    with pytest.raises(SystemExit) as ended:
+        jaxvib.cli.main()
+    assert ended.value.code == len(words) and len(seen) == raises
 
 
 def test_sentences_on_a_terminal_break_between_words(monkeypatch):

@@ -1,6 +1,7 @@
 """Commands about motion and stability, listings of what scene files hold, curves as CSV."""
 
 import csv
+import dataclasses
 import itertools
 import json
 import subprocess
@@ -52,6 +53,16 @@ def test_a_run_as_csv_is_its_trajectory(typed, tmp_path, monkeypatch):
     assert code == 2 and "--csv is 'run.csv', which cannot be created" in err
     with pytest.raises(jv.InputError, match=r"axis is 'point'; the axes of Run are: .*time"):
         jv.write_csv(kept, "point", tmp_path / "none.csv")
+
+
+def test_largest_displacements_need_a_trajectory(typed, monkeypatch):
+    kept, documents = small_run(), []
+    for saved in (kept, dataclasses.replace(kept, trajectory=None)):
+        monkeypatch.setattr("jaxvib.simulate", lambda *_, saved=saved, **__: saved)
+        documents.append(json.loads(typed("simulate", "machine.toml", "--until", "0.5s", "--json")[1]))
+    whole, window = documents
+    np.testing.assert_allclose(whole["largest_displacement"], np.max(np.abs(kept.trajectory.state.displacement), axis=0))
+    assert "largest_displacement" not in window and window["amplitude"] == whole["amplitude"]
 
 
 def test_an_envelope_as_csv_is_its_trajectory(typed, tmp_path):

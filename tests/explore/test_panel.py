@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from jaxvib.explore.chart import _jams_at_working_speed
 from jaxvib.explore.panel import TALL, WIDE, Panel, dot, legend
 
 PANEL = Panel(1.0, "force, N", (0.0, 10.0), (0.0, 100.0))
@@ -58,3 +59,19 @@ def test_a_legend_has_two_entries_in_a_column():
     assert places == {name: pytest.approx(place) for name, place in expected.items()}
     np.testing.assert_allclose(parts[0].points, [[0.05, TALL + 0.95], [0.45, TALL + 0.95]])
     np.testing.assert_allclose(np.mean(parts[1].points[:-1], axis=0), [0.25, TALL + 0.68])
+
+
+def test_logarithmic_panels_omit_points_without_logarithm():
+    points = (
+        Panel(1.0, "", (0.0, 10.0), (1.0, 100.0), log=True).line([0.0, 2.0, 5.0, 10.0], [0.0, -1.0, 10.0, 100.0], {}).points
+    )
+    np.testing.assert_allclose(points[np.isfinite(points[:, 0])], [[1.0 + 0.5 * WIDE, 0.5 * TALL], [1.0 + WIDE, TALL]])
+
+
+def test_number_of_a_jam_is_beside_its_highest_dot():
+    """Two coordinates at the crossing halfway between the points 0 and 1 of the branch: 30 N and 70 N."""
+    curves = [np.array([20.0, 40.0]), np.array([60.0, 80.0])]
+    dots, (text,) = _jams_at_working_speed(PANEL, curves, [(0, 0.5, "2", True)], 5.0)
+    middles = [np.mean([np.min(each.points, axis=0), np.max(each.points, axis=0)], axis=0) for each in dots]
+    np.testing.assert_allclose(middles, [[1.0 + 0.5 * WIDE, 0.3 * TALL], [1.0 + 0.5 * WIDE, 0.7 * TALL]], atol=1e-3)
+    assert text.text == "2" and text.y == pytest.approx(0.7 * TALL)

@@ -4,6 +4,7 @@ import math
 import re
 
 import numpy as np
+import pytest
 
 import jaxvib as jv
 from jaxvib.machine.files import SCREENS
@@ -100,3 +101,11 @@ def test_frequencies_of_supplies_are_shown_in_hertz():
     scene = jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), exciters=[jv.Exciter(drive=motor, unbalance=0.4)])
     values = cells(parameter_tables(scene))
     assert values[values.index("Hz") - 1] == "50" and values[values.index("rpm") - 1] == "930"
+
+
+@pytest.mark.parametrize(("unit", "shown", "factor"), [("m", "mm", 1e3), ("rad", "deg", 180.0 / np.pi)])
+def test_values_along_one_coordinate_have_its_unit(unit, shown, factor):
+    units = {"omega": "rad/s", "amplitude": "m or rad"}
+    scaled, named = in_display_units({"omega": 10.0, "amplitude": [0.01]}, units, (unit,))
+    assert named == {"omega": "rpm", "amplitude": shown}
+    np.testing.assert_allclose(scaled["amplitude"], [0.01 * factor], rtol=1e-12)
