@@ -395,3 +395,18 @@ def test_kilograms_as_a_force_are_refused_with_kgf(text, unit, force, value):
     assert float(number(force, unit, "field")) == pytest.approx(value, rel=1e-12)
     with pytest.raises(jv.InputError, match="field is '3 kg', which is not in N/m"):
         number("3 kg", "N/m", "field")
+
+
+def test_bounds_of_numpy_values_are_decided_while_tracing():
+    @jax.jit
+    def signed(x):
+        return x if np.all(Bounds(low=0.0).allow(np.array([0.0, 2.0]))) else -x
+
+    assert float(signed(3.0)) == 3.0
+
+
+def test_a_single_number_is_repeated_unless_shared():
+    assert numbers("44 N/mm", "N/m", "stiffness", 3).tolist() == [4.4e4] * 3
+    assert jax.jit(lambda x: numbers(x, "N/m", "stiffness", 3))(2.0).tolist() == [2.0] * 3
+    for scalar in (numbers(2.0, "N/m", "stiffness", 3, shared=True), numbers(2.0, "N/m", "stiffness", None)):
+        assert scalar.shape == () and float(scalar) == 2.0

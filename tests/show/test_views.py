@@ -140,6 +140,14 @@ def test_the_rim_of_a_rotor_encloses_its_loads(ball_radius, size):
     assert wheel.rim == pytest.approx(0.35 + max(1.15 * size, 0.1))
 
 
+@pytest.mark.parametrize("direction", [1, -1])
+def test_arrows_of_rotors_lie_outside_their_rims(direction):
+    wheel = Wheel(jv.Exciter(drive=jv.ConstantSpeed(100.0), unbalance=0.1, direction=direction), 0.35)
+    arc, head = wheel.turning_parts((1.0, 2.0))
+    np.testing.assert_allclose(np.hypot(*(arc.points - (1.0, 2.0)).T), wheel.rim + 0.13)
+    assert np.all(np.hypot(*(head.points - (1.0, 2.0)).T) > wheel.rim)
+
+
 def test_a_rotor_without_loads_has_a_radius_of_100_mm():
     wheel = Wheel(jv.Exciter(drive=jv.ConstantSpeed(100.0), unbalance=0.1), 0.35)
     assert (wheel.scale, wheel.size, wheel.rim) == pytest.approx((3.5, 0.06, 0.45))
