@@ -28,12 +28,14 @@ def unbalance_and_drag(s):
 
 
 def complex_response(s, w):
-    """Complex amplitudes in NumPy, of platforms and of the foundation force."""
+    """Complex amplitudes in NumPy, of platforms and of the foundation force; `w`: a speed or an array of speeds."""
     mass, damping, stiffness, port = matrices(s)
-    force = np.zeros(len(mass), complex)
-    force[port] = -1j * unbalance_and_drag(s)[0] * w**2
-    y = np.linalg.solve(stiffness - w**2 * mass + 1j * w * damping, force)
-    return y, np.sum((np.asarray(s.machine.stiffness) + 1j * w * np.asarray(s.machine.damping)) * y)
+    rotation = np.asarray(w)[..., None]
+    force = np.zeros((*np.shape(w), len(mass)), complex)
+    force[..., port] = -1j * unbalance_and_drag(s)[0] * np.asarray(w) ** 2
+    dynamic = stiffness - rotation[..., None] ** 2 * mass + 1j * rotation[..., None] * damping
+    y = np.linalg.solve(dynamic, force[..., None])[..., 0]
+    return y, np.sum((np.asarray(s.machine.stiffness) + 1j * rotation * np.asarray(s.machine.damping)) * y, axis=-1)
 
 
 def determinant(matrix):
