@@ -3,9 +3,12 @@ minima.
 
 PYTHONPATH=tests/helpers python -m repeated_records 400
 PYTHONPATH=tests/helpers python -m repeated_records 400 "white noise"
+PYTHONPATH=tests/helpers python -m repeated_records 400 "white noise" --store out/white_noise.jsonl
+
+With `--store` the fits of one case are kept in a file. A computation that was interrupted continues after the last of them.
 """
 
-import sys
+import argparse
 import time
 
 import jax
@@ -14,14 +17,14 @@ import numpy as np
 from repeated_records.fits import CASES, JAMMED_CASES, SUPPORT_CASES, repeated
 
 
-def main(count: int, names: list[str]) -> None:
+def main(count: int, names: list[str], store: str | None) -> None:
     print(
         "| case | records | intervals that contain the true value |  largest standard deviation / bound | wrong minima | "
         "of these with status found |"
     )
     for name in names:
         begin = time.process_time()
-        found = repeated(count, **(CASES | JAMMED_CASES | SUPPORT_CASES)[name])
+        found = repeated(count, store=store, **(CASES | JAMMED_CASES | SUPPORT_CASES)[name])
         print(f"| {name} | {found.row} |", flush=True)
         counts = zip(*np.unique(found.statuses, return_counts=True), strict=True)
         print(f"  {time.process_time() - begin:.0f} s of CPU time; {', '.join(f'{n} {name}' for name, n in counts)}")
@@ -33,4 +36,11 @@ def main(count: int, names: list[str]) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main(int(sys.argv[1]), sys.argv[2:] or [*CASES, *JAMMED_CASES, *SUPPORT_CASES])
+    parser = argparse.ArgumentParser(prog="repeated_records")
+    parser.add_argument("count", type=int)
+    parser.add_argument("names", nargs="*", default=[*CASES, *JAMMED_CASES, *SUPPORT_CASES])
+    parser.add_argument("--store", help="file of the fits of one case")
+    given = parser.parse_args()
+    if given.store and len(given.names) != 1:
+        parser.error("--store needs the name of one case")
+    main(given.count, given.names, given.store)

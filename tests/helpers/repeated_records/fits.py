@@ -6,6 +6,8 @@ One run-up by SciPy serves all records of a case; noise, gains and first values 
 
 import dataclasses
 import functools
+import json
+import pathlib
 
 import numpy as np
 from run_ups_by_scipy import TRUTH, accelerations, bound, ending_ramp, motor_run_up, ramp, record, scene_of
@@ -110,11 +112,11 @@ def run_up(motor, ending=False):
     return motor_run_up(TIMES, TRUTH) if motor else (accelerations(TIMES, [TRUTH], turning=turning)[0], turning)
 
 
-def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None, **options):
+def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None, store=None, **options):
     """Return the fits of `count` records from stiffnesses 10 % off and dampings 50 % off, in random directions, see `FACTORS`.
 
     In records of jammed balls, the mass and the drag of the balls are 10 % and 20 % off, the dampings 30 %, and the stiffnesses
-    5 %.
+    5 %. Fits that the file `store` contains are not repeated, and each new fit is added to it.
     """
     clean, turning = (jammed.clean(), None) if balls else run_up(motor, ending)
     if "full_scale" in options:
@@ -124,7 +126,8 @@ def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None
     if support:
         truth, scene = supports.truth(support), supports.scene_of
         names = [*NAMES, *(name for name in truth if name.startswith("effects") and "width" not in name)]
-    away, relative, statuses, runs, order = [], [], [], [], ()
+    fits, runs, path = [], [], pathlib.Path(store) if store else None
+    stored = list(map(json.loads, path.read_text().splitlines())) if path and path.exists() else []
     for k in range(count):
         rng = np.random.default_rng([seed, k])
         if balls:
@@ -137,14 +140,20 @@ def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None
             name: value * next((f for word, f in factor.items() if word in name), 1.0) ** rng.choice([-1.0, 1.0])
             for name, value in truth.items()
         }
-        fit = jv.identify(scene(first), run, unknown=names, throw=False)
-        found = np.array([[each.value, each.error] for each in fit.estimates]).T
-        true = np.array([truth[name] for name in fit.names])
-        away.append((found[0] - true) / found[1])
-        relative.append(found[0] / true - 1.0)
-        statuses.append(fit.status_name)
         runs.append(run)
-        order = fit.names
+        if k < len(stored):
+            fits.append(stored[k])
+            continue
+        fit = jv.identify(scene(first), run, unknown=names, throw=False)
+        estimates = {name: [each.value, each.error] for name, each in zip(fit.names, fit.estimates, strict=True)}
+        fits.append({"status": fit.status_name, "estimates": estimates})
+        if path:
+            with path.open("a") as file:
+                file.write(json.dumps(fits[-1]) + "\n")
+    order = tuple(fits[0]["estimates"])
+    true, statuses = np.array([truth[name] for name in order]), np.array([each["status"] for each in fits])
+    values, errors = np.moveaxis(np.array([list(each["estimates"].values()) for each in fits]), 2, 0)
+    away, relative = (values - true) / errors, values / true - 1.0
     options.pop("full_scale", None)
     linear = None
     if support:
@@ -153,7 +162,7 @@ def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None
         linear = np.array([supports.linear_errors(estimates, run, clean) for run in runs])
     else:
         least = jammed.bound(order, JAMMED_NOISE, **options) if balls else _bound(turning, **options)
-    return Repeated(np.array(away), np.array(relative), least, np.array(statuses), linear)
+    return Repeated(away, relative, least, statuses, linear)
 
 
 def _bound(turning, color=0.0, gain_error=0.0, outliers=0.0, resolution=0.0, pulses=24, **_):
