@@ -345,6 +345,7 @@ def descend(
     damped_count: int,
     positive: np.ndarray,
     bend: Callable[[Any, np.ndarray], np.ndarray] | None = None,
+    tolerance: float = _CONVERGED**2,
 ) -> tuple[Any, Equations, bool]:
     """Return the minimum near a trial, its equations, and True if it was reached.
 
@@ -357,7 +358,8 @@ def descend(
     **Arguments**: the first trial `best`, with its `cost`; `equations`: returns the equations of a trial; `stepped`: returns
     the trial after a step; `damped_count`: number of the first unknowns, whose steps are damped; `positive`: indices of the
     positive parameters; `bend`: returns for a trial and a step the product J^T (differences after the step - differences
-    + J step), where J are the derivatives of the model at the trial whose `equations` were computed last.
+    + J step), where J are the derivatives of the model at the trial whose `equations` were computed last; `tolerance`: expected
+    reduction of the cost by an undamped step below which the descent ends.
 
     Source of the correction: Transtrum, Sethna 2012, arXiv 1201.5885 (geodesic acceleration).
     """
@@ -368,7 +370,7 @@ def descend(
         if not np.all(np.isfinite(matrix)):
             return best, current, False
         undamped = _undamped(matrix, gradient)
-        if gradient @ undamped < _CONVERGED**2:
+        if gradient @ undamped < tolerance:
             return best, current, True
         if bend is None and gradient @ undamped < _NEAR_REDUCTION * best.cost:
             trial = _follow_valley(stepped(best, undamped), equations, stepped, positive)
@@ -385,7 +387,7 @@ def descend(
                 break
             damping *= 8.0
             if damping > 1e6:
-                return best, current, bool(gradient @ undamped < 100.0 * _CONVERGED**2)
+                return best, current, bool(gradient @ undamped < 100.0 * tolerance)
     return best, equations(best), False
 
 

@@ -3,8 +3,8 @@
 The vibration at the speed of the jam gives the angle of the loads up to a constant. This constant follows, together with the
 motion of the machine and the unbalance of the rotor, from a linear fit in which the loads are an unbalance that turns by that
 angle. The motion is then divided into segments, whose first states are unknowns of a fit with all other unknowns. The gaps
-between the segments are penalized and vanish. Within a segment, errors of the first values change the angles of the loads by
-less than a radian, whereas over the whole record they would change them by many turns.
+between the segments are penalized and become small. Within a segment, errors of the first values change the angles of the loads
+by less than a radian, whereas over the whole record they would change them by many turns.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from jaxvib.identification.fit import (
 )
 from jaxvib.identification.jammed.motion import ShiftedDrive, closed_motion, linearized, weighted_columns
 from jaxvib.identification.problem import Problem, channel_sizes, damped_modes, with_noise
-from jaxvib.identification.records.spline import fit_spline
+from jaxvib.identification.records.spline import fit_curve
 from jaxvib.identification.response import Unknowns, model_states
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
@@ -66,6 +66,10 @@ is one standard deviation."""
 
 _UNEXPLAINED = 0.25
 """Cost per reading, relative to the variance of the readings, above which a motion does not resemble the records."""
+
+_REDUCTION_PER_READING = 1e-3
+"""Expected reduction of the cost per reading, relative to the variance of the readings, below which the segments are fitted
+well enough: the fit of the whole motion converges from there. In a curved valley of the cost it takes fewer steps."""
 
 _ABOVE_JAM, _SAME_STIFFNESS = 1.04, 0.01
 """Ratio of a natural frequency to the speed of the jam near it, and change of the logarithm of the stiffnesses below which
@@ -110,13 +114,18 @@ def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     noise = [[Noise(np.ones(1), size) for size in of_run] for of_run in channel_sizes(problem)]
     weighted_problem, jams = with_noise(problem, noise), [_jam_of(problem, r) for r in range(len(problem.runs))]
     fitted, load_spread = _first_fit(weighted_problem, jams, np.zeros(problem.unknowns.count))
-    is_found = fitted.cost < _UNEXPLAINED * sum(int(np.count_nonzero(mask)) for mask in problem.masks)
+    is_found = fitted.cost < _UNEXPLAINED * _reading_count(problem)
     other = None if is_found else _stiffnesses_of_jam(problem, jams)
     if other is not None:
         again = _first_fit(weighted_problem, jams, other)
         fitted, load_spread = min((fitted, load_spread), again, key=lambda each: each[0].cost)
     angles = tuple(np.column_stack([turned, jam.angle]) for turned, jam in zip(problem.angles, jams, strict=True))
     return problem._replace(angles=angles, linear=fitted.linear, load_spread=load_spread), fitted.x
+
+
+def _reading_count(problem: Problem) -> int:
+    """Return the number of readings."""
+    return sum(int(np.count_nonzero(mask)) for mask in problem.masks)
 
 
 def _stiffnesses_of_jam(problem: Problem, jams: Sequence[_Jam]) -> np.ndarray | None:
@@ -232,9 +241,8 @@ def _jam_of(problem: Problem, r: int) -> _Jam:
         slope = (phase[part][0] - phase[::-1][part][0]) / (time[part][0] - time[::-1][part][0])
         phase[part] = phase[part][0] + slope * (time[part] - time[part][0])
     thinned = slice(None, None, max(1, int(1.0 / (peak * step))))
-    spline, _ = fit_spline(time[thinned], phase[thinned])
-    drive = drive_of_spline(type(spline)(spline.t, spline.c[:, :1], spline.k))  # without its errors
-    return _Jam(drive, spline(time)[:, 0], spline(time, 1)[:, 0])
+    spline = fit_curve(time[thinned], phase[thinned])
+    return _Jam(drive_of_spline(spline), spline(time)[:, 0], spline(time, 1)[:, 0])
 
 
 def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -274,7 +282,8 @@ def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[
 
 
 def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.ndarray]) -> _Trial:
-    """Return the best motion near the first values `x`, `linear` and `starts`, which leave gaps between the segments."""
+    """Return a motion near the best one, from the first values `x`, `linear` and `starts`, which leave gaps between the
+    segments; see `_REDUCTION_PER_READING`."""
     p, size, indices_of_runs = x.size, x.size + linear.size, linear_indices(problem)
     whole = np.concatenate(starts)
     scale = np.maximum(np.sqrt(np.mean(whole**2, axis=0)), 1e-9 * np.max(np.abs(whole)))
@@ -304,5 +313,5 @@ def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.
         new = tuple(each + factor * change for each, change in zip(at.starts, changes, strict=True))
         return trial(at.x + factor * step[:p], at.linear + factor * step[p:size], new)
 
-    first = trial(x, linear, tuple(starts))
-    return descend(first, lambda at: at.equations, stepped, size + 1, positive_indices(problem))[0]
+    first, tolerance = trial(x, linear, tuple(starts)), _REDUCTION_PER_READING * _reading_count(problem)
+    return descend(first, lambda at: at.equations, stepped, size + 1, positive_indices(problem), tolerance=tolerance)[0]

@@ -88,6 +88,15 @@ def fit_spline(
     return BSpline(best.knots, np.concatenate([best.coefficients[:, None], errors], axis=1), DEGREE), scatter
 
 
+def fit_curve(time: np.ndarray, value: np.ndarray) -> Any:
+    """Return a smoothing spline of degree 5 with one column, the values (n,) at ascending times (n,), s, without their errors.
+    The errors of a spline of many knots take most of the time of `fit_spline`."""
+    from scipy.interpolate import BSpline  # slow to import
+
+    best = _best_fit(_data(time, value, np.zeros(time.size, int), None), (), _MAX_INTERVALS)
+    return BSpline(best.knots, best.coefficients[:, None], DEGREE)
+
+
 class _Data(NamedTuple):
     """Values of a fit: `time` (n,), `weights` (n,), weighted values `value` (n,), and `marks` (n,).
 
