@@ -21,7 +21,8 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.branch_plot import branch_summary, plot_branch
 from jaxvib.steady.jams.folds import Folds, grid_near_poles, resampled_grid
-from jaxvib.steady.jams.jam import STABILITY_CRITERION, AbstractJam, Jam, branch_points
+from jaxvib.steady.jams.jam import STABILITY_CRITERION, STABILITY_OF_FREE_LOADS, AbstractJam, Jam, branch_points
+from jaxvib.steady.jams.phases import growth_of_free_loads
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, count, number
 
@@ -62,8 +63,9 @@ class Branches(AbstractJam):
     ) -> Drawn:
         """Plot load speed, amplitudes (zero to peak) and foundation force over the rotor speed.
 
-        Stable jams are solid lines, unstable ones dashed lines. Jams at the scene's rotor speed are marked with the numbers of
-        their modes.
+        Stable jams are solid lines, unstable ones dashed lines. As in the table of `jaxvib modes`, a jam is unstable if its
+        loads leave it when each is free to move separately (not computed for loads with a `ball_radius` or dry friction).
+        Jams at the scene's rotor speed are marked with the numbers of their modes.
 
         **Arguments**
 
@@ -78,9 +80,22 @@ class Branches(AbstractJam):
         folds = self.folds
         existing = np.flatnonzero(np.asarray(folds.exists)).tolist()
         marks = [("fold", float(folds.omega[k]), float(folds.rotor_speed[k])) for k in existing]
+        growth = self._growth_of_free_loads()
+        text = STABILITY_CRITERION if np.all(np.isnan(growth)) else STABILITY_OF_FREE_LOADS
+        stricter = eqx.tree_at(lambda branch: branch.stable, self, np.asarray(self.stable) & ~(growth > 0.0))
         return plot_branch(
-            self, marks, unit, most, STABILITY_CRITERION, show, linear, ax, np.asarray(self.mode), np.asarray(self.resonances)
+            stricter, marks, unit, most, text, show, linear, ax, np.asarray(self.mode), np.asarray(self.resonances)
         )
+
+    def _growth_of_free_loads(self) -> np.ndarray:
+        """Return `growth_of_free_loads` at the points that are stable by slope; NaN at all others."""
+        growth = np.full(np.shape(self.omega), np.nan)
+        points = np.flatnonzero(np.asarray(self.stable))
+        if points.size:
+            # A fixed number of points, so that the program is not compiled for each branch.
+            padded = np.resize(points, growth.shape)
+            growth[padded] = growth_of_free_loads(self.scene, self.omega[padded], self.rotor_speed[padded])
+        return growth
 
 
 @overload

@@ -45,6 +45,9 @@ from jaxvib.units.known import when_known
 STABILITY_CRITERION = "by slope, for light loads that stay together"
 """Name of the stability criterion of jam modes, with its assumption."""
 
+STABILITY_OF_FREE_LOADS = "for light loads, each of which is free to move separately"
+"""Name of the stability criterion of branch diagrams, with its assumption."""
+
 _UNRESOLVED = "no peak of its own on the branch (strong damping, a close resonance, or an exciter that does not move)"
 
 

@@ -24,6 +24,7 @@ from jaxvib.equations.torque_balance import (
     unknowns_of,
 )
 from jaxvib.errors import InputError
+from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
 from jaxvib.machine.loads import CircularLoads
@@ -224,10 +225,11 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     )
 
 
-def growth_of_free_loads(scene: Scene, omega: Array) -> np.ndarray:
+def growth_of_free_loads(scene: Scene, omega: Array, rotor_speed: Array | None = None) -> np.ndarray:
     """Return the growth of small disturbances of jams of coincident loads, (n,) 1/s, with each load free to move separately.
 
-    **Arguments**: `omega` (n,) rad/s of the jams of light coincident loads.
+    **Arguments**: `omega` (n,) rad/s of the jams of light coincident loads; `rotor_speed` (n,) rad/s of each jam, default: that
+    of the scene.
 
     **Returns** the `growth` of `PhaseJam` for each; NaN if there is no such jam nearby, if `omega` is NaN, or if the loads
     have a `ball_radius` or dry friction, which this function does not include.
@@ -242,8 +244,10 @@ def growth_of_free_loads(scene: Scene, omega: Array) -> np.ndarray:
     is_finite = np.isfinite(speeds)
     if loads.ball_radius is not None or has_term(scene.all_effects, ContactFriction):
         return np.full(speeds.shape, np.nan)
-    starts = np.where(is_finite, speeds, float(scene.drive.speed))
-    found = _coincident_jams(scene, jnp.asarray(starts))
+    working = float(scene.drive.speed)
+    starts = np.where(is_finite, speeds, working)
+    rotor = np.full(speeds.shape, working) if rotor_speed is None else np.where(is_finite, np.asarray(rotor_speed), working)
+    found = _coincident_jams(scene, jnp.asarray(starts), jnp.asarray(rotor))
     near = (
         is_finite
         & (np.abs(found.omega - starts) < _SAME_JAM_DISTANCE * starts)
@@ -253,9 +257,9 @@ def growth_of_free_loads(scene: Scene, omega: Array) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _coincident_jams(scene: Scene, omega: Array) -> PhaseJam:
+def _coincident_jams(scene: Scene, omega: Array, rotor_speed: Array) -> PhaseJam:
     together = jnp.zeros(scene.loads.count, omega.dtype)
-    return jax.vmap(lambda w: jam_from(scene, w, together))(omega)
+    return jax.vmap(lambda w, n: jam_from(scene.replace(drive=ConstantSpeed(n)), w, together))(omega, rotor_speed)
 
 
 class PhasePattern(eqx.Enumeration):

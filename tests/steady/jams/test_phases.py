@@ -9,6 +9,7 @@ from scenes import machines
 from scenes import scene as platforms
 
 import jaxvib as jv
+from jaxvib.draw.style import COLORS
 from jaxvib.equations.torque_balance import assemble_torque_balance, influence_of, torques_at
 from jaxvib.numerics.linalg import eliminate
 from jaxvib.steady.jams.phase_search import _same, phase_branch
@@ -305,6 +306,22 @@ def test_jams_by_slope_are_judged_for_loads_that_may_part():
     assert bool(coincident.coincident) and not bool(separated.coincident)
     assert coincident.summary().startswith("not settled: loads of one track are at nearly one angle, and")
     assert "unstable" not in separated.summary()
+
+
+def test_branch_diagram_is_dashed_where_loads_separate():
+    """The loads leave mode 5, which is stable by slope, see above. A single load cannot leave it."""
+    several = platforms()
+    balls = several.loads
+    alone = jv.balls(count=1, mass=balls.count * balls.mass, radius=balls.radius, drag=balls.count * balls.drag)
+    for s, styles in ((several, ("-", "--")), (several.replace(loads=alone), ("-", "-"))):
+        modes = jv.jam_modes(s)
+        axis = jv.branches(s).plot(unit="rad/s").axes[0]
+        lines = [line for line in axis.lines if line.get_color() == COLORS[0]]
+        for mode, style in zip((3, 5), styles, strict=True):
+            place = np.array([[float(s.drive.speed)], [float(modes.omega[mode - 1])]])
+            points = [np.nan_to_num(np.linalg.norm(np.array(line.get_data()) / place - 1.0, axis=0), nan=9.0) for line in lines]
+            far = [float(np.min(each, initial=9.0)) for each in points]
+            assert min(far) < 1e-2 and lines[int(np.argmin(far))].get_linestyle() == style
 
 
 def test_every_jam_is_listed_once_and_in_order():
