@@ -205,7 +205,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("normal_force", scene=s, t=0.0, state=state)
     # Jams
     yield call("jam_modes", scene=s)
-    yield call("branches", scene=s, exact=False, points=50, most=None, least=None, accuracy=1e-8)
+    yield call("branches", scene=s, exact=False, points=50, most=None, least=None, accuracy=None)
     yield call("branches", scene=s, exact=True, points=8, most=20.0, least=10.0, accuracy=1e-6)
     yield call("phase_jams", scene=s, starts=8, seed=0, near=None)
     yield call("jam_orbit", scene=s, mode=3, omega=None, near=None, accuracy=None, points=None, throw=True)
