@@ -131,7 +131,8 @@ def quantity_text(values: ArrayLike, unit: str, digits: int = 5, between: str = 
     """
     numbers = np.atleast_1d(np.asarray(values, float))
     shown, factor = shown_unit(unit, float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers))))
-    return between.join(f"{factor * x:.{digits}g}" for x in numbers) + f" {shown}"
+    # NumPy's numbers would warn of an overflow.
+    return between.join(f"{factor * x:.{digits}g}" for x in numbers.tolist()) + f" {shown}"
 
 
 def speed_text(values: ArrayLike, digits: int = 5, between: str = ", ") -> str:

@@ -10,7 +10,7 @@ import pint
 import pytest
 
 import jaxvib as jv
-from jaxvib.display import shown_unit
+from jaxvib.display import quantity_text, shown_unit
 from jaxvib.units import Bounds, count, known_number, number, numbers
 from jaxvib.units.columns import unit_factor
 from jaxvib.units.reading import _FACTORS, in_own_unit, to_float, unit_ratio
@@ -383,6 +383,10 @@ def test_values_are_shown_in_si_on_request():
     finally:
         jv.display_units()
     assert shown_unit("m", 0.02) == ("mm", 1e3)
+
+
+def test_values_above_all_numbers_are_shown_without_a_warning():
+    assert quantity_text(np.asarray([1e308, 1.0]), "rad/s", 3) == "inf, 9.55 rpm"
 
 
 @pytest.mark.parametrize(
