@@ -117,7 +117,7 @@ def simulate(
     >>> bool(run.settled), round(float(run.omega), 2)      # jammed just below the resonance at 28.1 rad/s
     (True, 27.41)
 
-    Source: the antiphase paper, section 5.3; for the method `UnrolledDopri8`.
+    Source: the antiphase paper, section 5.3; for the method of integration see `UnrolledDopri8`.
     """
     plan_from = partial(
         plan_run,
@@ -142,7 +142,7 @@ def simulate(
     if not plan.is_known:
         return run
     is_settled = float(run.drift) < SETTLED_DRIFT
-    # Loads of an unsettled run can overlap only if they have a size.
+    # An unsettled run is tested for overlapping loads only; loads without a size cannot overlap.
     sized = [exciter for exciter in scene.exciters if getattr(exciter.loads, "ball_radius", None) is not None]
     return with_separation_status(run, is_settled=is_settled) if is_settled or sized else run
 

@@ -223,7 +223,7 @@ def _group_name(group: Sequence[int]) -> str:
 def _draw_band(
     axis: Axes, time: np.ndarray, values: np.ndarray, k: int, name: str | None, bins: int, depth: float | np.ndarray = 0.0
 ) -> None:
-    """Draw the signal number `k` as a curve, or as a band if it has more samples than `bins`."""
+    """Draw the signal number `k` as a band, or as a curve if it has fewer than 2 samples for each of `bins` intervals."""
     middle, low, high = band(time, values, bins)
     if low is not high:
         low, high = -_smoothed_peaks(-low), _smoothed_peaks(high)

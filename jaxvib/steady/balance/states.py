@@ -109,7 +109,8 @@ class BalancedStates(Result):
     def intervals(
         self, low: Number, high: Number, arrangement: int = 0, *, points: int = 200, steps: int | None = None
     ) -> SpeedIntervals:
-        """Return the intervals of rotor speed, rad/s, in which an arrangement is stable; their ends are accurate to 1e-7.
+        """Return the intervals of rotor speed, rad/s, in which an arrangement is stable; their ends are accurate to 1e-7 of the
+        speed.
 
         **Arguments**
 
@@ -135,8 +136,8 @@ class BalancedStates(Result):
 
     @property
     def capacity(self) -> np.ndarray:
-        """Largest imbalance of the rotor that the loads in each plane cancel, (planes,) kg m: that of loads at one angle, or of
-        balls and rollers with a `ball_radius` that touch each other. If one load outweighs all others together, they do not
+        """Largest imbalance of the rotor that the loads in each plane cancel, (planes,) kg m: the unbalance of all loads at one
+        angle, or of balls and rollers with a `ball_radius` side by side. If one load outweighs all others together, they do not
         cancel small imbalances."""
         sides, touching = _sides(turning_loads(self.scene)), _touching_angle(self.scene)
         chains = [sides[plane.loads] * np.exp(1j * touching * np.arange(plane.loads.size)) for plane in _planes(self.scene)]
@@ -188,7 +189,7 @@ class BalancedStates(Result):
 
 @validated
 def balanced_states(scene: Scene) -> BalancedStates:
-    """Return all arrangements in which the scene's loads cancel each other and the rotor's imbalance.
+    """Return arrangements in which the scene's loads cancel each other and the rotor's imbalance.
 
         sum_j m_j R_j exp(i alpha_j) + U = 0,    sum_j m_j R_j s_j exp(i alpha_j) + W = 0
 
@@ -314,7 +315,7 @@ def _planes(scene: Scene) -> list[_Plane]:
         if abs(tilting) > _rounding() * max(abs(moment), abs(places[0] * static)):
             problem = (
                 "tilt the rotor: loads at one point cannot cancel a moment imbalance, or a static imbalance at another point "
-                "(it acts at the centre of mass of the rotor); give loads at two stations, or leave it out"
+                "(it acts at the centre of mass of the rotor); give loads at two stations, or leave the imbalance out"
             )
             raise InputError("effects", problem)
         return [_Plane(np.arange(distances.size), static)]
@@ -335,7 +336,7 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     **Arguments**
 
     - `scene`; its effects must not disturb the balanced motion
-    - `angles` (N,), rad, in the rotor's frame, at which the loads cancel each other and the scene's `StaticImbalance`; default:
+    - `angles` (N,), rad, in the rotor's frame, at which the loads cancel each other and the imbalances of the scene; default:
       the first of `balanced_states`
     - `steps` of Radau's method of order 11 over one turn; the default resolves the carrier's natural frequencies; typical: 24
       to 200. The time is proportional to this number. The method is valid for any drag of the loads and any damping of the

@@ -29,7 +29,7 @@ from jaxvib.study.audit.variants import possible_variants, present_variants, req
 from jaxvib.units import Number, count, number
 
 _TIER_STEPS = 1
-"""Measured time of the comparison of all tiers, in units of the time of one effect, for the share that `progress` reports."""
+"""Number of effects that take as long as the comparison of all tiers; used for the share that `progress` reports."""
 
 
 class AuditStatus(eqx.Enumeration):

@@ -66,8 +66,8 @@ def first_guess(
     **Arguments**: `dry`, `air`, `torque`: True if this part of the law is an unknown of the fit; the initial drag of the air
     and the initial torque are 0.
 
-    A swing loses pi mu1/(2 J w) of its amplitude in half a period to viscous friction, and 2 T_f/(m g l) to dry
-    friction with the torque T_f.
+    In half a period, a swing loses the share pi mu1/(2 J w) of its amplitude to viscous friction, and the angle 2 T_f/(m g l)
+    to dry friction with the torque T_f. mu1, J, m, g and l are those of `BearingPendulum`; w is the frequency of small swings.
     """
     a = turns.amplitude
     stretch = period_stretch(a)
@@ -220,8 +220,8 @@ def _least_squares(
         damped = normal + damping * jnp.diag(jnp.diagonal(normal))
         change = jnp.linalg.solve(damped, triangle.T @ reached)
         variance = cost / (n - p) + floor
-        # The square of the next undamped step in standard errors, from the best point so far, because the sum of squares may
-        # not decrease further at a kink.
+        # Squares of the lengths, in standard errors, of the damped and of the undamped step from the best point so far. At a
+        # kink no later trial may have a smaller sum of squares than this point.
         length_squared, next_step_squared = jnp.sum((triangle @ change) ** 2) / variance, jnp.sum(reached**2) / variance
         return count + 1, x - change, damping, length_squared, *best, next_step_squared
 
