@@ -79,11 +79,11 @@ def tolerance_ranges(
 
     - `scene` of the design
     - `quantities`, or demands of quantities; typical: 1 to 5
-    - `tolerances`: texts of one of two forms. NAME=PERCENT, such as "stiffness=5%": 95 of 100 machines are within the
-      tolerance, and the deviations of all parameters are independent. NAME=LOW..HIGH, such as "machine.mass[0]=100kg..130kg":
-      all values of the range are equally likely. Short names are stiffness and damping (of all springs and dampers), mass, drag
-      and unbalance. "material=0..20kg" is material on platform or body 1, at its centre of mass, "material[2]=..." on platform
-      or body 2
+    - `tolerances`: texts of one of two forms. NAME=PERCENT, such as "stiffness=5%": each parameter is within the tolerance in
+      95 of 100 machines, and the deviations of all parameters are independent. NAME=LOW..HIGH, such as
+      "machine.mass[0]=100kg..130kg": all values of the range are equally likely. Short names are stiffness and damping (of all
+      springs and dampers), mass, drag and unbalance. "material=0..20kg" is material on platform or body 1, at its centre of
+      mass, "material[2]=..." on platform or body 2
     - `samples`: number of machines; typical: 64 to 1000 (default 128)
     - `seed` of the random deviations
 

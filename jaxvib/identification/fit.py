@@ -49,9 +49,8 @@ _STEADY_VALUES = 0.05
 """Change of the unknowns in a pass, in standard errors, below which the influence of outliers and bounds is final."""
 
 _MAX_GROWTH = 1.2
-"""Ratio of the standard deviation of residuals to that in a fit with white noise. Above this ratio the coloured noise contains
-a part of the motion: the noise has the frequencies of the machine, because a free decay of the machine's vibration can be
-attributed to noise or to motion."""
+"""Ratio of the standard deviation of residuals to that in a fit with white noise, above which the coloured noise is regarded as
+a part of the motion: noise with the frequencies of the machine can describe a free decay of its vibration."""
 
 _ANGLE_MATTERS = 0.03
 """Share of the noise due to the error of the rotor's angle above which the angle is fitted with the machine."""
@@ -166,7 +165,7 @@ def project(problem: Problem, x: np.ndarray) -> _Trial:
         damping[2 * k : 2 * k + 2] = 0.0 if known is None else 1.0 / known.value**2
     linear = solved(matrix + np.diag(damping), right)
     if any(problem.unbalances):
-        for _ in range(8):  # the right side of each step depends on the directions of the last unbalances, not on their sizes
+        for _ in range(8):  # the information of known unbalances depends on the directions of the last ones
             information, gradient, _ = unbalance_prior(problem, linear)
             linear = linear + solved(matrix + information + np.diag(damping), right - matrix @ linear + gradient)
     data = square - 2.0 * linear @ right + linear @ matrix @ linear
@@ -497,7 +496,7 @@ def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
     if any(matters):
         problem, is_final = with_angle_errors(fitted.problem, matters), False
         fitted = fitted._replace(x=np.concatenate([fitted.x, np.zeros(problem.unknowns.errors)]), problem=problem)
-    for _ in range(_MAX_PASSES):  # a pass that has not converged does not end the loop, because its weights are not final
+    for _ in range(_MAX_PASSES):  # a pass that has not converged is no reason to stop: its weights are not final
         new = [[noise_of(each[:, k]) for k in range(each.shape[1])] for each in fitted.residuals]
         if is_final and _largest_change(noise, new) < _STEADY_NOISE:
             break

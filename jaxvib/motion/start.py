@@ -169,12 +169,12 @@ def _in_jam(omega: Array, displacement: Array, row: Array | np.ndarray, angle: A
 def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> State:
     """Return the state completed by the rotation of the loads about their own centres, if effects of the scene permit it.
 
-    A state that contains this rotation already is returned unchanged.
+    A state that contains this rotation already is returned unchanged. Loads that do not rotate in space have
 
         c = p' - w axis x (p + r n),    s = - w axis . n
 
-    p is the position of the centre of a load, r its radius and n the normal of its contact; w is the rotor speed, and axis the
-    unit vector along the axis of the rotor. c is the slip and s the drilling spin.
+    c is the slip and s the drilling spin. p is the position of the centre of a load, r its radius and n the normal of its
+    contact; w is the rotor speed, and axis the unit vector along the axis of the rotor.
 
     **Arguments**
 
@@ -210,7 +210,8 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, rotation: Rotation
     has_slip = has_term(exciter.effects, SlipRelease)
     if loads is None or not (has_drilling or has_slip):
         if state.spin is not None:
-            raise InputError("start.spin", "is given, but no effect of the scene allows it; leave it out, or add FreeSpin")
+            problem = "is given, but no effect of the scene allows it; leave it out, or add FreeSpin or Sliding"
+            raise InputError("start.spin", problem)
         return state
     if state.spin is not None:
         n = (loads.count,)

@@ -175,8 +175,8 @@ class _Change(NamedTuple):
     """State of the search for the first switch within a step, by Newton's method between bounds.
 
     **Attributes**: `low` and `high`: bounds of the time from the beginning of the step to the switch; `length`: the next trial
-    of this time; `is_final`: True if the search has ended; `is_found`: False if there is no switch, neither at the end of the
-    step nor at the moment of `_turning`; `trials`: number of trials.
+    of this time; `is_final`: True if the search has ended; `is_found`: True if a trial was after a switch; without a switch the
+    search ends after the trials at the end of the step and at the moment of `_turning`; `trials`: number of trials.
     """
 
     low: Array

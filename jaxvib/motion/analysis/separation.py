@@ -42,8 +42,8 @@ CLUSTER_ANGLE = 1e-3
 """Largest angle between loads that count as coincident if other loads of their track are elsewhere, rad."""
 
 MIN_SEPARATION_GROWTH = 1e-2
-"""Logarithm of the growth factor over the samples above which loads are said to separate. Smaller values can be errors of the
-interpolation."""
+"""If the logarithm of the growth factor over the samples is above this value, loads are said to separate. Smaller values can be
+errors of the interpolation."""
 
 
 def tracks(scene: Scene, k: int) -> list[np.ndarray]:

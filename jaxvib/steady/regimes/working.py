@@ -29,7 +29,7 @@ from jaxvib.steady.regimes.synchronous import RegimeStatus, SynchronousRegime, f
 
 _SETS_PER_SQUARED_UNKNOWN = 4
 """The number of random sets of phases is this factor times the square of the number of unknown phases. It is small, because a
-design evaluates thousands of machines."""
+search for a design evaluates thousands of machines."""
 
 _SPEEDS, _LOWEST_SPEED, _HIGHEST_SPEED = 64, 0.3, 1.01
 """Number and range of the speeds, relative to that of the fastest drive, among which the speed of a start is searched for."""

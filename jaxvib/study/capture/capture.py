@@ -73,8 +73,9 @@ class Capture(Result):
     - `uncertainty` of the threshold; NaN if there is no threshold. It is the largest of three numbers: half the distance
       between v and the next lower speed; half the distance from the threshold to the highest speed below it at which at least
       half of the starts fail; `last_change`
-    - `last_change`: change of the threshold by the last doubling of the steps, infinite if the threshold appeared or vanished,
-      NaN without a doubling
+    - `last_change`: change of the threshold by the last doubling of the steps, NaN without a doubling. A threshold below the
+      computed speeds counts as -1. The change is infinite if the threshold is above the computed speeds in one of the two
+      scans, and 0 if it is above them in both
     - `steps`, and `turns` of the rotor, of each run
 
     Below the threshold outcomes may be chaotic, with single captures among failures; `fraction` gives their share.
@@ -188,7 +189,7 @@ def capture(
 
     **Arguments**
 
-    - `scene` with `torus_balls` and an ideal drive
+    - `scene` with `torus_balls` and a drive of constant speed
     - `speeds`: initial speeds relative to the rotor, in units of the rotor speed, ascending, from -1 (at rest in space) to 0;
       typical: 32 speeds (the default)
     - `turns`: length of each run in turns of the rotor; typical: 1000 to 3000 (default 2000). A capture that needs more turns
@@ -201,13 +202,14 @@ def capture(
     - `rotation`: "rolling", for balls that roll from the start, or "none", for balls that do not rotate at the start and
       therefore slide until they roll; "none" needs the effect `Sliding`
     - `stepsize_controller`: `EqualSteps(n)` for the whole run, without doubling. By default the first scan has the largest of
-      three numbers of steps: 1 for each radian of the fastest vibration, 2 for each radian at the rate of contacts between
-      balls or of the end of a slip, 1 for every three time constants of the fastest decay; typical: 200 for each turn
+      three numbers of steps: 1 for each radian of the fastest vibration, 2 for each radian of the motion in a contact between
+      balls or at the end of a slip, 1 for every three time constants of the fastest decay; typical: 200 for each turn
     - `doublings`: largest number of times that the default steps are doubled; typical: 2 (the default); 0 for a single scan.
       With one doubling the work is three times that of a single scan
     - `equations`: as for `ensemble`
 
-    **Returns** `Capture`. **Raises** `InputError` for loads that are not in a torus, a motor, and values that are not allowed.
+    **Returns** `Capture`. **Raises** `InputError` for loads that are not in a torus, a drive whose speed is not constant, and
+    values that are not allowed.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

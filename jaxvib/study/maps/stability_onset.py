@@ -158,7 +158,7 @@ def stability_onset(
         raise InputError("between", f"is {quoted(between)}; it must be two positive values, the lower one first")
     for x, is_required in ((low, False), (high, True)):
         if has_point(x) != is_required:
-            present, required = ("no", "a") if is_required else ("a", "no")
+            present, required = ("no", "one") if is_required else ("a", "none")
             raise InputError(
                 "between",
                 f"is {quoted(between)}; at {x:g} the diagram has {present} {kind} and must have {required}: "
