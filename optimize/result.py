@@ -71,11 +71,11 @@ class Outcome:
 
 
 class Row(NamedTuple):
-    """Row of the table of a parameter or quantity.
+    """Row of the table, for one parameter or one quantity.
 
-    **Attributes**: name `what`; SI `unit`, "rad/s of a supply" for a frequency that is shown in Hz; value `before` the search;
-    values of the best design: by the method of the quantity (`after`), by the exact motion (`exact`), and by time integration
-    (`time`). A value that was not computed is NaN.
+    **Attributes**: name `what`; SI `unit`, "rad/s of a supply" for the frequency of an electrical supply; value `before` the
+    search; values of the best design: by the method of the quantity (`after`), by the exact motion (`exact`), and by time
+    integration (`time`). A value that was not computed is NaN.
     """
 
     what: str

@@ -141,7 +141,8 @@ def log_places(low: float, high: float, max_ticks: int = 9) -> LogLocator:
 def log_ticks(axis: Axes, which: Literal["x", "y"] = "y") -> None:
     """Set the ticks of a logarithmic axis, whose limits must already be set.
 
-    The labels are plain numbers if they are short, otherwise powers of ten; see `log_places` for the positions.
+    The labels are powers of ten if the axis has three decades or more and its plain numbers would be long, otherwise plain
+    numbers; see `log_places` for the positions.
 
     >>> figure, (axis,) = panels(1)
     >>> _ = axis.set_yscale("log"), axis.set_ylim(0.4, 3.0)
@@ -158,7 +159,7 @@ def log_ticks(axis: Axes, which: Literal["x", "y"] = "y") -> None:
 
 
 def length_unit(*values: np.ndarray) -> tuple[str, float]:
-    """Return the display unit of lengths, m, for the axis of a figure, and the factor from m to it.
+    """Return the unit in which the axis of a figure shows the lengths `values`, given in m, and the factor from m to it.
 
     >>> length_unit(np.array([0.02])), length_unit(np.array([3e-7]))
     (('mm', 1000.0), ('µm', 1000000.0))
@@ -222,7 +223,8 @@ def join_names(named: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:
     """
     groups: list[list[tuple[float, str]]] = []
     for share, name in named:
-        # A name joins a group if it is near the last name and not far from the first one, because the text stands between both.
+        # A name joins a group if it is near the last name and not far from the first one, because the text of the group is
+        # placed at the mean height.
         first, last = (groups[-1][0][0], groups[-1][-1][0]) if groups else (-1.0, -1.0)
         near = share - last < 0.045 and share - first < 0.09
         groups = [*groups[:-1], [*groups[-1], (share, name)]] if near else [*groups, [(share, name)]]

@@ -216,7 +216,7 @@ class RotorDynamics(eqx.Module):
     def _braking_torque(self, motion: Motion, drag_torque: Array, coupling: Axes) -> tuple[Array, list[Array]]:
         """Return (T, c) of the torque T + c . a, N m, with which loads, gravity and imbalance brake the rotor.
 
-        c has an entry for each of the first scalar rows of the mount; the torque does not depend on the other rows.
+        c has entries for the first scalar rows of the mount only; the torque does not depend on the other rows.
         """
         torque = self._total(drag_torque)
         torque = torque if motion.weight_torque is None else torque + motion.weight_torque
@@ -408,8 +408,7 @@ class ExciterDynamics(RotorDynamics):
     def _add_friction(self, drag_torque: Array, contact: ContactSolution) -> tuple[Array, list[Array], list[Axes]]:
         """Add the friction that does not depend on the accelerations to the drag and to the forces.
 
-        **Returns** both, and for each coordinate of a load the friction per acceleration, by axis; {} without such friction, as
-        for a rotor without loads.
+        **Returns** both, and for each coordinate of a load the friction per acceleration, by axis; {} without such friction.
         """
         force, coupling = list(contact.force), [dict[int, Array]() for _ in contact.force]
         for each in contact.friction:

@@ -87,7 +87,7 @@ def write_program(
 
     **Arguments**: `inputs`: the C expression of each argument; `parameters`: number of leading arguments that change only at
     events; `outputs`: the C expression to which each result is assigned; `has_events`: True to assign the difference of the two
-    compared values to an event indicator, for each comparison.
+    compared values to an event indicator, for each comparison of real numbers in `body` that is not the choice of a pivot.
 
     **Raises** `InputError` for an operation without a rule; the message names the operation.
     """

@@ -97,7 +97,8 @@ def compiled_anew() -> Iterator[None]:
 
 
 def require_own(folder: Path) -> None:
-    """Raise `InputError` if another user may write to a folder, or if any user may replace it."""
+    """Raise `InputError` if another user owns a folder or may write to it, or if a folder above it belongs to another user
+    (except root) or lets every user replace its contents."""
     if not hasattr(os, "geteuid"):  # on Windows only the owner can write to a home folder
         return
     for place in (folder, *folder.resolve().parents):

@@ -1,4 +1,4 @@
-"""Text and number of operations of a program (here a jaxpr, not machine code), and removal of unused operations."""
+"""Operations of a program (here a jaxpr, not machine code): their text, their number, and removal of unused ones."""
 
 from __future__ import annotations
 

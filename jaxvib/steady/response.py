@@ -107,8 +107,8 @@ class OperatingPoints(AbstractResponse):
     **Additional attributes**, ascending in `speed`; entries whose `exists` is False are NaN
 
     - `exists`: True for an operating point
-    - `growth`, 1/s, of the fastest growing small disturbance of the averaged motion, and `stable`: True if it is negative;
-      the differences of the phases stay fixed
+    - `growth`, 1/s, of the fastest growing small disturbance of the averaged motion (without disturbances of the differences
+      of the phases, which are fixed), and `stable`: True if it is negative
     """
 
     outer_axes = ("operating_point",)
@@ -269,7 +269,7 @@ def response(
     >>> machine = jv.one_mass(mass=200.0, stiffness=8e5, damping=600.0)                      # resonance at 604 rpm
     >>> weak = jv.DCMotor("1500 rpm", stall_torque=12.0, inertia=0.1)
     >>> found = jv.response(jv.Scene(machine, exciters=[jv.Exciter(drive=weak, unbalance=0.2)]))
-    >>> [round(float(w), 2) for w in found.operating.speed[found.operating.exists]]          # caught below 604 rpm, or passed
+    >>> [round(float(w), 2) for w in found.operating.speed[found.operating.exists]]   # caught below 604 rpm; unstable; passed
     [62.69, 63.96, 156.2]
     >>> [round(float(f), 3) for f in found.folds.factor]
     [1.179, 0.019]
@@ -344,8 +344,8 @@ def _response(scene: Scene, speeds: Array, phases: Array) -> Response:
 
 
 def _slow_speed(resonances: Array) -> Array:
-    """Return a speed, rad/s, at which a response is its limit at speed 0, within about 1e-9 (phases: 1e-5) in double
-    precision."""
+    """Return a speed, rad/s, so low that a response differs from its limit at speed 0 by at most about 1e-9 (phases: 1e-5) in
+    double precision."""
     lowest = jnp.min(jnp.where(resonances > 0.0, resonances, jnp.inf))
     return float(jnp.finfo(lowest.dtype).eps) ** 0.3 * jnp.where(jnp.isfinite(lowest), lowest, 1.0)
 

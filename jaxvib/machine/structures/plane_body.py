@@ -277,7 +277,7 @@ def plane_body(*, mass: Number, inertia: Number, supports: Sequence[PlaneSupport
         m x'' = f_x,    m y'' = f_y,    J psi'' = moment of the forces
 
     Displacements are measured from static equilibrium, x to the right, y up, psi anticlockwise. The rotation is assumed to be
-    small: kinematics are linear in q.
+    small: the kinematics are linear in x, y and psi.
 
     **Arguments** (SI, or strings with a unit)
 
