@@ -46,7 +46,8 @@ def pytest_configure(config):
     with contextlib.suppress(OSError):  # a home that cannot be written to, other tests that remove the same
         PROGRAMS.mkdir(parents=True, exist_ok=True)
         os.utime(PROGRAMS)
-        for old in sorted(PROGRAMS.parent.iterdir(), key=lambda place: place.stat().st_mtime)[:-4]:
+        folders = (place for place in PROGRAMS.parent.iterdir() if place.is_dir())
+        for old in sorted(folders, key=lambda place: place.stat().st_mtime)[:-4]:
             shutil.rmtree(old)
     # JAX makes a context of MLIR, with all its dialects, for each program that it lowers: a sixth of the suite's time. One that
     # is in use, by a program within which another one is lowered, is left alone.
