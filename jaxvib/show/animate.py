@@ -101,7 +101,7 @@ def animate(
     if isinstance(fps, bool) or not isinstance(fps, int) or not 1 <= fps <= 50:
         raise InputError("fps", f"is {quoted(fps)}; it must be a whole number of frames per second, 1 to 50")
     first, last = _time_range(motion, begin, end)
-    speed = _highest_speed(motion, owner)
+    speed = _highest_speed(motion, owner, first, last)
     turns = speed * (last - first) / (2.0 * np.pi)
     duration = None if seconds is None else float(number(seconds, "s", "seconds", low=0.0, open_low=True))
     if duration is not None and round(duration * fps) > _MAX_FRAMES:
@@ -111,8 +111,11 @@ def animate(
     count = round(float(np.clip(frames, 2, _MAX_FRAMES)))
     if turns / count > _MAX_TURNS_PER_FRAME:
         latest_end = first + _MAX_TURNS_PER_FRAME * 2.0 * np.pi * count / speed
-        problem = f"turns the rotor by {turns / count:.3g} turns from one frame to the next, which looks like another speed"
-        raise InputError("end", f"{problem}; end at {latest_end:.4g} s or before, or make the animation longer")
+        problem = (
+            f"turns rotor or loads by {turns / count:.3g} turns from one frame to the next, which looks like another speed"
+        )
+        more = "" if count == _MAX_FRAMES else ", or make the animation longer"
+        raise InputError("end", f"{problem}; end at {latest_end:.4g} s or before{more}")
     # An orbit is periodic; the frame after the last frame would be the first frame.
     time = first + (last - first) * np.arange(count) / (count if isinstance(motion, Orbit) else count - 1)
     dense = np.linspace(time[0], time[-1], max(400, count))
@@ -152,12 +155,14 @@ def _time_range(motion: Run | Orbit, begin: Number | None, end: Number | None) -
     return first, last
 
 
-def _highest_speed(motion: Run | Orbit, scene: Scene) -> float:
-    """Return the highest speed of rotor and loads, rad/s."""
+def _highest_speed(motion: Run | Orbit, scene: Scene, first: float, last: float) -> float:
+    """Return the highest speed of rotor and loads from the time `first` to `last`, s, in rad/s."""
     if isinstance(motion, Run):
-        window = motion.window
-        speeds = [*window.rotor_speeds, *(state.rate[0] for state in window.state.exciters if state.rate)]
-        return max(float(np.max(np.abs(speed), initial=1e-300)) for speed in speeds)
+        stored = _stored_states(motion, np.array([first, last]))
+        begin, end = np.searchsorted(np.asarray(stored.time, float), [first, last])
+        shown = slice(max(begin - 1, 0), end + 1)
+        speeds = [*stored.rotor_speeds, *(state.rate[0] for state in stored.state.exciters if state.rate)]
+        return max(float(np.max(np.abs(np.asarray(speed)[shown]), initial=1e-300)) for speed in speeds)
     return float(max(motion.rotor_speed, motion.omega)) if np.isfinite(motion.rotor_speed) else float(scene.drive.speed)
 
 
