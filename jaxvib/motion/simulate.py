@@ -247,13 +247,13 @@ def _coarser(control: StepControl) -> StepControl:
 def _run_with_estimate(plan: RunPlan) -> Run:
     """Return a run with its error, estimated by a second run with larger steps.
 
-    Without a progress meter both runs are computed in parallel.
+    Both runs are computed in parallel, but not with a progress meter or under a JAX transformation.
     """
     control = plan.integration.control
     assert isinstance(control, StepControl)
     coarser = _coarser(control)
     runs = partial(_run, plan, control), partial(_run, plan, coarser, is_measured=False)
-    if plan.integration.progress_meter is None:
+    if plan.is_known and plan.integration.progress_meter is None:
         fine, coarse = in_threads(lambda k: runs[k](), 2)
     else:
         fine, coarse = (run() for run in runs)

@@ -165,6 +165,17 @@ def test_an_unknown_error_is_infinite():
     assert float(failed.error) == np.inf
 
 
+def test_the_error_is_estimated_under_jit_and_vmap():
+    s = published(eps=1e-3).scene()
+
+    def error(speed):
+        return jv.simulate(eqx.tree_at(lambda s: s.drive.speed, s, speed), 5.0, estimate=True).error
+
+    speed = s.drive.speed
+    at_once = jax.jit(jax.vmap(error))(jnp.stack([speed, speed]))
+    np.testing.assert_allclose(at_once, float(error(speed)), rtol=0.1)  # another form of the same method
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
