@@ -237,7 +237,7 @@ def no_host_checks() -> Iterator[None]:
     def to_nan(*args: object, on_error: str) -> object:
         on_error = "nan" if on_error == "default" else on_error
         with contextlib.ExitStack() as stack:
-            if on_error == "nan" and hasattr(frames, "include_frame"):
+            if on_error == "nan" and frames is not None and hasattr(frames, "include_frame"):
                 # NaN has no message. For a message Equinox reads the source lines of the whole stack, which takes up to a fifth
                 # of the time of a trace.
                 stack.enter_context(_patched(frames, "include_frame", lambda frame: False))
