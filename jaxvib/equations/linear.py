@@ -353,7 +353,7 @@ def rotating_direction(mount: Mount, direction: int = 1) -> Array:
 
 
 def peak_force(force: Array) -> Array:
-    """Return the root of the sum of the squared peaks in all directions, N, of a force with complex amplitudes (np,), N."""
+    """Return the root of the sum of the squared peaks, N, of a force with a complex amplitude, N, for each direction."""
     return magnitude(force[0]) if force.shape[0] == 1 else jnp.sqrt(jnp.sum(magnitude(force) ** 2))
 
 

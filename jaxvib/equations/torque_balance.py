@@ -149,7 +149,7 @@ class UnbalancedModel(ExcitedModel):
         Y = Omega^2 D(Omega)^-1 f,      f = sum_k S_k exp(i alpha_k) B_k^T e_k,     braking torque = -(Omega^4/2) Im(f^H D^-1 f)
 
     **Attributes**, in addition to those of `ExcitedModel`: the `balance` of torques; `phasors` (count,), the complex numbers
-    exp(i alpha_k); `resultant` (np,) kg m, complex: sum_k S_k exp(i alpha_k) e_k, the force per Omega^2 in each direction;
+    exp(i alpha_k); `resultant`, kg m, complex: sum_k S_k exp(i alpha_k) e_k, the force per Omega^2 in each direction of e_k;
     `shaft`: the balance of one mass in place of all masses, which turn as one because their phases are fixed. The
     `unbalance` of this model is 1, and its `force_direction` is f.
     """
@@ -308,7 +308,7 @@ def _imbalances(exciter: Exciter, *, about_tilts: bool) -> list[Array]:
 def with_imbalances(model: LinearModel) -> LinearModel:
     """Return the model with one equivalent unbalance in place of the unbalance and the imbalances of each rotor.
 
-    The force per w^2 on the coordinates is S B^T e + those of the imbalances.
+    The force per w^2 on the coordinates is the sum of S B^T e and of the forces of the imbalances.
     """
     if not has_term(model.scene.all_effects, RotorImbalance):
         return model
@@ -327,7 +327,7 @@ def with_imbalances(model: LinearModel) -> LinearModel:
 
 
 def resultant_of(model: LinearModel, phasors: Array) -> Array:
-    """Return the resultant of the centrifugal forces per w^2, (np,) kg m complex: sum_j S_j exp(i alpha_j) e_j.
+    """Return the resultant of the centrifugal forces per w^2, sum_j S_j exp(i alpha_j) e_j, kg m, complex, shaped like e_j.
 
     `phasors` (count,): exp(i alpha) of each load, or of the unbalance of an exciter without loads, which includes the static
     imbalance of its rotor. The result is NaN for loads that do not move on a circle, and 0 if the forces cancel up to the

@@ -549,7 +549,8 @@ def channel_sizes(problem: Problem) -> list[list[float]]:
 def _delay_taps(delay: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the filters of the readings and of the model for a delay of the readings in steps: interpolation of degree 5.
 
-    Both filters delay their signals by two steps, because the interpolation needs samples on both sides.
+    The filter of the readings delays them by two steps, and the filter of the model delays the model by two steps more than
+    `delay`, because the interpolation needs samples on both sides.
     """
     late = delay + DELAY_MARGIN
     base = math.floor(late) - 2

@@ -69,7 +69,8 @@ _UNEXPLAINED = 0.25
 
 _REDUCTION_PER_READING = 1e-3
 """Expected reduction of the cost per reading, relative to the variance of the readings, below which the segments are fitted
-well enough: the fit of the whole motion converges from there. In a curved valley of the cost it takes fewer steps."""
+well enough: the fit of the whole motion converges from there. In a curved valley of the cost, the fit of the whole motion takes
+fewer steps than the fit of the segments."""
 
 _ABOVE_JAM, _SAME_STIFFNESS = 1.04, 0.01
 """Ratio of a natural frequency to the speed of the jam near it, and change of the logarithm of the stiffnesses below which
@@ -90,8 +91,8 @@ class _Jam(NamedTuple):
 class _Trial(NamedTuple):
     """Values of all unknowns, with their cost and `equations`.
 
-    **Attributes**: `x`, `linear`; of each run, `starts` (J, ns) of its segments, and their `start_changes`
-    (J, ns, f + 1), see `Linearized`.
+    **Attributes**: `x` (p,), the nonlinear unknowns; `linear` (L,), the linear ones; for each run, `starts` (J, ns), the first
+    states of its J segments, and `start_changes` (J, ns, f + 1) of these states, see `Linearized`.
     """
 
     x: np.ndarray
@@ -178,7 +179,7 @@ def first_states(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, ...]
 def with_jam(problem: Problem, linear: np.ndarray, state: np.ndarray) -> tuple[Problem, np.ndarray]:
     """Return the problem of one planned run that begins with a state of `first_states`, and its linear unknowns.
 
-    **Arguments**: `linear` (L,) with the components of the unbalance.
+    **Arguments**: `linear` (L,): values of the linear unknowns. Its entries of the first state are overwritten by `state`.
     """
     indices, samples = linear_indices(problem)[0], problem.runs[0]
     linear[indices[: state.size - 1]] = state[:-1]

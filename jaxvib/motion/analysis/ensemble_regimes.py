@@ -290,7 +290,8 @@ def _groups(rotation: np.ndarray) -> np.ndarray:
 def _order_of_equal(rotation: np.ndarray, phase: np.ndarray, equal: Sequence[int]) -> np.ndarray:
     """Return the order (runs, mass) of the masses in which those that may be exchanged are sorted.
 
-    The fastest ones are first; masses of one speed are in the order of their phases, which begin after their largest gap.
+    The fastest ones are first; masses of one speed are in the order of their phases. This order begins with the phase that
+    follows the largest gap between two phases.
     """
     order = np.tile(np.arange(len(equal)), (phase.shape[0], 1))
     for number in set(equal):

@@ -29,7 +29,7 @@ needed because the amplitude and the force of a balanced rotor are almost zero."
 
 _POINTS_IN_STEP = 8
 """Number of points in each sampling step at which a kinked force is searched for extrema. A second search covers the distance
-of two neighbouring points on each side of the extremum, and divides each of these distances into as many parts."""
+to the next point on each side of the extremum. It divides each of these two distances into the same number of parts."""
 
 Field = Callable[[Array, State], State]
 """Equations of motion: function from a time and a state to the rates of the state."""
@@ -123,10 +123,9 @@ class AbstractMeasured(Readable):
         return f"amplitude, zero to peak: {amplitude}; foundation force {force}"
 
     def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array]) -> str:
-        """Return a line of text with the speeds of the turning masses, and the last of the `rotor_speeds` of exciters with
-        loads.
+        """Return a line of text with the speeds of the turning masses, and the last rotor speed of each exciter with loads.
 
-        The turning mass of an exciter without loads is its rotor.
+        The turning mass of an exciter without loads is its rotor. `rotor_speeds`: an array (nt,), rad/s, for each exciter.
         """
         exciters = zip(scene.exciters, rotor_speeds, strict=True)
         rotors = [speeds[-1] for exciter, speeds in exciters if exciter.loads is not None]
@@ -332,7 +331,8 @@ def _kinked_extrema(outputs: Callable[[Array, Array], Array], field: Field, time
         def value(place: Array) -> Array:
             return at(first, second, place - k)[output]
 
-        # A step of Newton's method, because the derivatives are those of the value at a fixed place. It fails at a kink.
+        # The derivatives are those of the value at a fixed place. They are correct if the slope at this place is 0; therefore a
+        # step of Newton's method improves the place. The step fails at a kink; the place is then kept.
         slope, curvature = jax.grad(value)(place), jax.grad(jax.grad(value))(place)
         moved = place - slope / jnp.where(curvature == 0.0, 1.0, curvature)
         near = (jnp.abs(moved - place) * m**2 <= 1.0) & (sign * value(moved) >= sign * value(place))
@@ -355,8 +355,8 @@ class Peaks(NamedTuple):
 def locate_peaks(model: Model, field: Field, times: Array, states: State) -> Peaks:
     """Return the largest values of an evenly sampled part of a motion, for arguments as in `measure`.
 
-    Values between the samples are those of the polynomials of `locate_extrema`. The magnitude of the force is largest where
-    the square of the force is largest.
+    Values between the samples are those of the polynomials of `locate_extrema` or, for a force with kinks, those of
+    `_kinked_extrema`. The magnitude of the force is largest where the square of the force is largest.
     """
     nd = states.displacement.shape[1]
     if model.has_kinked_force:
@@ -393,7 +393,7 @@ class Extrema(NamedTuple):
         return (self.high - self.low) / 2.0
 
     def part(self, steps: slice = slice(None)) -> Extrema:
-        """Return the extrema of some `steps` along the leading axis together."""
+        """Return the extrema over all the given `steps`, a slice of the leading axis."""
         low, high, square = (x[steps] for x in self)
         return Extrema(jnp.min(low, axis=0), jnp.max(high, axis=0), jnp.max(square, axis=0))
 
