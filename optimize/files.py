@@ -70,7 +70,7 @@ def load_design(path: str | Path) -> Design:
     >>> load_design(folder / "design.toml").objective.name
     'force_per_amplitude'
     """
-    start()  # without an earlier call of jaxvib, the first arrays of the process are made here
+    start()  # before the first arrays of the process, which this function may create
     tables = read_toml(path)
     for name in tables:
         if name not in _SECTIONS:

@@ -101,7 +101,7 @@ def export_uff(
     frequencies: Numbers | None = None,
     rotor_speed: Number | None = None,
 ) -> Path:
-    """Write a universal file (58, 55, 15, 82, 151, 164) of a scene or of a run.
+    """Write a universal file of a scene or of a run, with the datasets 15, 55, 58, 82, 151 and 164.
 
     - Frequency responses of a `Scene` at evenly spaced frequencies: one function for each pair of a response (node and
       direction) and a force (exciter and direction)

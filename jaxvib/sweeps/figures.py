@@ -129,7 +129,8 @@ def plot_map(
 
     **Arguments**
 
-    - `measure`: its name in the store; default: the regime if it was measured, otherwise the first measure
+    - `measure`: its name in the store; default: the regime or the jam mode if it was measured, otherwise the first measure
+      with numbers
     - `x`, `y`: names of the axes of the map; default for `x`: the rotor speed if it is an axis, otherwise the first axis;
       default for `y`: the first of the remaining axes. The map shows the cases in which all other axes have their middle
       value. For a measure with several values in a case, the largest value is shown

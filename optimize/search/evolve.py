@@ -73,7 +73,7 @@ class PopulationValues:
     def __init__(self, problem: Problem):
         self.problem = replace(problem, batch_size=_DESIGNS_PER_BATCH)
         self.latest: tuple[np.ndarray, ...] | None = None
-        """Latest designs, and their followed speeds."""
+        """Latest designs, and the load speeds of their jams and folds."""
 
     def of(self, z: np.ndarray) -> np.ndarray:
         """Return the values of the designs z (s, d), NaN if a quantity does not exist."""

@@ -106,7 +106,10 @@ def _load_decay(loads: Loads, speed: Array, accelerance: Array) -> Array:
 
 
 def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rodas4 | None:
-    """Return the implicit method if the decay of a scene is too fast for explicit steps, otherwise None."""
+    """Return the implicit method if it takes less time than explicit steps, otherwise None.
+
+    That is the case if the state has at most 64 entries and a decay is more than 100 times as fast as the motion.
+    """
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(state))
     return Rodas4() if size <= _MAX_IMPLICIT_SIZE and float(fastest_decay(scene)) > _STIFF_RATE_RATIO * float(fastest) else None
 
@@ -177,8 +180,8 @@ def rate_at(scene: Scene, displacements: Array) -> Array:
 
         w^2 = fastest^2 + sum of k max(P M^-1 P^T)
 
-    k is the largest eigenvalue of the second derivative of the energy of a support at P q. The sum includes supports whose
-    stiffness has no limit, such as `CubicSupport`; stops are those of `contact_rate`.
+    k is the largest eigenvalue of the second derivative of the energy of a support at P q. The sum is over the supports
+    whose stiffness has no limit, such as `CubicSupport`. Stops are not included, see `contact_rate`.
     """
     fastest, linear = frequency_bounds(scene)[0], None
     square = fastest**2
@@ -206,7 +209,7 @@ def equal_step_length(fastest: float, decay: float, per_radian: float, step: flo
 
 
 def is_unresolved(decay: Array | np.ndarray, step: Array | float) -> Array | np.ndarray:
-    """Return True if explicit steps of the length `step`, s, diverge because of the decay rate `decay`, 1/s."""
+    """Return True if `decay`, 1/s, times the length `step` of explicit steps, s, is above 6; such steps diverge."""
     return decay * step > 2.0 * _MAX_DECAY_PER_STEP
 
 

@@ -45,7 +45,8 @@ _MAX_UNROLLED_SIZE = 8
 class PackedSystem(eqx.Module):
     """Conversion between a `State` and the state of the integrator.
 
-    The state of the integrator is a vector of the entries of the `State`, or, for a batch, a tuple of these entries.
+    The state of the integrator is a vector of the entries of the `State`, or, for a batch with equations on scalars, a tuple of
+    these entries.
 
     With a vector, a compiled step moves fewer values to and from memory, and diffrax stores, compares and copies one array
     instead of many. In a batch each entry is an array over the runs, which is contiguous in memory.

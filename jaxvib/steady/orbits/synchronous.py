@@ -385,7 +385,8 @@ def _solve_program(
 ) -> SynchronousOrbit:
     """Solve for one synchronous motion with a number of collocation points.
 
-    `max_steps`: limit of the integration steps in a period for the multipliers, with which they have reverse derivatives.
+    `max_steps`: limit of the integration steps in a period for the multipliers. With a limit, the multipliers have derivatives
+    in reverse mode.
     """
     whole, grid, forcing = periodic_scene(scene, phases), grid_of(points, False), forcing_exciters(scene)
     forced = bool(forcing)

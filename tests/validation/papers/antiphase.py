@@ -143,7 +143,7 @@ NUMBERS = (
         lambda: _platform_2_again(0),
         _platform_2,
         misprint=Misprint(
-            "n1, h1 of the platform with the exciter",
+            "n1, h1 of the other platform",
             "n2, h2",
             "steady motion by the equations of the machine, with unequal supports",
             lambda: _platform_2_again(1),
