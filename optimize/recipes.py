@@ -73,7 +73,11 @@ def _stroke(stroke: Number | None) -> float | None:
 
 
 def _throw_angle(angle: Number) -> float:
-    """Return the angle of throw, rad. **Raises** `InputError` for 0 and beyond a right angle: the line has no direction."""
+    """Return the angle of throw, rad.
+
+    **Raises** `InputError` for 0, and for a right angle or more. (A line has no direction: a larger angle describes the same
+    line as that angle minus half a turn.)
+    """
     radians = number_in(angle, "rad", "angle")
     if not 0.0 < abs(radians) < np.pi / 2.0:
         raise InputError("angle", f"is {quoted(angle)}; it must be between 0 and 90 deg, or between -90 deg and 0")

@@ -87,9 +87,9 @@ def _to_edges(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a line on a map of cells, extended to the edges of the map.
 
-    **Arguments**: coordinates of the points of the line: `along` one axis of the map, and `across` it; on the first axis, the
-    `centres` of the cells and the two `edges` of the map. An end of the line at the first or the last centre is extended with
-    the slope of the line to the edge beside it.
+    **Arguments**: `along`: coordinates of the points of the line on one axis of the map; `across`: those on the other axis;
+    `centres` of the cells and the two `edges` of the map, both on the first axis. An end of the line at the first or the last
+    centre is extended with the slope of the line to the edge beside it.
 
     >>> _to_edges(np.array([3.0, 4.0]), np.array([1.0, 2.0]), np.array([1.0, 2.0]), (0.5, 2.5))
     (array([2.5, 3. , 4. , 4.5]), array([0.5, 1. , 2. , 2.5]))

@@ -60,7 +60,8 @@ def solve(
 
     **Arguments**: `adjoint`: an adjoint of diffrax in place of the replay, such as `diffrax.ForwardMode()` for forward
     derivatives. Functions among the arguments must not contain traced arrays; pass these in `args`. `saveat` saves states at
-    given times and at the end. The method must carry only rates from step to step. The other arguments are as in diffrax.
+    given times and at the end. Rates must be the only values that the method carries over to its next step; the replay computes
+    them again. The other arguments are as in diffrax.
 
     **Returns** diffrax's `Solution`.
     """

@@ -48,7 +48,7 @@ class SearchResult(NamedTuple):
     """Results of searches.
 
     **Attributes**: those of `Polished`; `drawn`: number of random designs; `existing`: number of these for which the objective
-    exists (in a search from given designs, `drawn` is the number of these); `interrupted`: True if the user interrupted
+    exists (in a search from given designs, `drawn` is the number of given designs); `interrupted`: True if the user interrupted
     the search; `bounds`: lower and upper bounds (d,) of the d free parameters within which the best design was searched for,
     SI; `nodes`: number of bounded problems that branch and bound solved.
     """

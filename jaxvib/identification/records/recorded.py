@@ -58,8 +58,8 @@ def described_channels(
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return the times (s, from `low` to `high`) and the values of channels.
 
-    The values are in SI units, or in the unit of the file if the channel has a `unit`. If a channel of pulses has no times in
-    the file, its recorded values are the times of the pulses; it then has no values.
+    The values are in SI units. If the channel has a `unit`, they are the values of the file, unchanged, in this unit. If a
+    channel of pulses has no times in the file, its recorded values are the times of the pulses; it then has no values.
 
     **Raises** `InputError` for a channel that the file does not have or has more than once, a wrong unit, and times and values
     of different length.

@@ -27,7 +27,8 @@ MAX_COMPLETE = 6
 further mass."""
 
 _PHASES_PER_UNKNOWN, _MAX_REGULAR_SETS = 24, 64
-"""Number of random sets of phases divided by the square of the number of unknown phases, and largest number of regular sets."""
+"""Number of random sets of phases divided by the square of the number of unknown phases, and largest number of sets of phases
+that are multiples of half a turn."""
 
 _SETS_AT_ONCE = 64
 """Number of sets of phases whose torques are computed in one operation, which limits the memory."""
@@ -148,7 +149,8 @@ def sets_of_phases(prescribed: np.ndarray, dtype: np.dtype, per_unknown: int = _
     """Return regular and random sets of phases (n, count).
 
     The number of random sets is `per_unknown` times the square of the number of unknown phases, and not larger than that for
-    `MAX_COMPLETE` masses. The phases of masses with prescribed speed are 0.
+    `MAX_COMPLETE` masses. A single unknown phase has `per_unknown` evenly spaced values instead of random ones. The phases of
+    masses with prescribed speed are 0.
     """
     free = np.flatnonzero(~prescribed) if prescribed.any() else np.arange(1, prescribed.size)
     n = free.size
