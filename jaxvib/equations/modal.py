@@ -27,7 +27,8 @@ class ModalResponse(eqx.Module):
     - `poles` s (2 nd,) 1/s, the roots of det(K + s C + s^2 M) = 0; `outputs` Z (nd, 2 nd); `inputs` W (2 nd, nd)
     - `residues` r of the receptance of the mount, (2 nd,), or of the receptances between several masses, (count, count, 2 nd)
     - `norms` (3,), the largest row sums of |K|, |C| and |M|
-    - `is_rough`: True if the result may lose more than 2 digits because eigenvectors are nearly parallel
+    - `is_rough`: True if the result may lose more than 2 digits, because eigenvectors are nearly parallel, and for a carrier
+      with a natural frequency 0
     """
 
     poles: Array

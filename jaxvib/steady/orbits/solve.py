@@ -72,8 +72,8 @@ class _Balance(NamedTuple):
     """Torque balance of the bodies at the points.
 
     **Attributes**: `residual` (G, M) of the balance, divided by drag times load speed of each body; `scale` of the terms in it;
-    `acceleration` (p, M) of the mount, m/s^2; `moving` (p, G, M): de/dphi; `vibration_stiffness` (G, M): derivative of the
-    vibrational torque with respect to the angle, at a fixed acceleration, in the units of the residual.
+    `acceleration` (p, M) of the mount, m/s^2; `moving` (p, G, M): de/dphi; `vibration_stiffness` (G, M): minus the derivative
+    of the vibrational torque with respect to the angle, at a fixed acceleration, in the units of the residual.
     """
 
     residual: Array
