@@ -59,8 +59,9 @@ class Envelopes(Readable):
     **Attributes** (nt times, nd coordinates, nb directions of the force)
 
     - `time` (nt,), s
-    - `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s: complex amplitudes Y of q = Re(Y exp(i theta)), with the mean
-      angle theta of the loads. If exciters turn at different speeds, the amplitudes change periodically (beats)
+    - `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s: complex amplitudes Y and V of q = Re(Y exp(i theta)) and
+      q' = Re(V exp(i theta)), with the mean angle theta of the loads. If exciters turn at different speeds, the amplitudes
+      change periodically (beats)
     - `amplitude` (nt, nd), m, and `foundation_force` (nt, nb), N, zero to peak
     - `omega` (nt,): mean load speed, each load positive in the direction of its exciter, and `load_speed` (nt, count) of
       each load, positive anticlockwise, rad/s
