@@ -29,7 +29,7 @@ from jaxvib.units.known import when_known
 LoadMasses = Literal["fixed", "none"]
 
 _STRAIGHT = 1e-3
-"""Largest ratio of the axes of an ellipse that counts as a straight line."""
+"""Largest 2 a b/(a^2 + b^2) of an ellipse with the semi-axes a and b that counts as a straight line."""
 
 _COUPLING, _MIN_COUPLING_ROUNDINGS = 1e-9, 100.0
 """Size of the added coupling that separates two whirls of one speed, relative to the matrices of the machine, and its minimum

@@ -36,7 +36,7 @@ class ThresholdCurve(Result):
     - `least` (V,): the lowest speed at which a start was captured, NaN if there is none. If it is below the threshold, both
       captures and failures occur between this speed and the threshold
     - `last_change` (V,): change of the threshold by the last doubling of the steps
-    - `converged` (V,): False if this change was larger than the spacing of the computed speeds
+    - `converged` (V,): False if this change was larger than the `resolution`, or without one than the spacing of the speeds
     - `turns` of the rotor of each run
     """
 
