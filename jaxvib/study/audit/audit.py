@@ -173,8 +173,8 @@ def audit(
     report("the scene", 0.0)
     values = repeated.values(scene, repeated.tier(scene))
     until = comparison.until if isinstance(comparison, RunComparison) else None
-    # For a machine that hardly moves, the typical effects are chosen for an amplitude as large as the unbalance radius S/M of its
-    # loads.
+    # For a machine that hardly moves, the typical effects are chosen for amplitudes of the size of the unbalance radius S/M of
+    # its loads.
     amplitude = [a * (values.magnified / MIN_AMPLITUDE_SHARE if values.magnified > 1.0 else 1.0) for a in values.amplitude]
     variants = [*present_variants(scene, until), *possible_variants(scene, amplitude, possible)]
     finite_status = "done" if values.uncertainty <= 0.5 * accuracy else "unsettled"
