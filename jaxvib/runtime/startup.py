@@ -20,7 +20,7 @@ def start() -> None:
     public name of jaxvib, other than errors and names of `jaxvib.runtime`, and when the first part of a scene is made. It
     issues a warning
 
-    - if JAX has already begun to compute, because XLA's options then have no effect
+    - with such a version, if JAX has already begun to compute, because XLA's options then have no effect
     - if programs cannot be cached
     """
     if os.environ.get("JAXVIB_AUTOMATIC", "").lower() in ("off", "0", "no", "false"):
