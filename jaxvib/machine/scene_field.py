@@ -13,8 +13,8 @@ from jaxvib.results.fields import as_text
 def mass_names(scene: Scene) -> tuple[str, ...]:
     """Return the names of the loads, and of the rotors of exciters without loads.
 
-    The first load has the name "1" in a scene with one exciter; with several exciters, "2.1" is the first load of exciter 2,
-    and "2" its rotor. A single exciter without loads has no names.
+    The first load has the name "1" in a scene with one exciter; with several exciters, "2.1" is the first load of exciter 2, or
+    "2" is its rotor if it has no loads. A single exciter without loads has no names.
     """
     counts = [0 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters]
     if len(counts) == 1:

@@ -267,7 +267,8 @@ class Store:
         return np.bincount(self._values("status", region).ravel(), minlength=len(CASE_STATUSES))[: len(CASE_STATUSES)]
 
     def pieces(self) -> list[slice]:
-        """Return slices of the first dimension; each has whole chunks and at most about a million cases."""
+        """Return slices of the first dimension; each has whole chunks: one row of them, or several with at most about a million
+        cases."""
         wide = max(int(np.prod(self.shape[1:], dtype=np.int64)), 1)
         rows = max(1, (1 << 20) // (wide * self.tile[0])) * self.tile[0]
         return [slice(k, min(k + rows, self.shape[0])) for k in range(0, self.shape[0], rows)]

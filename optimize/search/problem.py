@@ -188,7 +188,7 @@ def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand
     """Return the problem of a search with its followed speeds and the scale of each demand.
 
     The scale is the modulus of the limit. If the limit is 0 or a quantity, it is the larger of the moduli of the demand's
-    quantity and limit for the initial design, or 1 if both are 0 within rounding.
+    quantity and limit for the initial design, or 1 if both are 0 within rounding or one of them is not finite.
     """
     forms = tuple(demand.form() for demand in demands)
     keys, parts, program = _targets_of_search(space, objective, forms)
