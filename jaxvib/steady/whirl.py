@@ -139,10 +139,14 @@ class Whirl(Result):
         Critical speeds are marked on the line on which the whirl frequency is equal to the rotor speed. A vertical line marks
         the working speed `at` if it is given.
 
-        **Arguments**: `at`, rad/s; `unit` of the speeds.
+        **Arguments**: `at`, rad/s; `unit` of the speeds. **Raises** `InputError` for whirls at a single rotor speed, and for an
+        `at` that is not finite.
         """
         from jaxvib.draw.whirl import campbell_diagram  # slow import
 
+        if self.rotor_speed.shape[0] < 2:
+            problem = "is a single speed; a Campbell diagram needs several, such as whirl(scene, numpy.linspace(0.0, 500.0, 101))"
+            raise InputError("rotor_speed", problem)
         if at is not None and not np.isfinite(at):
             raise InputError("at", f"is {at:g} rad/s; it must be finite")
         critical = (np.asarray(self.critical.speed), self.critical.sense)

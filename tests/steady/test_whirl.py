@@ -90,6 +90,8 @@ def test_campbell_diagram_has_both_senses():
     assert found.speed.shape == (13, 4)
     labels = [line.get_label() for line in found.plot().axes[0].lines]
     assert "forward whirl" in labels and "backward whirl" in labels
+    with pytest.raises(jv.InputError, match="rotor_speed is a single speed; a Campbell diagram needs several"):
+        jv.whirl(published_rotor()).plot()
 
 
 def test_platforms_do_not_whirl():
