@@ -503,7 +503,7 @@ def test_an_interrupt_ends_a_command_at_once(moment, options):
 
 
 INTERRUPTED = """
-import signal, sys, threading, time
+import signal, sys, threading, time, jaxvib.cli.app
 from jaxvib_command import main
 
 def interrupted(arguments):
@@ -531,7 +531,7 @@ def test_interrupts_end_a_search_whose_threads_compile():
 
 
 LOST = """
-import signal, sys, time, weakref
+import signal, sys, time, weakref, jaxvib.cli.app
 from importlib.machinery import ExtensionFileLoader
 from jaxvib_command import main
 
