@@ -140,8 +140,8 @@ class BalancedStates(Result):
         angle, or of balls and rollers with a `ball_radius` side by side. If one load outweighs all others together, they do not
         cancel small imbalances."""
         sides, touching = _sides(turning_loads(self.scene)), _touching_angle(self.scene)
-        ordered = has_term(self.scene.all_effects, LoadInteraction)
-        return np.array([_largest_sum(sides[plane.loads], touching, ordered=ordered) for plane in _planes(self.scene)])
+        chains = [sides[plane.loads] * np.exp(1j * touching * np.arange(plane.loads.size)) for plane in _planes(self.scene)]
+        return np.array([abs(np.sum(chain)) for chain in chains])
 
     def _angles_of(self, arrangement: int) -> np.ndarray:
         """Return the angles of an arrangement. **Raises** `ComputationError` if there is no arrangement."""
@@ -274,14 +274,6 @@ def _touching_angle(scene: Scene) -> float:
     """Return the angle between two loads that touch each other, rad; 0 for loads without a size."""
     loads = turning_loads(scene)
     return 0.0 if loads.ball_radius is None else float(np.max(2.0 * np.arcsin(loads.ball_radius / loads.radius)))
-
-
-def _largest_sum(sides: np.ndarray, touching: float, *, ordered: bool) -> float:
-    """Return the largest unbalance of loads side by side, kg m. It is largest with the heaviest loads in the middle; `ordered`
-    loads keep their order on the circle, in which any load can be the first."""
-    ascending = np.sort(sides)
-    orders = [np.roll(sides, k) for k in range(sides.size)] if ordered else [np.append(ascending[0::2], ascending[1::2][::-1])]
-    return max(abs(np.sum(order * np.exp(1j * touching * np.arange(sides.size)))) for order in orders)
 
 
 def _sides(loads: CircularLoads) -> np.ndarray:

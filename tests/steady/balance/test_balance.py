@@ -99,17 +99,6 @@ def test_balls_need_room_beside_each_other(share, status):
         assert np.min(gaps) >= 2.0 * half
 
 
-@pytest.mark.parametrize("effects", [(), (jv.LoadContact("50 N/mm", 10.0),)])
-def test_capacity_is_that_of_the_best_order(effects):
-    mass, angle = np.array([0.3, 0.7, 0.4, 0.5]), 2.0 * np.arcsin(0.11)
-    drum = jv.balls(count=4, mass=mass, radius=0.1, ball_radius=0.011, drag=0.1)
-    machine = jv.planar_rotor(mass=28.0, stiffness=9500.0, damping=40.0)
-    orders = itertools.permutations(range(4)) if not effects else [np.roll(np.arange(4), k) for k in range(4)]
-    most = max(abs(np.sum(0.1 * mass[list(order)] * np.exp(1j * angle * np.arange(4)))) for order in orders)
-    states = jv.balanced_states(jv.Scene(machine, drum, jv.ConstantSpeed(115.0), effects))
-    assert states.capacity == pytest.approx([most], rel=1e-12)
-
-
 @pytest.mark.parametrize(
     ("mass", "status", "sentence"),
     [([0.3], "alone", "single load"), ([0.3, 0.2], "outweighed", "larger"), ([0.1, 0.1, 0.1, 0.4], "outweighed", "larger")],
