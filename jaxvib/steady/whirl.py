@@ -145,7 +145,7 @@ class Whirl(Result):
         from jaxvib.draw.whirl import campbell_diagram  # slow import
 
         if self.rotor_speed.shape[0] < 2:
-            problem = "is a single speed; a Campbell diagram needs several, such as whirl(scene, numpy.linspace(0.0, 500.0, 101))"
+            problem = "is a single speed; a Campbell diagram needs several, such as numpy.linspace(0.0, 500.0, 101)"
             raise InputError("rotor_speed", problem)
         if at is not None and not np.isfinite(at):
             raise InputError("at", f"is {at:g} rad/s; it must be finite")
