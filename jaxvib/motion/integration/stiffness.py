@@ -23,7 +23,10 @@ from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.runtime.programs import cached
 
 _MAX_DECAY_PER_STEP = 3.0
-"""Largest product of decay rate and length of an explicit step for which the method is accurate; above 5.2 it diverges."""
+"""Largest product of decay rate and length of an explicit step for which the method is accurate."""
+
+_MAX_STABLE_DECAY_PER_STEP = 5.1
+"""Largest product of decay rate and length of an explicit step for which the method is stable; above 5.17 it diverges."""
 
 _MAX_CONTACT_PER_STEP = 1.0
 """Largest product of the rate during a contact and the length of a step, about a third of a contact, for which runs do not
@@ -209,8 +212,8 @@ def equal_step_length(fastest: float, decay: float, per_radian: float, step: flo
 
 
 def is_unresolved(decay: Array | np.ndarray, step: Array | float) -> Array | np.ndarray:
-    """Return True if `decay`, 1/s, times the length `step` of explicit steps, s, is above 6; such steps diverge."""
-    return decay * step > 2.0 * _MAX_DECAY_PER_STEP
+    """Return True if explicit steps of the length `step`, s, diverge because of the decay rate `decay`, 1/s."""
+    return decay * step > _MAX_STABLE_DECAY_PER_STEP
 
 
 def resolves_contact(contact: Array, step: Array | float) -> Array:

@@ -1,5 +1,6 @@
 """Loads that decay faster than anything moves: which steps are taken, and that they give what SciPy's implicit method gives."""
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -54,7 +55,18 @@ def test_steps_resolve_decay_or_are_implicit():
         1e-3,
         True,
     )
-    assert bool(is_unresolved(7000.0, 1e-3)) and not bool(is_unresolved(5000.0, 1e-3))
+
+
+@pytest.mark.parametrize("decay", [5.0, 5.09, 5.2, 5.9])
+def test_steps_are_unresolved_where_the_method_diverges(decay):
+    """A step multiplies a decaying value by R = 1 + z b (1 - z A)^-1 e, with z = -decay times the length of the step."""
+    tableau = diffrax.Dopri8.tableau
+    weights = np.asarray(tableau.b_sol)
+    stages = np.zeros((weights.size, weights.size))
+    for i, row in enumerate(tableau.a_lower):
+        stages[i + 1, : i + 1] = row
+    factor = 1.0 - decay * weights @ np.linalg.solve(np.eye(weights.size) + decay * stages, np.ones(weights.size))
+    assert bool(is_unresolved(decay, 1.0)) == (abs(factor) > 1.0)
 
 
 KLOSS = {"speed": 50.0, "breakdown_torque": 120.0, "breakdown_slip": 0.05, "inertia": 0.02}
