@@ -29,13 +29,13 @@ def campbell_diagram(
     """Draw whirl frequencies over the rotor speed: lines of forward whirls are solid, of backward whirls dashed, of straight
     motions dash-dotted.
 
-    **Arguments** (ns rotor speeds, nd whirls at each)
+    **Arguments** (ns rotor speeds, at least 2, and nd whirls at each)
 
     - `rotor_speed` (ns,), `speed` (ns, nd): rotor speed and whirl frequencies, rad/s, drawn in `unit`
     - `sense` (ns, nd): "forward", "backward" or "straight"
     - `critical`: critical speeds (k,), rad/s, and their senses (k,), marked with their values on the line whirl frequency =
       rotor speed
-    - `at`: working speed, rad/s; default: the rotor speed if there is only one, otherwise none
+    - `at`: working speed, rad/s; default: none
 
     >>> import numpy as np
     >>> n = np.linspace(0.0, 2.0, 5)
@@ -46,9 +46,7 @@ def campbell_diagram(
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
     for word, (color, line, label) in _SENSES.items():
         for k, values in enumerate(whirl_lines(speed, sense == word)):
-            alone = {"marker": "o", "ms": 4.0} if len(rotor_speed) == 1 else {}
-            axis.plot(scale * rotor_speed, scale * values, ls=line, color=color, label=None if k else label, **alone)
-    at = float(rotor_speed[0]) if at is None and len(rotor_speed) == 1 else at
+            axis.plot(scale * rotor_speed, scale * values, ls=line, color=color, label=None if k else label)
     found = np.zeros(0) if critical is None else critical[0][np.isfinite(critical[0])]
     right = scale * max(float(np.max(rotor_speed)), 0.0 if at is None else 1.05 * at)
     top = 1.12 * scale * max(float(np.nanmax(speed)), *(w for w in found if scale * w <= right), 1e-300)
@@ -58,8 +56,12 @@ def campbell_diagram(
         axis.plot([], [], "o", ms=6.0, mfc="white", mec="black", label=f"critical speeds (no damping), {unit}", ls="")
     if at is not None:
         axis.axvline(scale * at, label="working speed", **WORKING)
-    left = scale * float(np.min(rotor_speed)) if len(rotor_speed) > 1 else 0.0
-    axis.set(xlim=(left, right), ylim=(0.0, top), xlabel=f"rotor speed, {unit}", ylabel=f"whirl frequency, {unit}")
+    axis.set(
+        xlim=(scale * float(np.min(rotor_speed)), right),
+        ylim=(0.0, top),
+        xlabel=f"rotor speed, {unit}",
+        ylabel=f"whirl frequency, {unit}",
+    )
     legend_above(axis, 3)
     return figure if ax is None else ax
 

@@ -151,17 +151,6 @@ def test_whirls_have_a_line_for_each_sense():
     assert marks == [([[4.5, 4.5]], "s"), ([[7.0, 7.0]], "o")]
     assert axis.get_xlim() == (0.0, 10.0) and axis.get_ylim() == (0.0, pytest.approx(1.12 * 8.0))
     assert at_x(axis, "--") and [text.get_text() for text in axis.texts] == ["4.5 backward", "7 forward"]
-    (alone,) = (
-        line
-        for line in campbell_diagram(n[1:], speed[1:, :1], sense[1:, :1], unit="rad/s").axes[0].lines
-        if line.get_marker() == "o"
-    )
-    assert alone.get_xydata().tolist() == [[10.0, 4.0]]
-
-
-def test_one_rotor_speed_is_the_operating_speed():
-    axis = campbell_diagram(np.array([10.0]), np.array([[4.0]]), np.array([["forward"]]), unit="rad/s").axes[0]
-    assert named(axis)["working speed"][0][0] == 10.0 and axis.get_xlim() == pytest.approx((0.0, 10.5))
 
 
 def test_critical_speeds_are_grouped_by_their_neighbour():
