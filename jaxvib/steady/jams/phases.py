@@ -256,7 +256,7 @@ def growth_of_free_loads(scene: Scene, omega: Array, rotor_speed: Array | None =
     return np.where(near, found.growth, np.nan)
 
 
-@eqx.filter_jit
+@cached
 def _coincident_jams(scene: Scene, omega: Array, rotor_speed: Array) -> PhaseJam:
     together = jnp.zeros(scene.loads.count, omega.dtype)
     return jax.vmap(lambda w, n: jam_from(scene.replace(drive=ConstantSpeed(n)), w, together))(omega, rotor_speed)
