@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import html
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -28,9 +28,6 @@ from jaxvib.units.reading import in_own_unit, unit_ratio
 
 MAX_USUAL_SPEED = 700.0
 """Largest usual speed of a rotor, rad/s. A larger plain number was probably intended in rpm."""
-
-_TEXT, _SKETCH = "jaxvib.machine.files:scene_text", "jaxvib.show.moving:sketch_svg"
-"""Functions that represent a scene. They are named, because their modules import this one."""
 
 _MIN_RATIO = 1e-15
 """Ratio of two numbers below which a sum in double precision loses the smaller one."""
@@ -205,11 +202,6 @@ def _require_inertia(unbalance: float, mass: float, inertia: float) -> None:
         raise InputError("drive", f"{problem}, S^2/m = {smallest:g} kg m^2; the inertia must include the unbalance")
 
 
-def _function_named(name: str) -> Callable[[Scene], str]:
-    module, _, function = name.partition(":")
-    return getattr(importlib.import_module(module), function)
-
-
 class Scene(Part):
     """Complete description of a machine in motion; a frozen pytree of SI numbers.
 
@@ -287,16 +279,18 @@ class Scene(Part):
 
     def __repr__(self) -> str:
         """Return the scene as the text of a scene file with units; traced scenes and own kinds of parts as their fields."""
+        files = importlib.import_module("jaxvib.machine.files")  # imports this module
         try:
-            return _function_named(_TEXT)(self).rstrip()
+            return files.scene_text(self).rstrip()
         except InputError:
             return super().__repr__()
 
     def _repr_html_(self) -> str:
         """Return the representation and, if the scene can be drawn, its sketch, for notebooks."""
+        sketches = importlib.import_module("jaxvib.show.moving")  # imports this module
         text = f"<pre>{html.escape(repr(self))}</pre>"
         try:
-            return text + _function_named(_SKETCH)(self)
+            return text + sketches.sketch_svg(self)
         except InputError:
             return text
 
