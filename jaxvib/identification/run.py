@@ -215,10 +215,10 @@ def parse_change(value: Number, field: str) -> Change:
         return Change("set", float(number(value, "", field)))
     text = value.strip()
     if text[:1] in ("+", "-"):
-        rest = text[1:].strip()
-        if rest.endswith("%") and is_number(rest[:-1], ","):
-            return Change("scale", 1.0 + float(f"{text[0]}1") * float(rest[:-1]) / 100.0)
-        return Change("add", f"-{rest}" if text[0] == "-" else rest)
+        amount = text[1:].strip() if text[0] == "+" else f"-{text[1:].strip()}"
+        if amount.endswith("%") and is_number(amount[:-1], ","):
+            return Change("scale", 1.0 + float(amount[:-1]) / 100.0)
+        return Change("add", amount)
     if not text:
         raise InputError(field, "is empty; write for example '+10 kg' or '95 kg'")
     return Change("set", text)
