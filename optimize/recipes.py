@@ -142,7 +142,7 @@ def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
 def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: int = 16) -> list[tuple[str, Synthesis]]:
     """Determine which spring of an existing machine should be exchanged.
 
-    For each spring, the best machine that differs in this spring only is searched for.
+    For each spring, a search finds the best machine that differs in this spring only.
 
     **Arguments**: `objective`: the quantity to minimize; `range_`: the factor by which a spring may differ; `starts` of each
     search.
@@ -174,7 +174,7 @@ def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[
     if mass.ndim:
         raise InputError("loads.mass", "differs from load to load; this recipe needs equal loads")
     amplitude_of_mode = amplitude(mode=mode, of=of)
-    amplitude_of_mode(scene)  # refuses a mode and a platform that the machine does not have
+    amplitude_of_mode(scene)  # raises an error for a mode or a platform that the machine does not have
     space = DesignSpace(scene, {"loads.mass": (float(mass) / 10.0, float(mass) * 10.0)})
     _positive(least, "m", "least")
     return Design(space, total_mass(), subject_to=(amplitude_of_mode > least,))

@@ -50,7 +50,7 @@ STROKES = ("-", (0, (6, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
 """Line styles of series; with `MARKERS` they distinguish series without colours."""
 
 WHITE_OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
-"""Effect of texts over curves."""
+"""Outline of texts over curves."""
 
 UNSTABLE = (0, (3, 2))
 """Dash pattern of unstable parts."""

@@ -116,7 +116,7 @@ class RotorDynamics(eqx.Module):
 
     - `levers` of the loads and `rotor_levers`, see `Mount`
     - `housing_row`: row (1, nd) of the rotation of the housing, None if it does not turn
-    - `drive` in the direction of the exciter
+    - `drive`, whose angle and speed are positive anticlockwise for either direction of the exciter
     - `unbalance` about the axis, kg m, or None
     - `effects`, prepared for the loads
     - `axes` of the mount

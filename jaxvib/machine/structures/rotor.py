@@ -157,8 +157,8 @@ class Rotor(Machine):
         return np.array([0.0, 1.0, 0.0, 0.0])
 
     def shaft_supports(self) -> list[tuple[float, float, float]]:
-        """Return the place, vertical stiffness and vertical damping of both supports; if terms replace these, the values that
-        have the same c1, c2, b1 and b2."""
+        """Return the place, vertical stiffness and vertical damping of both supports. If terms replace the supports, the values
+        are those that give the same c1, c2, b1 and b2."""
         position = np.asarray(self.position)
 
         def vertical(across: Array, up: Array | None, terms: Array | None) -> list[float]:
@@ -292,7 +292,7 @@ def _distinct(stations: np.ndarray | float) -> np.ndarray:
 def _require_passive(field: str, one: float, two: float, three: float) -> None:
     if min(one, three) < 0.0 or two**2 > one * three * (1.0 + 1e-9):
         problem = (
-            "would add energy to the rotor; the first and the last must be at least 0, and their product "
+            "are not the terms of any supports; the first and the last must be at least 0, and their product "
             "at least the square of the middle one"
         )
         raise InputError(f"machine.{field}", f"{[one, two, three]} {problem}")

@@ -39,7 +39,7 @@ def arrangements(loads: np.ndarray, imbalance: complex, touching: float, *, orde
     fixed, at = (0, 0.0) if free else (n, np.angle(imbalance))
     angles = np.mod(directions - directions[:, fixed, None] + at, 2.0 * np.pi)[:, :n]
     turned = np.sort(angles, axis=1)
-    # The loads of these arrangements are as far from each other as the balance allows.
+    # Equal loads are as far from each other in these arrangements as the balance allows.
     if np.min(np.diff(turned, append=turned[:, :1] + 2.0 * np.pi)) < touching * (1.0 - 1e-9):
         return Arrangements("no_room", np.zeros((0, n)), 0, [], ())
     if ordered:
@@ -59,9 +59,8 @@ def inscribed_polygon(sides: np.ndarray) -> np.ndarray:
     def centre_angles(x: float) -> np.ndarray:
         return 2.0 * np.arcsin(np.minimum(sides / sides[largest] * x, 1.0))
 
-    # x = largest side / diameter. The centre is inside the polygon if the angles of the sides at x = 1 add up to a full turn or
-    # more. Otherwise the centre is beyond the largest side, whose angle is then the sum of the others, in the opposite
-    # direction.
+    # x = largest side / diameter. The centre is inside the polygon if the central angles of the sides at x = 1 add up to a full
+    # turn or more. Otherwise it is outside, beyond the largest side, whose central angle is then the sum of the others.
     inside = centre_angles(1.0).sum() >= 2.0 * np.pi
     others = np.arange(sides.size) != largest
 
