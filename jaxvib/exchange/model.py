@@ -57,7 +57,7 @@ def foundation_forces(machine: Machine) -> tuple[Signal, ...]:
 
 
 def omit_unknown_force(machine: Machine, force: Array) -> Array:
-    """Return the force on the foundation without entries if the foundation is unknown, see `foundation_forces`."""
+    """Return the force on the foundation; an empty array if the foundation is unknown, see `foundation_forces`."""
     return force if machine.has_foundation else force[:0]
 
 
@@ -110,11 +110,11 @@ class _TorqueInput(MotorWrapper):
         self.motor, self.extra, self.is_alone, self.kind = motor, extra, is_alone, "torque_input"
 
     def torque(self, speed: Array) -> Array:
-        """Return the steady torque of the motor, unless it is replaced, and the additional torque."""
+        """Return the additional torque plus the steady torque of the motor; without the latter if it is replaced."""
         return self.extra if self.is_alone else self.motor.torque(speed) + self.extra
 
     def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
-        """Return the torque of the motor at time `t`, unless it is replaced, and the additional torque."""
+        """Return the additional torque plus the torque of the motor at time `t`; without the latter if it is replaced."""
         return self.extra if self.is_alone else self.motor.torque_at(t, speed, states) + self.extra
 
 

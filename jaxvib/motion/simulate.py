@@ -265,7 +265,7 @@ _MAX_ACCURACY_RUNS = 6
 
 
 def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
-    """Return the first run, with successively smaller tolerances, whose estimated error is at most `accuracy`.
+    """Repeat a run with smaller and smaller tolerances, and return the first one whose estimated error is at most `accuracy`.
 
     The status is `not_accurate` if no tolerance is small enough.
     """

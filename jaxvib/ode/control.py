@@ -45,8 +45,8 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
 
     - `tolerance`, a scalar without a unit
     - `unit`, a tree like the state: the scale of each entry, in its unit
-    - `relative`, a tree like the state: the fraction of |y| that is added to the scale. It is 0 for angles, because they grow
-      without limit, and a long run would lose its phase with an error relative to them
+    - `relative`, a tree like the state: the fraction of |y| that is added to the scale. It is 0 for angles: they grow without
+      limit, and so would their permitted error
     - `max_steps`: a whole number, None for no limit
 
     >>> import diffrax, jax, jax.numpy as jnp

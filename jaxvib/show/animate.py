@@ -112,7 +112,7 @@ def animate(
     if turns / count > _MAX_TURNS_PER_FRAME:
         latest_end = first + _MAX_TURNS_PER_FRAME * 2.0 * np.pi * count / speed
         problem = (
-            f"turns rotor or loads by {turns / count:.3g} turns from one frame to the next, which looks like another speed"
+            f"lets rotor or loads turn by {turns / count:.3g} turns from one frame to the next, which looks like another speed"
         )
         more = "" if count == _MAX_FRAMES else ", or make the animation longer"
         raise InputError("end", f"{problem}; end at {latest_end:.4g} s or before{more}")

@@ -163,7 +163,7 @@ def test_frames_are_enough_for_the_speed_that_is_shown():
         (lambda run, orbit: jv.animate(run, end=3.0), "begin selects .* the run keeps 0 to 2 s"),
         (
             lambda run, orbit: jv.animate(run, begin=0.0, seconds=1.0),
-            "end turns rotor or loads by 0.955 turns .* or make the animation longer",
+            "end lets rotor or loads turn by 0.955 turns .* or make the animation longer",
         ),
         (lambda run, orbit: jv.animate(run, seconds=-1.0), "seconds is -1 s; it must be greater than 0"),
         (

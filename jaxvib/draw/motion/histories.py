@@ -17,8 +17,8 @@ _MAX_PLAIN_PERIODS = 40
 """Maximum number of periods of a run that is drawn without bands."""
 
 _MAX_BEATS, _SAMPLES_PER_INTERVAL, _MIN_SAMPLES = 20, 10, 1000
-"""Maximum number of beats of an averaged history that is drawn as a curve. A history with more beats is a band between the
-minimum and the maximum of `_SAMPLES_PER_INTERVAL` samples, if it has at least `_MIN_SAMPLES`."""
+"""Maximum number of beats of an averaged history that is drawn as a curve. A history with more beats and at least
+`_MIN_SAMPLES` samples is drawn as a band between the minima and maxima of intervals of `_SAMPLES_PER_INTERVAL` samples."""
 
 _SHOWN_PERIODS = 3
 """Number of periods at the end that are drawn as curves."""

@@ -74,7 +74,7 @@ class BalancedStates(Result):
       loads in two planes "turn in plane 1", "shape 1 in plane 1", ...
     - `scene`
 
-    For a plane in which all loads are on one line, there is one more neutral direction than `dimension` counts, except for two
+    If all loads of a plane are on one line, the plane has one neutral direction more than `dimension` counts. Exception: two
     loads on a rotor without imbalance.
     """
 
@@ -266,7 +266,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
 
 def _status(names: list[str]) -> BalanceStatus:
-    """Return the status of loads in several planes: of the statuses of the planes, the first one in `order` below."""
+    """Return the status of loads in several planes: that of the plane whose status comes first in `order` below."""
     order = ("alone", "outweighed", "no_room", "family", "unique")
     return getattr(BalanceStatus, min(names, key=order.index))
 
@@ -469,7 +469,7 @@ def stability_changes(
 
 
 def _rounding() -> float:
-    """Return the relative difference from 0 that counts as rounding."""
+    """Return the largest relative value that counts as 0, because it can be caused by rounding."""
     return max(1e-9, 32.0 * float(np.finfo(float_dtype()).eps))
 
 

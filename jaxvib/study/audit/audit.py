@@ -29,7 +29,7 @@ from jaxvib.study.audit.variants import possible_variants, present_variants, req
 from jaxvib.units import Number, count, number
 
 _TIER_STEPS = 1
-"""Number of effects that take as long as the comparison of all tiers; used for the share that `progress` reports."""
+"""Estimated time of the comparison of all tiers, in units of the time of one effect; `progress` reports shares."""
 
 
 class AuditStatus(eqx.Enumeration):
@@ -207,7 +207,7 @@ def audit(
 
 
 def _with_computed_advice(row: NumberRow, effects: Sequence[EffectRow]) -> NumberRow:
-    """Return the row of a dimensionless number, with the advice on its effect in the audit if the audit has a clear result."""
+    """Return the row of a dimensionless number. If the audit has a clear advice on its effect, the row contains this advice."""
     for effect in effects:
         if effect.effect == row.name.partition(":")[0] and effect.advice != "cannot tell":
             return row._replace(advice=effect.advice, note=f"{row.note}; the advice is that of the computed effect")

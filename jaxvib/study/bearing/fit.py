@@ -220,8 +220,7 @@ def _least_squares(
         damped = normal + damping * jnp.diag(jnp.diagonal(normal))
         change = jnp.linalg.solve(damped, triangle.T @ reached)
         variance = cost / (n - p) + floor
-        # Squares of the lengths, in standard errors, of the damped and of the undamped step from the best point so far. At a
-        # kink no later trial may have a smaller sum of squares than this point.
+        # Squares of the lengths, in standard errors, of the damped and of the undamped step from the best point so far.
         length_squared, next_step_squared = jnp.sum((triangle @ change) ** 2) / variance, jnp.sum(reached**2) / variance
         return count + 1, x - change, damping, length_squared, *best, next_step_squared
 
