@@ -94,8 +94,8 @@ class Limit(NamedTuple):
     - `what`: the condition as text; `value` of its quantity and its `limit`, in the SI `unit`
     - `violation`: relative violation of the condition (0: met; infinite: the machine does not have the quantity)
     - `active`: True if it limits the design
-    - `multiplier`: derivative of the objective with respect to the limit, in the direction that relaxes the limit (for held
-      quantities: an increase of the held value), times the modulus of the limit; in the unit of the objective
+    - `multiplier`: derivative of the objective with respect to a relative relaxation of the limit (for held quantities: a
+      relative increase of the held value), in the unit of the objective
     - `gain`: change of the objective, percent, if the limit is relaxed by 1 %, predicted from this derivative; negative for an
       improvement. A prediction of more than a few percent is not reliable
     - `written`: unit in which the user wrote the limit, such as "mm"; "" for the default display unit

@@ -167,8 +167,9 @@ def linear_model(scene: Scene) -> LinearModel:
 def mean_speed(scene: Scene, unbalances: Array | None = None) -> Array:
     """Return the mean speed of all rotors, rad/s, anticlockwise.
 
-    Rotors turn at the working speeds of their drives. If `unbalances`, rad/s, is given, rotors without loads turn at this speed
-    instead.
+    Rotors turn at the working speeds of their drives.
+
+    **Arguments**: `unbalances`: speed of the rotors without loads, rad/s; default: their working speeds.
     """
     speeds = [
         exciter.direction * (exciter.drive.speed if unbalances is None or exciter.loads is not None else unbalances)
@@ -429,7 +430,7 @@ def require_circular(loads: Loads, drive: Drive) -> None:
     """
     if not loads.circular:
         needed = "this function needs loads on a circle with viscous drag (property circular): ball, roller, pendulum"
-        raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {needed}; use simulate for others")
+        raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {needed}; use simulate for other loads")
     if not drive.ideal:
         raise InputError(
             "drive.kind",

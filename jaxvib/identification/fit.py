@@ -1,6 +1,6 @@
 """Least-squares fit of a machine to recorded runs by the method of Levenberg and Marquardt with projected linear unknowns.
 
-At every trial the linear unknowns (first states, unbalances, offsets) are computed by linear least squares. Only the steps of
+At every trial the linear unknowns (initial states, unbalances, offsets) are computed by linear least squares. Only the steps of
 the other unknowns are damped. The noise of each channel follows from its residuals, and the fit is repeated with whitened
 residuals. Outliers among the residuals have little influence; a clipped reading is a bound of the true value. If the error of a
 rotor's angle is not small compared with the noise, the angle is fitted together with the machine.
@@ -49,8 +49,8 @@ _STEADY_VALUES = 0.05
 """Change of the unknowns in a pass, in standard errors, below which the influence of outliers and bounds is final."""
 
 _MAX_GROWTH = 1.2
-"""Ratio of the standard deviation of residuals to that in a fit with white noise, above which the coloured noise is regarded as
-a part of the motion: noise with the frequencies of the machine can describe a free decay of its vibration."""
+"""Largest ratio of the standard deviation of residuals in a fit with coloured noise to that in the fit with white noise. Above
+it, the coloured noise is a part of the motion: noise with the frequencies of the machine can describe its free decay."""
 
 _ANGLE_MATTERS = 0.03
 """Share of the noise due to the error of the rotor's angle above which the angle is fitted with the machine."""
@@ -75,8 +75,8 @@ class Fitted(NamedTuple):
     - `outliers` (C,) of each run: share of the residuals that are outliers
     - `converged`: True if the last descent reached a minimum
     - `is_absorbed`: True if coloured noise would take up a part of the motion; the noise of the fit is white then
-    - `misfits` of each run: deviation of the rotor from its torque balance, relative to that from a smooth curve; empty if no
-      parameter of a motor is unknown
+    - `misfits` of each run: standard deviation of the rotor's readings from the torque balance, divided by that from a smooth
+      curve; empty if no parameter of a motor is unknown
     """
 
     x: np.ndarray
@@ -351,8 +351,8 @@ def descend(
     With `bend`, each damped step is corrected for the second derivative of the model along it. In a curved valley of the cost,
     such steps are much longer than those of the linearized model.
 
-    A parameter that tends to 0 stays at a value that the data do not distinguish from 0. With its logarithm as the unknown, the
-    expected reduction of the cost would remain the same at every smaller value, and the descent would never end.
+    A parameter that the data do not distinguish from 0 is not reduced further. Its logarithm is the unknown, and the expected
+    reduction of the cost would remain the same at every smaller value: the descent would never end.
 
     **Arguments**: the first trial `best`, with its `cost`; `equations`: returns the equations of a trial; `stepped`: returns
     the trial after a step; `damped_count`: number of the first unknowns, whose steps are damped; `positive`: indices of the
@@ -511,7 +511,7 @@ def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
 
 
 def _is_absorbed(noise: Sequence[Sequence[Noise]], before: Fitted, after: Fitted) -> bool:
-    """Return True if the residuals of a channel with coloured `noise` have grown from a fit with white noise to another fit."""
+    """Return True if a channel with coloured `noise` has larger residuals `after` than `before` (fit with white noise)."""
     triples = zip(noise, before.noise, after.noise, strict=True)
     return any(
         len(each.taps) > 1 and new > _MAX_GROWTH * old

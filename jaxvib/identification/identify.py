@@ -250,7 +250,7 @@ def identify(
     problem = build_problem(scene, runs, unknown, known or {})
     free, readings = unknown_count(problem), sum(int(np.count_nonzero(mask)) for mask in problem.masks)
     if free >= readings:
-        problem = f"has {free} unknowns, including first states and offsets of the runs, for {readings} readings"
+        problem = f"has {free} unknowns, including initial states and offsets of the runs, for {readings} readings"
         raise InputError("unknown", f"{problem}; record longer runs")
     if problem.has_loads:
         problem, first = with_first_motion(problem)

@@ -61,11 +61,11 @@ def initial_state(
       state on the leading-order motion of a jam mode
     - `mode`: number of the jam mode, for "jam"; typical: 1, 3, 5, the modes that are stable for light loads
     - `angles` (count,): the angles of the loads about the axis of the rotor, rad; or one value for the middle of all loads
-      (default: the angle of `Loads.rest` at rest, and 0 in a jam). The displacements of a jam belong to the mean angle;
-      typical: -pi to pi
+      (default: the angle of `Loads.rest` at rest, and 0 in a jam). In a jam the displacements are those of coincident loads at
+      the mean angle; typical: -pi to pi
     - `separation`: angle between neighbouring loads, rad; typical: 0.02. For loads that touch (`LoadContact`) it is added to
-      the angle at which they are side by side. Default: at rest, side by side if the `ball_radius` of the loads is known,
-      otherwise 1 degree; 0 in a jam, whose theory assumes coincident loads, and for `angles` (count,). Loads with the same
+      the angle at which they are side by side. Default at rest: side by side if the loads have a `ball_radius`, otherwise
+      1 degree. Default in a jam (whose theory assumes coincident loads) and for `angles` (count,): 0. Loads with the same
       parameters that start at exactly one angle (`separation=0`) stay at one angle, even if slightly separated loads would not
     - `throw`: True to raise `ComputationError` if the mode does not exist; otherwise, and under a JAX transformation, the state
       is NaN
@@ -266,9 +266,10 @@ def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: 
     drives = []
     for exciter in scene.exciters:
         if not exciter.drive.constant:
-            raise InputError("start", f"is 'spin_up', but the drive is {quoted(exciter.drive.kind)} already; start at 'rest'")
+            drive = quoted(exciter.drive.kind)
+            raise InputError("start", f"is 'spin_up', which needs a constant speed, but the drive is {drive}; start at 'rest'")
         drives.append(SpinUp(exciter.drive.speed, end / 2.0 if spin_up is None else spin_up))
-    times, problem = (drives[0].duration, end), "is {:g} s, longer than the run of {:g} s; run longer"
+    times, problem = (drives[0].duration, end), "is {:g} s, longer than the run of {:g} s; shorten it, or run longer"
     require_if_known(lambda duration, end: duration <= end, *times, field="spin_up", problem=problem)
     return eqx.tree_at(lambda s: [exciter.drive for exciter in s.exciters], scene, drives)
 

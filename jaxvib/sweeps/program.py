@@ -96,7 +96,7 @@ def _measure_cases(
 
 
 def _ending(run: BatchRun | None) -> Array | int:
-    """Return the index in `CASE_STATUSES` of the outcome of a run, done without a run."""
+    """Return the index in `CASE_STATUSES` of the outcome of a run, or that of done if there is no run."""
     done, not_finite, not_resolved = (_STATUS_NUMBER[name] for name in ("done", "not_finite", "not_resolved"))
     if run is None:
         return done

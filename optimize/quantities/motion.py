@@ -73,8 +73,8 @@ def peak_displacement(
     - `body`: number of the body from 0; typical: 0 (the default)
 
     **Returns** `Quantity`; its derivatives exist in forward mode only; typical: 5 to 30 mm, two to four times the amplitude at
-    working speed. **Raises** `InputError` for times as in `peak_force`, and for a point that is not (x, y). A place that the
-    machine does not have raises it when the quantity is computed.
+    working speed. **Raises** `InputError` for times as in `peak_force`, and for a point that is not (x, y). For a place that
+    the machine does not have, `InputError` is raised when the quantity is computed.
 
     >>> from optimize import peak_displacement
     >>> (peak_displacement(until="10 s", at=(1.5, 0.1)) < "15 mm").words

@@ -175,7 +175,7 @@ def solve_model(
         return Step(solution.p, solution.held, solution.demands * _active(solution, demands), np.ones((len(hessian), 1)))
     values = (point.pieces - point.values[:, :1]) / size[:, None]
     slopes = point.piece_gradients / size[:, None, None]
-    # Only the pieces that can become largest in the trust region are used, and not many more than can meet at one kink.
+    # Only the 3 d + 8 pieces that can become largest in the trust region are used; d + 1 can meet at one kink.
     reachable = values + np.einsum("spd,sd->sp", np.abs(slopes), np.maximum(-box[0], box[1]))
     candidates = np.argsort(-reachable, axis=1)[:, : 3 * d + 8]
     values = np.take_along_axis(values, candidates, axis=1)
@@ -202,7 +202,7 @@ def solve_model(
 def _active(solution: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Return True (s, mi) for demands (slopes, excess) that are active after the step.
 
-    An interior-point method leaves small multipliers of inactive demands, which are not small relative to an objective near 0.
+    An interior-point method leaves small multipliers of inactive demands. Compared with an objective near 0 they are not small.
     """
     slopes, excess = demands
     slack = -excess - np.einsum("smd,sd->sm", slopes, solution.p[:, : slopes.shape[2]])

@@ -122,5 +122,5 @@ def test_a_spin_up_in_a_sweep_is_that_of_simulate(tmp_path):
     np.testing.assert_allclose(found.data["load_speed"].values, [run.omega for run in runs], rtol=1e-4)
     assert float(found.scene.drive.duration) == 5.0
     turning = jv.Scene(table, scene.loads, jv.SpinUp(60.0, duration=2.0))
-    with pytest.raises(jv.InputError, match="start is 'spin_up', but the drive is 'spin_up' already"):
+    with pytest.raises(jv.InputError, match="start is 'spin_up', which needs a constant speed, but the drive is 'spin_up'"):
         study(turning, {"loads.drag": [1.0]}, ["run.load_speed"], until=9.0, start="spin_up")

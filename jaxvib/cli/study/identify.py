@@ -69,8 +69,8 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     For a machine, RECORD is an identification file (TOML) with the names of a scene file, of recorded runs and of their
     channels. --out adds the fitted scene (found.toml), the figure and the fit (fit.npz).
 
-    For a bearing, RECORD is a CSV file with the time and the angle of a pendulum, whose swing on the bearing decays, or a
-    measurement file (TOML) with the name of the CSV file. Options replace the values in the measurement file. --out adds the
+    For a bearing, RECORD is a CSV file with the time and the angle of a pendulum that swings on the bearing, or a measurement
+    file (TOML) with the name of the CSV file. Options replace the values in the measurement file. --out adds the
     figure and the fit (fit.csv)."""
     import numpy as np  # slow imports, which --help does not need
 
@@ -123,7 +123,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
             table(f"friction of the bearing; {meaning}", ["", "value", "from", "to"], rows),
         ]
         if found.dry is not None:
-            lines.append(f"errors of mu1 and mu2 are correlated by {found.correlation:.3f}")
+            lines.append(f"correlation of the errors of mu1 and mu2: {found.correlation:.3f}")
         return "\n".join([*lines, *found.notes])
 
     output.done(document, text, "identify", found)

@@ -29,7 +29,7 @@ _NOISE_RATIO = 1.5
 `patterned`."""
 
 _NUMBER_ERROR = 1e-6
-"""Relative standard error that fixes the parameters while the first state of a nonlinear motion is fitted."""
+"""Relative standard error that fixes the parameters while the initial state of a nonlinear motion is fitted."""
 
 
 _MIN_FILTERED = 64
@@ -202,7 +202,7 @@ def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
         if name in fit.gain_names:
             x[first + k] = math.log(fit.gains[fit.gain_names.index(name)].value)
     fixed, means, precisions = pairs if has_mark or len(sizes) > 1 else None, problem.means, problem.precisions
-    if is_nonlinear(fit.scene):  # the first state has a nonlinear effect; the parameters are held by their priors
+    if is_nonlinear(fit.scene):  # the initial state has a nonlinear effect; the parameters are held by their priors
         held = problem._replace(means=x, precisions=np.full(x.size, _NUMBER_ERROR**-2))
         problem = (with_guided_motion if has_nonlinear_supports(fit.scene) else with_first_motion)(held)[0]
 

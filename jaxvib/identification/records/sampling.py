@@ -124,7 +124,7 @@ def _reduced_to_own_rate(time: np.ndarray, value: np.ndarray, where: str) -> tup
         return time, value, []
     part = slice(with_reading[0] % stride, None, stride)
     rate = 1.0 / float(np.median(np.diff(time[part])))
-    return time[part], value[part], [f"{where} has a reading at one of {stride} times only: its rate is {rate:.6g} Hz"]
+    return time[part], value[part], [f"{where} has a reading at only one in {stride} times: its rate is {rate:.6g} Hz"]
 
 
 def _on_grid(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:

@@ -102,7 +102,7 @@ class Drive(Part):
         return self._with_changed_parts(lambda part: part.settled())
 
     def at_working_speed(self) -> "Drive":
-        """Return the drive with its prescribed speed, if it has one, at the working speed, even if the rotor comes to rest."""
+        """Return the drive with the constant working speed in place of a prescribed speed, even if the rotor comes to rest."""
         return self._with_changed_parts(lambda part: part.at_working_speed())
 
     def _with_changed_parts(self, change: Callable[["Drive"], "Drive"]) -> "Drive":

@@ -139,11 +139,11 @@ class Effect(Part):
 
 
 class Gravity(Effect):
-    """Gravity on loads, unbalances and static imbalances: V = m g p_up(u), that is the torque -m g R cos phi on a load on a
-    circle and -S g cos theta on the rotor of an unbalance.
+    """Gravity on loads, unbalances and static imbalances: V = m g p_up(u).
 
-    V is the potential energy of a load of mass m at its position p(u), R its radius and phi its angle. S is the unbalance and
-    theta the angle of its rotor. Angles are measured from the horizontal direction.
+    V is the potential energy of a load of mass m at its position p(u). On a load on a circle the torque is -m g R cos phi, with
+    the radius R and the angle phi. On the rotor of an unbalance S the torque is -S g cos theta, with the angle theta of the
+    rotor. Angles are measured from the horizontal direction.
 
     Displacements of platforms are measured from static equilibrium under the weight of platforms and loads. Gravity therefore
     adds no force on the platforms.

@@ -127,7 +127,7 @@ def work_precision(
     if unknown or not solvers:
         raise InputError("solvers", f"are {quoted(list(solvers))}; name some of {', '.join(SOLVERS)}")
     if not tolerances:
-        raise InputError("tolerances", f"are {quoted(tuple(tolerances))}; name one at least, such as 1e-6")
+        raise InputError("tolerances", f"are {quoted(tuple(tolerances))}; give at least one, such as 1e-6")
     for k, tolerance in enumerate(tolerances):
         number(tolerance, "", f"tolerances[{k}]", low=0.0, open_low=True)
     count(repeats, "repeats")

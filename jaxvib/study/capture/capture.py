@@ -68,8 +68,8 @@ class Capture(Result):
     - `captured` (S, starts): True if all loads turned with the rotor at the end of the run
     - `finite` (S, starts): True if the motion stayed finite
     - `detached` (S, starts): True if a load lost contact with its wall at some time; the equations keep it on the wall
-    - `threshold`: midpoint between v and the next lower computed speed, where v is the lowest speed from which on every start
-      was captured
+    - `threshold`: midpoint between v and the next lower computed speed. v is the lowest speed such that every start at v and at
+      all higher speeds was captured
     - `uncertainty` of the threshold; NaN if there is no threshold. It is the largest of three numbers: half the distance
       between v and the next lower speed; half the distance from the threshold to the highest speed below it at which at least
       half of the starts fail; `last_change`
@@ -183,7 +183,7 @@ def capture(
       a capture may occur late
     - With a `resolution`, the interval between the two computed speeds around the threshold is divided by further speeds until
       it is small enough. The range above the first threshold is not refined: failures in an interval that is narrower than the
-      distance of the first speeds may remain undetected
+      spacing of the `speeds` may remain undetected
     - The scan is repeated with twice as many steps until the threshold changes by no more than the resolution or, without one,
       by no more than the spacing of the `speeds`
 
@@ -302,7 +302,7 @@ def _sliding_start(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
 
 
 def _threshold_index(captured: np.ndarray) -> int:
-    """Return the index of the lowest speed from which on all starts are captured, or the number of speeds if there is none."""
+    """Return the index of v, see `threshold` of `Capture`, or the number of speeds if there is none."""
     failing = np.flatnonzero(~np.all(captured, axis=1))
     return 0 if failing.size == 0 else int(failing[-1]) + 1
 
@@ -354,12 +354,12 @@ def _summarize_captures(
 
 
 def capture_time(run: Run, within: float = 0.05) -> Array:
-    """Return the time, s, from which on all load speeds stay within a band around the rotor speed.
+    """Return the time, s, after which all load speeds stay within a band around the rotor speed.
 
     This is the last time in the trajectory of the run at which the speed of a load differs from the rotor speed by more than
-    `within` times the rotor speed, interpolated linearly between the stored states. Forward and reverse derivatives exist. The
-    derivatives are valid as long as the same entry of the same load into the band is the last one. If another entry becomes
-    the last one, the time jumps, and the derivatives do not show this jump.
+    `within` times the rotor speed, interpolated linearly between the stored states. Forward and reverse derivatives exist. They
+    describe the entry of one load into the band. If a parameter changes so much that another entry becomes the last one, the
+    time jumps; the derivatives do not show this jump.
 
     **Arguments**: `run` with a trajectory; `within`: half the width of the band, relative to the rotor speed; typical: 0.01 to
     0.1 (default 0.05).

@@ -133,8 +133,8 @@ def stability_onset(
       this number
     - `accuracy` of x, relative; at least 1e-12; typical: 0.1 to 1e-3 (the default). Each diagram halves the range
 
-    **Returns** x, which is too large by at most `accuracy` (relative). **Raises** `InputError` for an unknown kind, and unless
-    the diagram of the lower value of `between` has no such point and that of the higher value has one.
+    **Returns** x, which is too large by at most `accuracy` (relative). **Raises** `InputError` for an unknown kind, if the
+    diagram of the lower value of `between` has such a point, and if that of the higher value has none.
 
     >>> import jaxvib as jv
     >>> def machine(eps):

@@ -203,6 +203,6 @@ def test_more_unknowns_than_readings_are_refused():
     t = 0.01 * np.arange(800)
     run = jv.MeasuredRun.from_arrays([FRAME], t, {"frame": np.random.default_rng(0).normal(size=t.size)})
     run.values["frame"][6:] = np.nan
-    words = "unknown has 7 unknowns, including first states and offsets of the runs, for 6 readings"
+    words = "unknown has 7 unknowns, including initial states and offsets of the runs, for 6 readings"
     with pytest.raises(jv.InputError, match=words):
         jv.identify(scene, run, unknown=["machine.stiffness", "machine.damping"])

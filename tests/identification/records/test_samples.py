@@ -117,7 +117,7 @@ def test_readings_at_the_stated_range_are_clipped():
 def test_slower_channel_has_a_lower_rate():
     slow = np.where(np.arange(T.size) % 4 == 0, SIGNAL, np.nan)
     found = run(slow)
-    assert found.notes == ("run: channel 'frame' has a reading at one of 4 times only: its rate is 250 Hz",)
+    assert found.notes == ("run: channel 'frame' has a reading at only one in 4 times: its rate is 250 Hz",)
     assert found.rate("frame") == pytest.approx(250.0)
     np.testing.assert_array_equal(found.values["frame"], SIGNAL[::4])
 

@@ -112,7 +112,7 @@ def test_slow_channel_begins_at_its_first_reading():
     time, found, notes = even_samples(T, value, "a:")
     np.testing.assert_allclose(time, T[3::4], atol=1e-12)
     np.testing.assert_array_equal(found, WAVE[3::4])
-    assert notes == ["a: has a reading at one of 4 times only: its rate is 25 Hz"]
+    assert notes == ["a: has a reading at only one in 4 times: its rate is 25 Hz"]
     value[11] = np.nan
     _, found, notes = even_samples(T, value, "a:")
     assert np.flatnonzero(np.isnan(found)).tolist() == [2] and len(notes) == 2

@@ -142,7 +142,7 @@ def test_the_cheapest_is_the_fastest_that_is_exact_enough():
         (dict(solvers=["Euler"]), r"solvers are \['Euler'\]; name some of default, Tsit5, Dopri8"),
         (dict(solvers=[]), r"solvers are \[\]; name some of default"),
         (dict(until=-1.0), "until is -1"),
-        (dict(tolerances=()), r"tolerances are \(\); name one at least, such as 1e-6"),
+        (dict(tolerances=()), r"tolerances are \(\); give at least one, such as 1e-6"),
         (dict(tolerances=(1e-6, 0.0)), r"tolerances\[1\] is 0; it must be greater than 0"),
         (dict(repeats=0), "repeats is 0; it must be a whole number, at least 1"),
     ],
