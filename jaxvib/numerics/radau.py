@@ -59,7 +59,7 @@ _FORMS = _forms()
 
 
 def steps_for(radians: Array) -> Array:
-    """Return the number of steps for the total phase of the fastest oscillation, rad. Decaying motions need no further steps."""
+    """Return the number of steps for the total phase of the fastest oscillation, rad. Decays need no further steps."""
     return jnp.ceil(radians / PHASE).astype(int)
 
 

@@ -33,8 +33,9 @@ _MAX_CONTACT_PER_STEP = 1.0
 diverge. The stages of a step in which a damper begins to act amplify its force."""
 
 _DAMPER_FACTOR = 4.0
-"""Number of equal steps per decay time of a damper, for each step per radian of a vibration. The force of the damper begins within
-a step; the error is then proportional to the length of the step. With 16 steps per decay time it is about 1 % of the force."""
+"""Number of equal steps per decay time of a damper, for each step per radian of a vibration. The force of the damper begins
+within a step; the error is then proportional to the length of the step. With 16 steps per decay time it is about 1 % of the
+force."""
 
 _MAX_RADIANS_PER_STEP = {False: 2.0, True: 0.5}
 """Largest number of radians of a smooth motion in an explicit step, or in an implicit one (True), for which amplitudes have
