@@ -54,7 +54,7 @@ def _end_at_interrupts() -> None:
 
     threading.Thread(target=wait, daemon=True).start()
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
-    signal.signal(signal.SIGINT, lambda *_: None)  # the thread acts
+    signal.signal(signal.SIGINT, lambda *_: None)  # the thread ends the process
 
 
 def _end() -> NoReturn:

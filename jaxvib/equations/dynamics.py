@@ -183,7 +183,7 @@ class Dynamics(eqx.Module):
             return [[jnp.sum(self.rows[k] * carrier) for k in block] for block in blocks], carrier
 
         def row_coupling(i: int, k: int) -> Array | float:
-            """Return the acceleration of row i per that of row k by the added mass, which couples rows of one exciter only."""
+            """Return the acceleration of row i that the added mass causes per acceleration of row k of the same exciter."""
             return sum(self.accelerance[i, j] * weights[j][k] for j in block_of_row[k])
 
         n, free = ends[-1], times(self.rows, unforced)

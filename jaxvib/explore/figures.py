@@ -224,8 +224,7 @@ def modes_of(scene: Scene) -> list[int]:
     """Return the numbers of the jam modes that `machine` can animate: 1, 3, 5, ..., the modes that are stable by slope.
 
     Modes that exist at the rotor speed of the scene come first, then the modes that do not. In each group the mode at the
-    highest resonance comes first, and the mode above all resonances last. The list is empty for other scenes than those of
-    `has_branches`.
+    highest resonance comes first, and the mode above all resonances last. The list is empty if `has_branches` is False.
     """
     if not has_branches(scene):
         return []

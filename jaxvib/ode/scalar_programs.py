@@ -26,8 +26,7 @@ from jaxvib.runtime.compat import (
 )
 
 _MAX_RECOMPUTED = 8
-"""A value that is used several times and needs more operations than this is protected from recomputation by the compiler, see
-`fenced`."""
+"""Largest number of operations that the compiler may repeat for each use of a value, see `fenced`."""
 
 
 def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
@@ -153,9 +152,9 @@ def substituted(program: ClosedJaxpr, chosen: Callable[[JaxprEqn, Atoms], Instea
 
 
 def with_reciprocals(program: ClosedJaxpr, changing: int) -> ClosedJaxpr:
-    """Return the program with divisions by values that do not change replaced by products with their reciprocals.
+    """Return the program in which divisions by constant values are products with the reciprocals of these values.
 
-    A time loop then computes these reciprocals once. The results change by rounding errors. The first `changing` inputs change
+    A time loop then computes the reciprocals once. The results change by rounding errors. The first `changing` inputs change
     within the loop, the others do not.
     """
     moving = set(program.jaxpr.invars[:changing])

@@ -81,7 +81,7 @@ def in_unit(unit: str, *axes: str, name: str = "", first: int = 0) -> InUnit:
 
 
 def part(*axes: str, prefix: str = "") -> Part:
-    """Return the metadata of a field that contains another object with such metadata, or a tuple of such objects.
+    """Return the metadata of a field that contains another object whose fields have metadata, or a tuple of such objects.
 
     **Arguments**: `axes`: names of axes that precede the axes of the object; `prefix` of the names of its arrays in labelled
     data. The objects of a tuple with several objects are numbered, and each of them has its own axis "load".

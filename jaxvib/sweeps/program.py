@@ -107,8 +107,8 @@ def _ending(run: BatchRun | None) -> Array | int:
 def _measure_cases_compiled(scene: Scene, values: Array, program: str, *choices: Any) -> tuple[tuple[Array, ...], Array]:
     """Compute cases by a compiled program. `program` is the digest of `traced_program`; a new digest compiles a new program.
 
-    The digest is an argument for the following reason: a user's function is equal to itself after a change of its global
-    variables. Without the digest, the program from before the change would be used again.
+    The digest is an argument, because a user's function still compares equal after a change of its global variables. Without
+    the digest, the program from before the change would be used again.
     """
     return _measure_cases(scene, values, *choices)
 

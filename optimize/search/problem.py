@@ -318,8 +318,8 @@ def find_targets(quantities: Sequence[Quantity], scene: Scene) -> tuple[tuple[Ke
     """Return the keys of the load speeds that these quantities of a scene follow, the number of smooth pieces whose maximum is
     the first quantity, and the digest of the program of the quantities, "" without a function of the user.
 
-    A user's function is equal to itself after a change of its global variables. Without the digest among the arguments of the
-    compiled functions, the program from before the change would be used again.
+    The digest is an argument of the compiled functions, because a user's function still compares equal after a change of its
+    global variables. Without the digest, the program from before the change would be used again.
     """
     quantities, shapes = tuple(quantities), _Shapes.of(scene)
     parts = (part for quantity in quantities for part in walk(quantity))

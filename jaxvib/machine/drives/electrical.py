@@ -135,7 +135,7 @@ class NamePlateMotor(Motor):
         """Return the torque of Kloss's formula, with the starting torque if it is known."""
         slip, largest, breakdown_slip = 1.0 - speed / self.speed, self.breakdown_torque, self.breakdown_slip
         if self.starting_ratio is not None:
-            ratio = jnp.maximum(self.breakdown_ratio / self.starting_ratio, 1.0 + 1e-6)  # the root has a derivative
+            ratio = jnp.maximum(self.breakdown_ratio / self.starting_ratio, 1.0 + 1e-6)  # at 1 the root has no derivative
             at_standstill = ratio - jnp.sqrt(ratio**2 - 1.0)  # 1/u
             growth = (at_standstill - breakdown_slip) / (1.0 - breakdown_slip)
             breakdown_slip = breakdown_slip + growth * jnp.maximum(slip - breakdown_slip, 0.0)

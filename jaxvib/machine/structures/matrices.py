@@ -112,8 +112,8 @@ def from_matrices(
 
     A model with more than `reduce` coordinates is reduced to its lowest real normal modes, which are computed without damping
     and rotation. The coordinates of the machine are then the modal amplitudes r, and results for coordinates are values of r.
-    The modal mass m of all modes is such that r = 1 m of a mode displaces the places by at most 1 m.
-    Displacements, forces and speeds at the places are those of the model, except for the contributions of the omitted modes.
+    All modes have the same modal mass m, with which r = 1 m of any mode displaces the places by at most 1 m. Displacements,
+    forces and speeds at the places are those of the model, except for the contributions of the omitted modes.
 
     **Arguments** (numbers and arrays in SI; nd coordinates of the model, nb directions of the force)
 
@@ -159,7 +159,7 @@ def from_matrices(
     if size > limit:
         modes = _lowest_modes(m, k, limit)
         largest = jax.lax.stop_gradient(jnp.max(jnp.abs(rows[:, :2] @ modes)))
-        modes = modes / jnp.where(largest > 0.0, largest, 1.0)  # natural units of runs are displacements of the places
+        modes = modes / jnp.where(largest > 0.0, largest, 1.0)  # S/m, the unit of r in runs, then suits the places
         m, c, k, g = (None if x is None else modes.T @ x @ modes for x in (m, c, k, g))
         rows, force = rows @ modes, None if force is None else force @ modes
     parts = {"mass": m, "damping": c, "stiffness": k, "gyroscopic": g, "places_rows": rows, "foundation": force}

@@ -185,7 +185,7 @@ def _jams_from_starts(scene: Scene, balance: TorqueBalance, omega: np.ndarray, p
     groups = equal_loads(balance)
     starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(balance.speed)))
     places, reached = _distinct(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
-    # Several starts can lead to the same jam. At the low accuracy of the search this is not visible.
+    # Several starts can lead to the same jam; at the low accuracy of the search their results may still differ.
     first = starts_at[np.asarray(places, dtype=int)]
     jams = in_chunks(_JAMS_PER_PROGRAM, lambda w, a: _jams_from(scene, w, a), omega[first], phase[first])
     found = np.flatnonzero(status_names(jams.status) == "found")
@@ -243,8 +243,9 @@ def _contains_jam(branch: PhaseBranch, place: int, growth: Array) -> bool:
 def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
     """Follow the phase pattern of `jam` over load speeds `omega` (n,) rad/s, ascending, below the rotor speed.
 
-    The drag is explicit in the load speed; therefore folds need no continuation: two jams of the pattern merge at an extremum
-    of the drag factor over `omega`. If a pattern ends, the next phases may belong to another pattern; the phases then jump.
+    The drag is computed directly from the load speed; therefore folds need no continuation. Two jams of the pattern merge at an
+    extremum of the drag factor over `omega`. If a pattern ends, the next phases may belong to another pattern; the phases then
+    jump.
 
     **Returns** `PhaseBranch`. **Raises** `InputError` for speeds that do not ascend or are not between 0 and the rotor's.
 

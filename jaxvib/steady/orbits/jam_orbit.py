@@ -211,7 +211,7 @@ def plan_orbit(
 
 
 def _mode_start(scene: Scene, mode: int) -> tuple[Array, Array, Array]:
-    """Return True if the jam mode exists in leading order, the sign of dn/dOmega there, and its load speed, rad/s."""
+    """Return three values of the jam mode in leading order: existence, sign of dn/dOmega, and load speed, rad/s."""
     if scene.mounting.gyroscopic is not None:
         raise InputError("mode", "is not defined for a machine whose resonances depend on the rotor speed; give omega or near")
     jams = jams_of(scene)

@@ -65,7 +65,7 @@ def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -
 
 
 def gravity_share(radius: float, omega: float, g: float = _G) -> float:
-    """Return g/(R Omega^2): the share of gravity in the normal force of a load at `radius` R m that turns at `omega` rad/s.
+    """Return g/(R Omega^2): the share of gravity in the normal force of a load at `radius`, m, with the speed `omega`, rad/s.
 
     >>> round(100.0 * gravity_share(0.08, 169.6), 3)      # percent, of the published rotor's pendulums in their first jam
     0.426
@@ -112,13 +112,13 @@ def _crowding(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
     half = math.asin(min(ratio, 1.0))
     filled = n * half / math.pi
     if filled >= 1.0:
-        note = f"{origin}the loads do not fit on the track: use lighter loads, or more than one track"
+        note = f"{origin}the loads do not fit on the track; use lighter loads, or more than one track"
         return NumberRow("crowding: N arcsin(r/R)/pi", filled, 1.0, "perhaps needed", note)
     if not origin:
         return None
     lost = 1.0 - math.sin(n * half) / (n * math.sin(half))
     note = (
-        f"{origin}side by side they fill {100.0 * filled:.3g} % of the track and lose this share of unbalance: give ball_radius"
+        f"{origin}side by side they fill {100.0 * filled:.3g} % of the track and lose this share of unbalance; give ball_radius"
     )
     return _row("loads side by side: 1 - sin(N a)/(N sin a)", lost, accuracy, note)
 
@@ -126,7 +126,7 @@ def _crowding(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
 def _distance(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     if not np.isfinite(values.closest) or has_term(scene.all_effects, LoadInteraction):
         return None
-    note = "diameter over the smallest distance of two loads: above 1 they pass through each other, and load_contact is needed"
+    note = "diameter divided by the smallest distance of two loads; above 1 they pass through each other; add load_contact"
     return _row("contact: 2 r / distance", 1.0 / max(values.closest, 1e-9), 1.0, note)
 
 
@@ -139,13 +139,14 @@ def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
     if scene.loads.has_bearing:
         diameter = _BEARING_DIAMETER * arm
         lever, bearing = 0.5 * _BEARING * diameter, f"mu2 = {_BEARING:g}, d = {1e3 * diameter:.3g} mm"
-        note, name = f"of a ball bearing ({bearing}): dry_friction", "bearing: mu2 (d/2) m R Omega^2 / drag torque"
+        note = f"friction of a ball bearing ({bearing}); effect dry_friction"
+        name = "bearing: mu2 (d/2) m R Omega^2 / drag torque"
     else:
         ball = _ball_radius(scene)
         assert ball is not None
         radius, origin = ball
         lever, name = _ROLLING / radius * arm, "rolling: k (R/r) m R Omega^2 / drag torque"
-        note = f"{origin}of steel on steel (k = {1e3 * _ROLLING:g} mm): rolling_friction, or more drag"
+        note = f"{origin}friction of steel on steel (k = {1e3 * _ROLLING:g} mm); effect rolling_friction, or more drag"
     return _row(name, lever * normal_force / drag, accuracy, note)
 
 
@@ -169,7 +170,7 @@ def _lift(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | No
         return None
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))))
     weight = _G * (float(jnp.trace(machine.carrier().mass)) + loads)
-    note = "foundation force over weight: above 1, springs under the machine would have to pull; stop, cubic_support"
+    note = "foundation force divided by weight; above 1, springs under it would have to pull; effect stop or cubic_support"
     return _row("lift: R / (M g)", values.foundation_force / weight, 1.0, note)
 
 
