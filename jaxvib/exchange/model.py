@@ -110,11 +110,11 @@ class _TorqueInput(MotorWrapper):
         self.motor, self.extra, self.is_alone, self.kind = motor, extra, is_alone, "torque_input"
 
     def torque(self, speed: Array) -> Array:
-        """Return the steady torque of the motor plus the additional torque, or the latter alone (`is_alone`)."""
+        """Return the steady torque of the motor plus the additional torque; if `is_alone`, only the additional torque."""
         return self.extra if self.is_alone else self.motor.torque(speed) + self.extra
 
     def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
-        """Return the torque of the motor at time `t` plus the additional torque, or the latter alone (`is_alone`)."""
+        """Return the torque of the motor at time `t` plus the additional torque; if `is_alone`, only the additional torque."""
         return self.extra if self.is_alone else self.motor.torque_at(t, speed, states) + self.extra
 
 

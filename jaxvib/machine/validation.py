@@ -257,8 +257,8 @@ def weight_accelerations(scene: Scene) -> dict[int, float]:
 
 
 _MIN_SHOWN_WEIGHT = 0.05
-"""Share by which the weight changes a speed within a turn, from which on there is a note. The share is 0.005 to 0.008 at the
-working speeds of the templates of screens, and 0.29 to 0.36 at their lowest resonances."""
+"""Smallest relative change of a speed within a turn by the weight for which there is a note. The change is 0.005 to 0.008 at
+the working speeds of the templates of screens, and 0.29 to 0.36 at their lowest resonances."""
 
 
 def weight_notes(scene: Scene, slowest: Mapping[int, float]) -> list[str]:

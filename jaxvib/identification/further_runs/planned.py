@@ -90,8 +90,8 @@ class Expected(NamedTuple):
     **Attributes**
 
     - `fitted`: the run as a fit without iterations
-    - `indices_in_run` and `indices_in_fit` (k,): the positions of the k unknowns that the run and the fit have in common, the
-      former among the unknowns of the run, the latter in the information of the fit
+    - `indices_in_run` (k,): the positions, among the unknowns of the run, of the k unknowns that it has in common with the fit
+    - `indices_in_fit` (k,): the positions of the same unknowns in the information of the fit
     """
 
     fitted: Fitted

@@ -54,8 +54,8 @@ MARKS = {
 def modes_of(omega: np.ndarray, rotor_speed: np.ndarray, resonances: np.ndarray) -> np.ndarray:
     """Return the number of the jam mode of each point of a branch, from the folds between its points.
 
-    **Arguments**: load speed `omega`, ascending, and `rotor_speed` of the points, rad/s; the latter is NaN where no orbit
-    converged. `resonances`, rad/s.
+    **Arguments**: load speed `omega` of the points, rad/s, ascending; their `rotor_speed`, rad/s, NaN if no orbit converged;
+    `resonances`, rad/s.
     """
     solved = np.isfinite(rotor_speed)
     _, ends, numbers = sampled_modes(omega[solved], rotor_speed[solved], resonances)

@@ -19,11 +19,14 @@ from papers.machines import ECCENTRICITY
 __all__ = ["TABLES", "PrintedTorus", "PublishedRow", "cosine_torus", "gap_torus", "printed_torus"]
 
 _TURN_WIDTH, _CLIMB_WIDTH = 0.02, 0.1
-"""Width of the smoothed signs in the printed model: of psi' in w, of the velocity rho a' along the wall in e w."""
+"""Widths of the smoothed signs in the printed model: of psi', in units of w; of the velocity rho a' along the wall, of e w."""
 
 
 class PublishedRow(NamedTuple):
-    """A row of the paper's tables: `damping` n, `stiffness` p, `friction` k m, and over `gap` the least initial `speed`."""
+    """Row of the paper's tables.
+
+    **Attributes**: `damping` n, `stiffness` p, `friction` k (m); for each `gap` (R_1 - r)/e the lowest initial `speed`.
+    """
 
     damping: float
     stiffness: float

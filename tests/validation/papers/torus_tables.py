@@ -1,4 +1,4 @@
-"""The published tables of least initial speeds, paper against computed."""
+"""Published tables of the lowest initial speeds from which balls are captured, compared with computed ones."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from papers.step_doubling import refine
 __all__ = ["CONTACT", "MODELS", "TorusTables", "published_tables"]
 
 CONTACT = LoadContact(stiffness=4e4, restitution=0.5)
-"""Contact of balls that touch: the paper leaves contact open. A contact lasts 3 ms, 0.07 turns."""
+"""Contact between balls, which the paper does not describe. A contact lasts 3 ms, 0.07 turns."""
 
 SPIN = FreeSpin()
 
@@ -39,7 +39,7 @@ _GRID = np.linspace(-1.0, -0.1, _COARSE)
 
 
 class _Runs(NamedTuple):
-    """Runs side by side, (B,) each, and the positions (B, 2) of the balls besides the paper's."""
+    """Batch of runs: parameters (B,), and shifts (B, 2) of the balls from the positions of the paper."""
 
     gap: Array
     damping: Array
@@ -82,33 +82,34 @@ MODELS = {
     "spinning": _Model(_spinning, vector_field),
     "contact": _Model(_touching, vector_field),
 }
-"""Models by name: this package's equations; those of the paper to the letter (`PrintedTorus`), with the gap as the lever of the
-friction up the tube, and with the correct projection of the unbalance; this package's with `FreeSpin`, and with `CONTACT`."""
+"""Models by name. "derived": the equations of jaxvib; "spinning" with `FreeSpin`, "contact" with `CONTACT`. "printed": the
+equations as printed in the paper (`PrintedTorus`); "gap lever" with the gap as the lever arm of the friction in the equation of
+the angle in the tube, "cosine" with the correct projection of the unbalance."""
 
 
 TABLE_TOLERANCE = 0.011
-"""Largest move of a border at a doubling of steps that counts as converged: 0.01 and half of the resolution."""
+"""Largest change of a threshold by a doubling of the steps that counts as converged: 0.01 plus half of the resolution."""
 
 
 class TorusTables(NamedTuple):
-    """Points of the paper's tables 1 and 2 beside computed ones.
+    """Points of the paper's tables 1 and 2, and computed values.
 
-    **Attributes** (P points, M models):
+    **Attributes** (P points, M models)
 
-    - `damping` n, `stiffness` p, `friction` k m, `gap`, and the `paper`'s speed, (P,); `models`, M names
-    - `least` (M, P), the least initial speed that is captured, -1 if a ball at rest is, NaN if none is
-    - `threshold` (M, P), the speed from which on all are captured, NaN if the highest is not; both borders lie halfway between
-      speeds that differ by `resolution`
-    - `captured` (M, P, S), True if a speed of those `tried` (S,) is captured
-    - `fraction` (M, P), the share captured of `starts` perturbed starts at the paper's speed
-    - `steps_per_turn` (M, P), the least number of steps for a turn of the rotor in the last scan
-    - `last_change` (M, P, 2), by how much the last doubling of the steps moved `least` and `threshold`, infinite if it made one
-      appear or vanish; NaN without a doubling
-    - `turns` of the rotor that each run took
+    - `damping` n, `stiffness` p, `friction` k (m), `gap` (R_1 - r)/e, and the `paper`'s speed, (P,); `models`: M names
+    - `least` (M, P): lowest initial speed that is captured, -1 if a ball at rest is captured, NaN if no speed is captured
+    - `threshold` (M, P): speed above which all speeds are captured, NaN if the highest speed is not captured. `least` and
+      `threshold` lie halfway between two speeds whose difference is the resolution
+    - `captured` (M, P, S): True for each of the speeds `tried` (S,) that is captured
+    - `fraction` (M, P): captured fraction of `starts` perturbed starts at the paper's speed
+    - `steps_per_turn` (M, P): smallest number of steps per turn of the rotor in the last scan
+    - `last_change` (M, P, 2): changes of `least` and `threshold` by the last doubling of the steps, infinite if one of them
+      appeared or vanished; NaN without a doubling
+    - `turns` of the rotor in each run
 
-    If `least` and `threshold` differ, captures and failures alternate between them, and the paper's one number may be any of
-    their borders; if the share is neither 0 nor 1, or a border still moves, the outcome there is chaotic. Bands
-    narrower than the distance of the speeds `tried` stay unseen.
+    If `least` and `threshold` differ, captures and failures alternate between them, and the paper's number may be any of the
+    boundaries. If the fraction is neither 0 nor 1, or a boundary still changes, the outcome there is chaotic. Intervals
+    narrower than the spacing of the speeds `tried` are not detected.
     """
 
     damping: np.ndarray
@@ -182,26 +183,30 @@ def published_tables(
     seed: int = 0,
     doublings: int = DOUBLINGS,
 ) -> TorusTables:
-    """Compute the paper's tables of least initial speeds by other equations, with the certainty of each entry.
+    """Compute the paper's tables of lowest initial speeds by several models, with the convergence of each entry.
 
-    For each point 19 speeds from -1 to -0.1 are tried, then twice four speeds between the least captured one and the next lower
-    one, and below the speed from which on all are captured. The scan is repeated with twice the steps until both borders move
-    by 0.011 at most; points that have converged drop out. Last come `starts` perturbed starts at the paper's own speed. All
-    points advance together, sorted by the steps they need: about 5000 runs a model, some ten minutes of CPU time.
+    For each point 19 speeds from -1 to -0.1 are tried. Then four speeds between the lowest captured one and the next lower one,
+    and four below the threshold, are tried, twice. The scan is repeated with twice the steps until `least` and `threshold`
+    change by at most 0.011; points that have converged are not repeated. Finally `starts` perturbed starts at the paper's speed
+    are computed. All points are computed together, sorted by the number of steps: about 5000 runs and ten minutes of CPU time
+    for each model.
 
-    **Arguments**: `models` names of `MODELS`; `rows` of `TABLES`; `turns` of the rotor that each run takes; `starts`, all but
-    the first moved along the ring, each ball by itself, by up to `spread` rad, by `seed`; `doublings` of the steps at most.
+    **Arguments**: `models`: names of `MODELS`; `rows` of `TABLES`; `turns` of the rotor in each run; `starts`: in all except
+    the first, each ball is shifted along the ring by its own random angle of up to `spread` rad, with the `seed`; `doublings`:
+    largest number of doublings of the steps.
 
-    By "printed" 35 of the 47 speeds come out within 0.05 of the paper, by "gap lever" 28 (`doublings=1`): the lever R_1 is
-    wrong, but the tables come out nearer with it. The three smallest gaps that are far off, with the lesser friction, are slow:
-    with n = 0.1 the gap of 0.5 is captured from -0.757 in 2000 turns and from -0.865 in 4000 (paper -0.857). At p = 0.010 and a
-    gap of 5.1 lone failures stand among captures up to -0.87 (paper -0.868), at other speeds with other steps. "cosine", tried
-    for two rows with the gap as its lever, moves no border by more than 0.002 but for chaotic ones. By "derived" captures from
-    speeds below -0.7 are gone, but for lone ones, and thresholds at p = 0.003 and 0.005 lie 0.2 to 0.7 above the paper's: the
-    paper counts the ball's own rotation with f'^2 and not with f' (f' - w). "spinning", tried for eight points of all gaps, is
-    captured from rest at seven and from -0.967 at the other: a free spin that begins at the bottom takes the balls up by as
-    much as 0.35 of the rotor speed. "contact" moves the thresholds of "derived" by -0.07 to 0.07, a quarter of them by more
-    than 0.03, mostly up.
+    Results (`doublings=1`):
+
+    - "printed": 35 of the 47 speeds are within 0.05 of the paper; "gap lever": 28. The lever arm R_1 is wrong, but it
+      reproduces the tables more closely. At three of the smallest gaps with the lower friction, captures take long:
+      with n = 0.1 and a gap of 0.5 the lowest speed is -0.757 in 2000 turns and -0.865 in 4000 (paper: -0.857). At p = 0.010
+      and a gap of 5.1 isolated failures occur among captures up to -0.87 (paper: -0.868), with other steps at other speeds
+    - "cosine", computed for two points with the gap as lever arm: no boundary changes by more than 0.002, except chaotic ones
+    - "derived": no captures from speeds below -0.7, except isolated ones. The thresholds at p = 0.003 and 0.005 are 0.2 to 0.7
+      above those of the paper, whose equations contain the rotation of the ball with f'^2 and not with f' (f' - w)
+    - "spinning", computed for eight points with all gaps: captures from rest at seven of them, from -0.967 in the other. A free
+      spin that begins at the bottom increases the speed of the balls by up to 0.35 of the rotor speed
+    - "contact" changes the thresholds of "derived" by -0.07 to 0.07, a quarter of them by more than 0.03, mostly upward
 
     Source: Strautmanis et al. 2018, tables 1 and 2, where each speed has one start.
     """
@@ -213,7 +218,7 @@ def published_tables(
     shifts[0] = 0.0
 
     def column(model: _Model) -> list[np.ndarray]:
-        """Borders (P, 2), outcomes of the first speeds (P, S), shares, steps for a turn, moves (P,)."""
+        """Return `least` and `threshold` (P, 2), `captured` (P, S), `fraction`, `steps_per_turn` (P,), `last_change` (P, 2)."""
         needed = np.array([_steps_per_second(model, *point[:4]) for point in points])
         found = refine(
             lambda which, multiple: _scanned(model, points[which], multiple * needed[which], turns),
@@ -253,19 +258,19 @@ _SHARES = np.arange(1, 5) / 5.0
 
 
 def _from(captured: np.ndarray) -> np.ndarray:
-    """The place of the least speed from which on all are captured (P, S); S where there is none."""
+    """Return the index of the lowest speed above which all are captured, for captures (P, S); S if there is none."""
     failing = ~captured[:, ::-1]
     return np.where(np.any(failing, axis=1), captured.shape[1] - np.argmax(failing, axis=1), 0)
 
 
 def _between(speed: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The speed at a place and the one below it, (P, 1) each; the two at the end of the line where there are none."""
+    """Return the speeds (P, 1) below and at an index; at the ends of the grid, the two outermost ones."""
     at = np.clip(at, 1, speed.shape[1] - 1)[:, None]
     return np.take_along_axis(speed, at - 1, axis=1), np.take_along_axis(speed, at, axis=1)
 
 
 def _scanned(model: _Model, points: np.ndarray, steps: np.ndarray, turns: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return of each point (P, 5), by so many steps a second (P,), the two borders and the outcomes of the first speeds."""
+    """Return `least` and `threshold` of each of the `points` (P, 5), and `captured`; `steps` (P,) per second."""
     speed = np.tile(_GRID, (len(points), 1))
     captured = first = _tried(model, points, steps, speed, np.zeros((_COARSE, 2)), turns)
     for _ in range(_ROUNDS):
@@ -294,10 +299,10 @@ def _tried(
 
 
 def _outcomes(model: _Model, runs: _Runs, needed: np.ndarray, turns: int) -> np.ndarray:
-    """Return True for each run (B,) whose balls all turn with the rotor at its end, by `needed` steps a second at least.
+    """Return True for each run (B,) at whose end all balls turn with the rotor, with at least `needed` (B,) steps per second.
 
-    Runs go in blocks of one size, sorted by the steps they need, so that one program answers them all. Each block has a further
-    run with numbers of its own: otherwise a number that all runs share would ask for another program.
+    Runs are computed in blocks of equal size, sorted by the number of steps, by one program. Each block has an additional run
+    with different parameters; otherwise a parameter that all runs share would be a constant of another program.
     """
     order, size = np.argsort(-needed, kind="stable"), _LANES * len(jax.devices()) - 1
     gap, damping, stiffness, friction, still = (jnp.asarray([x]) for x in (7.5, 0.2, 0.02, 1e-5, 0.0))
