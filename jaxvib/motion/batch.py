@@ -51,8 +51,7 @@ _STEPS_PER_BLOCK = 16
 """Approximate number of steps of a block, in which the largest values are determined from the state at each step."""
 
 _DOUBLINGS = 40
-"""Number of doublings with which the end of the first implicit step, 1e-12 of a regular step, becomes that of a regular
-step."""
+"""Number of doublings from the end of the first implicit step, 1e-12 of a regular step, to the end of a regular step."""
 
 
 @fast_diffrax_loop_end()
@@ -151,7 +150,7 @@ class BatchPlan(NamedTuple):
     blocks: int = 0
 
     def with_peaks(self) -> BatchPlan:
-        """Return the plan with largest values, which makes at least as many steps."""
+        """Return the plan that also determines the largest values; it has at least as many steps."""
         blocks = -(-self.each // _STEPS_PER_BLOCK)
         return self._replace(blocks=blocks, each=blocks * max(NODES - 1, -(-self.each // blocks)))
 
