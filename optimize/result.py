@@ -199,7 +199,8 @@ class Synthesis(Result):
 
     def summary(self) -> str:
         """Return the design before, after and verified, the active limits and the influences as text."""
-        counted = f"{self.starts} starts ({self.drawn} drawn), {self.converged} converged, {self.same} to the best machine"
+        starts = f"{self.starts} starts chosen from {self.drawn} designs"
+        counted = f"{starts}, {self.converged} converged, {self.same} to the best machine"
         lines = [f"{objective_text(self.objective)}: {self.message}", counted]
         lines += [" ".join(line) for line in _align_columns([["", "before", "after", "exact", "verified"], *self.rows()])]
         if self.unverified:

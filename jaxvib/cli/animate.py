@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 @click.option("--begin", help="First time of the animation, such as 4.5s [four vibration periods before the end].")
 @click.option("--end", help="Last time of the animation [end of the run].")
 @click.option(
-    "--seconds", help="Duration of the animation, s, at most 600 frames [about 11 frames for each turn of the rotor]."
+    "--seconds", help="Duration of the animation, s; at most 600 frames [that of about 11 frames for each turn of the rotor]."
 )
 @click.option("--fps", type=int, default=20, show_default=True, help="Frames per second.")
 @click.option(

@@ -127,7 +127,8 @@ def _document(best: Synthesis) -> dict:
 def _text(best: Synthesis) -> str:
     from optimize.result import objective_text
 
-    counts = f"{best.starts} starts ({best.drawn} drawn), {best.converged} converged, {best.same} to the best machine"
+    starts = f"{best.starts} starts chosen from {best.drawn} designs"
+    counts = f"{starts}, {best.converged} converged, {best.same} to the best machine"
     rows = best.rows()
     heads = ["", "before", "after", "exact", "verified"]
     columns = [k for k in range(len(heads)) if k < 3 or any(row[k] for row in rows)]

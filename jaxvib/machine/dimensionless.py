@@ -62,7 +62,7 @@ class Dimensionless(Readable):
       typical: 1 each, or 50 to 5000 kg, 10 to 100 rad/s and 0.05 to 0.3 m
     - `kappa`, at least 1: inertia factor of the loads, which are pendulums; typical: 1 to 1.5
 
-    **Raises** `InputError` for lengths that do not fit, negative values, 0 for other arguments than `natural`, `damping`,
+    **Raises** `InputError` for lengths that do not fit, negative values, 0 for arguments other than `natural`, `damping`,
     `link_natural` and `link_damping`, a `kappa` below 1, and loads that are not lighter than M2S.
 
     >>> import jaxvib as jv

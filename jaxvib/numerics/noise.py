@@ -18,9 +18,9 @@ _MAX_ORDER = 40
 
 _COLOUR_GAIN = 10.0
 """Difference of the information criteria of white and coloured noise above which noise counts as coloured. A fit takes up part
-of the noise at the natural frequencies of its model. For a short record, this gap in the spectrum of the residuals looks like
-colour, and a filter for it makes standard errors too small. With 400 white residuals of a fit with 17 unknowns, the difference
-is larger in 1 of 1000 cases."""
+of the noise at the natural frequencies of its model, which leaves gaps in the spectrum of the residuals. In a short record
+these gaps look like coloured noise, and a filter for it makes standard errors too small. With 400 white residuals of a fit with
+17 unknowns, the difference is larger in 1 of 1000 cases."""
 
 _FREQUENCIES = 2**14
 """Number of frequencies at which a spectral density is evaluated."""

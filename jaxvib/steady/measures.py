@@ -49,8 +49,8 @@ ZONE_LIMITS = {
 for a comparison, and public pages contradict each other."""
 
 _MIN_SLIP = 1e-4
-"""Slip n - Omega, relative to n, below which the torque is computed from the dissipation of the carrier. At this slip both
-ways to compute the torque have a relative rounding error of 1e-12."""
+"""Slip n - Omega, relative to n, below which the torque is computed from the dissipation of the carrier. At this slip the
+difference n - Omega has a relative rounding error of about 1e-12, at smaller slips a larger one."""
 
 _NEGLIGIBLE = 1e-9
 """Fraction of the largest stroke or force below which a value is a rounding error and is not shown."""
@@ -158,7 +158,7 @@ class VibrationMeasures(Readable):
       plane or a rotor
     - `static_deflection` (nt,), m: downward displacement of each coordinate (of x: to the left) under the weight of machine
       and loads, 0 for a platform that no support carries; typical: 5 to 30 mm for screens
-    - `static_load` (ns,), N: weight that each support carries, negative if a support on the foundation is pulled up. It and
+    - `static_load` (ns,), N: weight that each support carries, negative if the support pulls the foundation up. It and
       `static_deflection` are NaN if the supports cannot carry the weight, or if the directions of coordinates are unknown
     - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on a support.
       They are NaN, as is `foundation_load` in two directions, for a scene with supports that are effects (`CubicSupport`,

@@ -248,9 +248,7 @@ def test_optimize_json_has_the_promised_keys(typed, tmp_path):
         assert (tmp_path / "o" / figure).stat().st_size > 5_000
     assert document["status"] == "done" and document["table"][0]["what"] == "stiffness of support 1"
     code, out, _ = typed("optimize", "design.toml", "--resume", "o/search.npz", "--no-verify")
-    assert (
-        code == 0 and "4 starts (4 drawn)" in out and "stiffness of support 2, N/mm" in out and "machine.stiffness" not in out
-    )
+    assert code == 0 and "from 4 designs" in out and "stiffness of support 2, N/mm" in out and "machine.stiffness" not in out
 
 
 def test_criterion_json_has_the_promised_keys(typed, tmp_path, monkeypatch):

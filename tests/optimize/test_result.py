@@ -60,7 +60,10 @@ def test_rows_are_in_units_of_the_largest_value(searched):
     rows = dataclasses.replace(searched, table=table).rows()
     assert rows == [["a, N/mm", "0.5", "2", "", ""], ["b", "-3", "1", "2", ""], ["c, s", "", "", "", ""]]
     summary = dataclasses.replace(searched, table=table, unverified="not requested").summary().splitlines()
-    assert summary[0].startswith("least off by: the search converged") and "2 starts (2 drawn), 2 converged, 2 to" in summary[1]
+    assert (
+        summary[0].startswith("least off by: the search converged")
+        and "2 starts chosen from 2 designs, 2 converged, 2 to" in summary[1]
+    )
     assert "  not verified: not requested" in summary
     columns = [line.index(word) + len(word) for line, word in zip(summary[2:5], ("before", "0.5", "-3"), strict=True)]
     assert len(set(columns)) == 1

@@ -32,9 +32,9 @@ _MAX_TRIALS, _ACCURACY = 60, 1e-13
 """Largest number of trials for the time of a switch, and its error relative to the length of the step."""
 
 _NEAR_TURN = 0.2
-"""The machine may approach a side of a stop and move away again within one step. If the remaining gap at the nearest point is
-less than this fraction of the approach (in a parabola through the rates at both ends of the step), a short contact is
-possible."""
+"""The machine may approach a side of a stop and move away again within one step. A short contact is possible if the remaining
+gap at the nearest point is less than this fraction of the approach. Both follow from a parabola with the rates at both ends of
+the step."""
 
 Step = Callable[[Array, Array, Array, Dynamics], Array]
 """Function of a time, a state, the length of a step, and equations of motion, that returns the state after the step."""

@@ -39,7 +39,7 @@ def arrangements(loads: np.ndarray, imbalance: complex, touching: float, *, orde
     fixed, at = (0, 0.0) if free else (n, np.angle(imbalance))
     angles = np.mod(directions - directions[:, fixed, None] + at, 2.0 * np.pi)[:, :n]
     turned = np.sort(angles, axis=1)
-    # Equal loads are as far from each other in these arrangements as the balance allows.
+    # Loads with a size are equal. They are as far from each other in these arrangements as the balance allows.
     if np.min(np.diff(turned, append=turned[:, :1] + 2.0 * np.pi)) < touching * (1.0 - 1e-9):
         return Arrangements("no_room", np.zeros((0, n)), 0, [], ())
     if ordered:

@@ -52,8 +52,8 @@ class BalanceStatus(eqx.Enumeration):
         "cancelled"
     )
     no_room = (
-        "the loads would overlap in the arrangement that cancels the rotor's imbalance: more, heavier or smaller loads are "
-        "needed"
+        "the loads overlap in every arrangement in which they would cancel the rotor's imbalance: more, heavier or smaller "
+        "loads are needed"
     )
 
 
@@ -202,8 +202,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
     - Three loads cancel in one triangle and its mirror image
     - Four or more loads cancel in a family of arrangements with N - 2 dimensions. In the returned arrangement and its mirror
       image, m_j R_j are the sides of a polygon inscribed in a circle. Equal loads are then as far from each other as the
-      balance allows; unequal loads with the status `no_room` may have room in another arrangement. `neutral` gives the
-      directions of the family
+      balance allows. `neutral` gives the directions of the family
     - An imbalance of the rotor is an additional side of the polygon; the loads then cannot rotate together
     - Loads in two planes at s_1 and s_2 cancel in each plane the part of the imbalance that acts there, (W - s_2 U)/(s_1 - s_2)
       and (W - s_1 U)/(s_2 - s_1). The arrangements of both planes are combined

@@ -58,7 +58,7 @@ class ThresholdCurve(Result):
         ]
         for row in zip(self.value, self.threshold, self.uncertainty, self.least, self.converged, strict=True):
             value, threshold, uncertainty, least, converged = map(float, row)
-            threshold_text = "not every start" if np.isnan(threshold) else f"{threshold:.4f} +- {uncertainty:.1e}"
+            threshold_text = "no threshold" if np.isnan(threshold) else f"{threshold:.4f} +- {uncertainty:.1e}"
             threshold_text += "" if converged else " (not converged)"
             lines.append(f"  {value:10.6g}  {threshold_text}" + ("" if np.isnan(least) else f"; lowest {least:.4f}"))
         return "\n".join(lines)
