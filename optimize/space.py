@@ -338,7 +338,10 @@ def _read_rows(scene: Scene, choices: Mapping[str, Any]) -> tuple[dict[str, Sequ
         read: dict[str, list[float]] = {}
         for name, entry in entries.items():
             if not isinstance(columns_given[name], (list, tuple)) or entry.size != 1:
-                raise InputError(f"{field}.{name}", "needs a list of values of a single number, such as machine.stiffness[0]")
+                raise InputError(
+                    f"{field}.{name}",
+                    "needs the name of a single number, such as machine.stiffness[0], and a list of its values",
+                )
             read[name] = [entry.value(v, f"{field}.{name}[{k}]") for k, v in enumerate(columns_given[name])]
         first, *others = read
         lengths = {name: len(values) for name, values in read.items()}

@@ -365,7 +365,7 @@ def refine_solution(product: Callable[[Array], Array], inverse: Callable[[Array]
 
 
 def solve_definite(a: Array, b: Array) -> Array:
-    """Return x (n,) or (n, m) of a x = b for a symmetric and positive definite, without pivots and therefore without
+    """Return x (n,) or (n, m) of a x = b for a symmetric, positive definite matrix a, without pivots and therefore without
     branches."""
     rows = jnp.concatenate([a, b if b.ndim > 1 else b[:, None]], axis=1)
     for k in range(b.shape[0]):

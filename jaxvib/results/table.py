@@ -198,7 +198,7 @@ def _lines(path: Path, max_lines: int | None = None) -> Iterator[tuple[int, str]
             file.seek(0)
             if file.read(2) == b"PK":
                 problem = "is an archive, such as a saved result, not a recording"
-                advice = 'write the run to a CSV file, as by run.to_pandas("time").to_csv("run.csv", index=False)'
+                advice = 'for a run: run.to_pandas("time").to_csv("run.csv", index=False)'
                 raise InputError(str(path), f"{problem}; give the path of a CSV file ({advice})")
             file.seek(0)
             text = io.TextIOWrapper(file, encoding="utf-8-sig")

@@ -34,8 +34,8 @@ _OTHER_UNITS = {
 """Units that a file may have in place of the stated one."""
 
 _SPEED_ERROR, _MOTION_ERROR, _UNIT_ERROR = 0.03, 0.3, 0.15
-"""Largest allowed relative difference between two speeds, and between two motions; largest relative difference between a ratio
-of motions and a ratio of units, up to which the unit is named as the cause."""
+"""Largest allowed relative difference between two speeds, and between two motions. A wrong unit is named as the cause if the
+relative difference between the ratio of motions and the ratio of units is at most the third number."""
 
 _COHERENT, _STRONG = 0.9, 1e-3
 """Smallest coherence at a frequency that is compared, and smallest power at this frequency relative to the largest power."""

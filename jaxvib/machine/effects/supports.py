@@ -219,8 +219,8 @@ class FrictionSupport(_Support):
 
         force F tanh(|v|/width) v/|v| on the foundation,    v the velocity of the platform, or relative to the platform `to`
 
-    - Coulomb friction is the limit of a small `width`. An oscillation with the largest speed v loses less energy by the share
-      (pi^2/24) (width/v)^2, 0.41 (width/v)^2
+    - Coulomb friction is the limit of a small `width`. An oscillation with the largest speed v loses less energy than with
+      Coulomb friction; the relative difference is (pi^2/24) (width/v)^2 = 0.41 (width/v)^2
     - A machine that would stick under the force f < F creeps at the speed width artanh(f/F)
     - The amplitude of a free vibration on a spring k decreases by 4 F/k per period
 
@@ -240,7 +240,7 @@ class FrictionSupport(_Support):
     >>> float(jv.FrictionSupport("0.2 kN", platform=2, to=1).force)
     200.0
 
-    Source: Den Hartog 1931 for the vibration with Coulomb friction, to which tests compare.
+    Source: Den Hartog 1931 for the vibration with Coulomb friction, with which the tests compare.
     """
 
     force: Array = eqx.field(metadata=unit("N", low=0.0, words="friction force at the support"))

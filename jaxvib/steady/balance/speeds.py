@@ -228,10 +228,11 @@ def _require_mount_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndar
     if np.sum(squares <= rounding * squares[-1]) > free:
         stiff = int(np.argmax(np.diag(stiffness) / np.diag(mass)))
         name = scene.machine.structure().coordinates[stiff]
-        advice = "too high for this precision; use a softer spring or leave this coordinate out of the machine"
+        reason = "too high for this precision"
+        advice = "use a softer spring or leave this coordinate out of the machine"
         if np.any(port[:, stiff]):
-            raise InputError("machine.exciter", f"is attached to {name}, where the stiffness is {advice}")
-        raise InputError("machine.stiffness", f"is at {name} {advice}")
+            raise InputError("machine.exciter", f"is attached to {name}, where the stiffness is {reason}; {advice}")
+        raise InputError("machine.stiffness", f"is {reason} at {name}; {advice}")
 
 
 def _inverse_root(values: Array) -> Array:
@@ -299,7 +300,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     grid = jnp.concatenate([0.999 * poles[:1], inside.ravel(), 1.001 * poles[-1:]])
 
     # Below the first resonance the sign is + for any damping; for a machine that can drift, the sign changes at speed 0.
-    # A loop over the grid points, so that a batch of machines needs the memory of one grid point for each.
+    # A loop over the grid points: a batch of machines then needs the memory of only one grid point for each machine.
     positive = jnp.append(jnp.asarray([True]), jax.lax.map(lambda w: fast_functional(w) > 0.0, grid[1:]))
     passed = jnp.cumsum(positive[1:] != positive[:-1])
     order = jnp.arange(2 * resonances.shape[0] - 1)

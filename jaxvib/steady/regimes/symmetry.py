@@ -118,7 +118,7 @@ def distinct_regimes(
 def _without_copies(speed: np.ndarray, phasors: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
     """Return the ascending indices of regimes without those that agree with an earlier one in rounded speed and phasors.
 
-    Most regimes are found from many starts. The search for exchanges is slow, and this comparison leaves few of them to it.
+    Most regimes are found from many starts. The search for exchanges is slow; this comparison first removes most regimes.
     """
     relative = phasors * phasors[:, :1].conj() / (0.5 * tolerance[1])
     level = np.log(np.maximum(speed, np.finfo(speed.dtype).tiny)) / tolerance[0]

@@ -360,7 +360,7 @@ def test_exciter_that_cannot_move_is_refused():
         jv.criterion(s)
     with pytest.raises(jv.InputError, match=r"machine\.stiffness.* is inf"):
         jv.one_mass(mass=1.0, stiffness=float("inf"), damping=0.0)
-    for exciter, field in ((2, "exciter is attached to y2, where the stiffness is"), (1, "stiffness is at y2")):
+    for exciter, field in ((2, "exciter is attached to y2, where the stiffness is"), (1, "stiffness is")):
         machine = jv.two_mass(
             mass=(4.0, 3.0), stiffness=(1e4, 1e20), damping=(3.0, 3.0), link_stiffness=2e4, link_damping=1.0, exciter=exciter
         )

@@ -42,7 +42,7 @@ def test_intervals_that_touch_are_one_and_empty_ones_none():
     ("stiffness", "says"),
     [
         ((1e4, 1e30), "machine.exciter is attached to y2, where the stiffness is too high for"),
-        ((1e30, 1e4), "machine.stiffness is at y1 too high for this precision"),
+        ((1e30, 1e4), "machine.stiffness is too high for this precision at y1"),
         ((1e12, 1e4), None),
         ((1e4, 0.0), None),
     ],
