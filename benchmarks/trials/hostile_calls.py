@@ -263,6 +263,7 @@ def judged(ask: Callable[[], Any], *, number: bool = True) -> tuple[str, str]:
             with contextlib.chdir(FOLDER):
                 answer = ask()
             answer = jax.block_until_ready(answer) if isinstance(answer, eqx.Module) else answer
+            repr(answer)
     except (jv.InputError, jv.ComputationError) as error:
         taken = time.process_time() - began
         said = str(error)

@@ -14,7 +14,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
@@ -39,7 +38,7 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.runtime.programs import cached
-from jaxvib.units import Number, numbers
+from jaxvib.units import Number, known_number, numbers
 
 
 @validated
@@ -145,7 +144,7 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     Source: the energy of the equations in `vector_field`, derived here.
     """
     scene, state = _validated(scene, state)
-    return _energy(scene, state, _at_time(t, state))
+    return _energy(scene, state, known_number(t, "s", "t"))
 
 
 def _validated(scene: Scene, state: State) -> tuple[Scene, State]:
@@ -156,11 +155,6 @@ def _validated(scene: Scene, state: State) -> tuple[Scene, State]:
 
     require_state(scene := validate_scene(scene), state, "state")
     return scene, jax.tree.map(array, state)
-
-
-def _at_time(t: Array | float, state: State) -> Any:
-    """Return a time as an array. One compiled program then serves all times."""
-    return t if isinstance(t, Array) else np.asarray(t, state.displacement.dtype)
 
 
 @cached
@@ -251,7 +245,7 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     Source: derived here from `vector_field`; the drag of loads on machines with platforms: the antiphase paper, equation (2).
     """
     scene, state = _validated(scene, state)
-    return _power(scene, _at_time(t, state), state)
+    return _power(scene, known_number(t, "s", "t"), state)
 
 
 @cached
@@ -406,7 +400,7 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
     Source: Strautmanis et al. 2018, equation (10), with the acceleration of the rotor.
     """
     scene, state = _validated(scene, state)
-    return _normal_force(scene, _at_time(t, state), state)
+    return _normal_force(scene, known_number(t, "s", "t"), state)
 
 
 @cached

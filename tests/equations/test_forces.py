@@ -75,3 +75,12 @@ def test_states_of_other_scenes_are_refused_in_one_sentence(state, says):
     if "displacement" in says:
         with pytest.raises(jv.InputError, match=says):
             jv.foundation_force(BOTH, state)
+
+
+@pytest.mark.parametrize("time", [(1.0, 2.0), (), np.zeros((2, 2)), np.nan, np.asarray(np.inf)])
+@pytest.mark.parametrize(
+    "quantity", [lambda t, s: jv.energy(BOTH, s, t), *(lambda t, s, f=f: f(BOTH, t, s) for f in (jv.power, jv.normal_force))]
+)
+def test_a_time_is_one_finite_number(quantity, time):
+    with pytest.raises(jv.InputError, match=r"^t "):
+        quantity(time, state_of_both())

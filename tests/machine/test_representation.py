@@ -37,6 +37,10 @@ def test_scene_with_a_machine_of_matrices_is_shown():
     assert shown._repr_html_().startswith("<pre>Scene(")
 
 
+def test_a_number_too_large_for_its_display_unit_is_shown():
+    assert repr(jv.ConstantSpeed(1e308)) == "constant_speed(speed=1e+308)"
+
+
 def test_traced_numbers_show_their_shape():
     shown = []
     jax.jit(lambda speed: shown.append(repr(jv.ConstantSpeed(speed))))(60.0)

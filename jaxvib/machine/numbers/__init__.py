@@ -177,7 +177,7 @@ def _shown(value: object, spec: NumberSpec) -> str:
 def with_display_units(spec: NumberSpec, value: Any) -> Any:
     """Return a number, or the nested list of an array, as texts with 10 digits and the display unit, which constructors read.
 
-    A number without a unit, or one that is not finite, stays a number.
+    A number without a unit, or one that is not finite in the display unit, stays a number.
 
     >>> with_display_units(NumberSpec(("N/m",), Bounds()), [5e4, 0.0]), with_display_units(PLAIN, 0.1)
     (['50 N/mm', '0 N/mm'], 0.1)
@@ -186,7 +186,11 @@ def with_display_units(spec: NumberSpec, value: Any) -> Any:
     if len(spec.units) > 1:
         units = zip(spec.units, array, strict=True)
         return [with_display_units(spec._replace(units=(each,)), entry) for each, entry in units]
-    if not spec.unit or array.dtype.kind != "f" or not np.all(np.isfinite(array)):
+    if not spec.unit or array.dtype.kind != "f":
         return array.tolist()
     shown, factor = shown_unit(spec.unit_of_tables, float(np.max(np.abs(array), initial=0.0)))
-    return np.vectorize(lambda number: f"{factor * number:.10g} {shown}", otypes=[object])(array).tolist()
+    with np.errstate(over="ignore"):
+        numbers = factor * array
+    if not np.all(np.isfinite(numbers)):
+        return array.tolist()
+    return np.vectorize(lambda number: f"{number:.10g} {shown}", otypes=[object])(numbers).tolist()
