@@ -53,7 +53,7 @@ frequency."""
 class FitStatus(eqx.Enumeration):
     """Outcomes of a fit of a machine. The value of each member is the message shown to the user."""
 
-    found = "the model explains the records up to noise"
+    found = "the model explains the records; only noise remains"
     patterned = (
         "the residuals are not noise, or the rotor's angle is inaccurate: see the notes. The model lacks a part, the angle has "
         "errors, or the fit has ended at a wrong minimum, and the intervals are too narrow; plot the residuals over speed, and "

@@ -377,7 +377,7 @@ def shapes_of(machine: Machine, at: Place = None) -> tuple[Carrier, Mount]:
     try:
         return _structure(rest, tuple(map(shape_and_dtype, leaves)), jnp.result_type(float), platform)
     except InputError:
-        machine.mount(at)  # raises the same error, with the place in place of its shape
+        machine.mount(at)  # raises the same error, which then names the place
         raise
 
 

@@ -84,7 +84,7 @@ def settle(
       beats with that of an imbalance, which turns faster. The last 32 segments are considered (of 100 periods of the lowest
       natural frequency; more if segments are shorter). The motion is steady in the mean if the drift does not decrease, and if
       the means of amplitudes, force and speed over the four quarters of these segments differ by no more than the larger of
-      two limits: what their scatter explains, and half the drift
+      two limits: the difference that their scatter explains, and half the drift
     - `creeping`: four loads or more, or three with an imbalance, can balance the rotor in infinitely many arrangements
       (`balanced_states`). Small disturbances such as gravity move the loads slowly from one to the next, for hours. The status
       is `creeping` if the loads balance the rotor, free vibrations of the carrier have decayed, and the loads creep evenly

@@ -31,9 +31,13 @@ _STEPS_PER_UPDATE = 20
 
 
 class _SearchState(NamedTuple):
-    """State of one search: the design with its values and derivatives (as in `Point`), the state of Adam, the step length, the
-    multipliers and the weight of the demands, the largest violation of a demand at the last update of the multipliers
-    (`worst`), the `scale` by which the objective is divided (modulus of its initial value), and the number of `steps`."""
+    """State of one search.
+
+    It contains the design with its values and derivatives (as in `Point`), the state of Adam, the step length, and the
+    multipliers and the weight of the demands. `worst` is the largest violation of a demand at the last update of the
+    multipliers, `scale` the modulus of the initial objective, by which the objective is divided, and `steps` the number of
+    steps.
+    """
 
     z: Array
     values: Array

@@ -94,8 +94,8 @@ def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
     """Return the prediction of a run that the fit did not use, and its comparison with the readings.
 
     - The parameters and the gains are those of the fit. The motion at the first sample and the offsets are fitted to the run
-    - The zero of the rotor's angle is fitted too, with two exceptions: the fit and the run both have the mark of a tachometer,
-      and the scene has neither loads nor nonlinear supports; or the scene has several exciters
+    - The zero of the rotor's angle is fitted too. It is not fitted in two cases: the scene has several exciters; or the fit
+      and the run both have the mark of a tachometer, and the scene has neither loads nor nonlinear supports
     - A likelihood-ratio test compares two hypotheses: the machine has the same parameters in the run as in the fit, or it has
       other parameters. The test accounts for the errors of the fit and the noise of the run. If the p-value of the deviation is
       below 1e-5, the run contradicts the fit, and a note names the parameter whose change explains most of the deviation. In a

@@ -48,8 +48,10 @@ _KINDS = ("acceleration", "velocity", "displacement", "force", "angle", "speed")
 
 
 def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
-    """Return a run with a lower sampling rate, and a note about both rates, if the run has at least 2^14 samples and at least
-    40 of them in a period of the `highest` frequency (rad/s) of the machine and its rotors; otherwise return the same run.
+    """Return a run with a lower sampling rate, and a note about both rates. A short or coarse run is returned unchanged.
+
+    The rate is reduced if the run has at least 2^14 samples, and at least 40 of them in a period of the `highest` frequency
+    (rad/s) of the machine and its rotors.
 
     A run with clipped readings (each is only a bound of the motion), or with channels at different times, is not changed.
     """

@@ -50,8 +50,8 @@ class Orbit(Result):
 
     Returned by `jam_orbit`.
 
-    Values are NaN if the status is `absent`, or `not_converged` (then except for `residual` and `offsets`). Signals are
-    Re sum_k c_k exp(i k theta).
+    Values are NaN if the status is `absent`. If it is `not_converged`, all values except `residual` and `offsets` are NaN.
+    Signals are Re sum_k c_k exp(i k theta).
 
     **Attributes** (nd coordinates, nb directions of the force, J and K harmonics)
 
@@ -133,7 +133,7 @@ class Orbit(Result):
 
     @property
     def judgement(self) -> str:
-        """Stability as text: "stable", "unstable", or that the stability is unknown."""
+        """Stability as text: "stable", "unstable" or "stability unknown"."""
         return judgement_of(self.multiplier, self.multiplier_error, self.stable)
 
     def force_peaks(self) -> Array:
@@ -171,7 +171,7 @@ class Orbit(Result):
 
 
 def judgement_of(multiplier: Array, error: Array, stable: Array) -> str:
-    """Return "stable" or "unstable", or that the stability is unknown, for the largest `multiplier` of a motion.
+    """Return "stable", "unstable" or "stability unknown" for the largest `multiplier` of a motion.
 
     It is unknown without a multiplier, and if the multiplier differs from 1 by less than its `error`.
     """

@@ -39,7 +39,7 @@ it."""
 class IdentifyStatus(eqx.Enumeration):
     """Outcomes of a fit. The value of each member is the message shown to the user."""
 
-    found = "the fit explains the record up to noise"
+    found = "the fit explains the record; only noise remains"
     patterned = "the residuals of the fit are not noise: the friction law is incomplete; its coefficients depend on the swing"
     negative = "a coefficient of friction is below 0: the swing grows, or its decay does not follow this law"
     contradicted = "the period contradicts the length and inertia of the pendulum: check both, because mu1 is proportional to J"
@@ -137,9 +137,8 @@ def identify_bearing(
       Levenberg and Marquardt's method with forward-mode derivatives through the integration
     - The frequency is a free parameter, because the dimensions of a pendulum are never known accurately enough to predict the
       phase of many swings; g is adapted to the frequency. J is taken from `pendulum`; therefore mu1 is proportional to this J
-    - Samples before the release are not used. Samples after the last clear turning point, when the pendulum is at rest or its
-      swing is below the noise, are not used either, because the position at which the pendulum comes to rest is not a smooth
-      function of the friction
+    - Samples before the release and after the last clear turning point are not used. After this point the pendulum is at rest,
+      or its swing is below the noise. The position at which it comes to rest is not a smooth function of the friction
     - `width` is 0.005 of the speed of the smallest swing. In this swing the dry friction then dissipates 0.001 % less energy
       than with a sudden change of its sign; the difference is smaller for larger swings
 
