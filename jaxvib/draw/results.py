@@ -118,15 +118,12 @@ def phase_circles(
     sets: Sequence[tuple[str, np.ndarray]],
     *,
     resultant: bool = True,
-    numbers: np.ndarray | None = None,
-    plural: str = "loads",
     ax: Onto = None,
 ) -> Drawn:
     """Draw angles of loads (count,) rad as points on a circle, one circle for each (title, angles).
 
     A black arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel.
-    `resultant`: False for masses that turn in different directions, whose mean has no meaning. `numbers` and `plural`: see
-    `draw_circle`.
+    `resultant`: False for masses that turn in different directions, whose mean has no meaning.
     `ax` must contain one axes object for each circle.
 
     >>> import numpy as np
@@ -139,7 +136,7 @@ def phase_circles(
     for k, axis in enumerate(axes):
         axis.set_axis_off()
         if k < len(sets):
-            draw_circle(axis, *sets[k], resultant=resultant, numbers=numbers, plural=plural)
+            draw_circle(axis, *sets[k], resultant=resultant)
     return figure if ax is None else ax
 
 

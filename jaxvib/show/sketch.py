@@ -43,7 +43,7 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
 
     - `scene` of platforms, of a rotor, or of one body in a plane
     - `deck`: the motion of points of a body in a plane, such as the result of `Run.deck`; the ellipses of the points are drawn,
-      magnified; default: none
+      magnified, with dots at their positions at one time; default: none
     - `ax`: axes to draw onto; default: a new figure
 
     **Returns** a matplotlib figure, or the given `ax`.
@@ -105,7 +105,7 @@ def _draw_deck(axis: Axes, view: View, deck: Deck, limits: Limits) -> None:
     left, right, bottom, top = limits
     (low_x, low_y), (high_x, high_y) = (extreme(np.concatenate(paths), axis=0) for extreme in (np.min, np.max))
     axis.set(xlim=(min(left, low_x - 0.1), max(right, high_x + 0.1)), ylim=(min(bottom, low_y - 0.1), max(top, high_y + 0.1)))
-    note = f"ellipses drawn {magnify:g} x as large"
+    note = f"ellipses drawn {magnify:g} x as large; dots: positions at one time"
     axis.text(right, bottom, note, ha="right", va="bottom", fontsize="x-small", color="#555555")
 
 

@@ -226,7 +226,9 @@ def test_points_on_a_circle_are_numbered_from_1():
 
 @pytest.mark.parametrize("named", [{}, {"plural": "masses"}])
 def test_many_points_at_one_angle_share_a_label(named):
-    texts = [text.get_text() for text in phase_circles([("", np.zeros(6))], **named).axes[0].texts]
+    axis = Figure().subplots()
+    draw_circle(axis, "", np.zeros(6), **named)
+    texts = [text.get_text() for text in axis.texts]
     assert f"6 {named.get('plural', 'loads')}" in texts
 
 

@@ -104,6 +104,8 @@ def test_ellipses_of_a_deck_lie_at_their_points(run):
         np.testing.assert_allclose(np.mean(line.get_xydata()[:-1], axis=0), scale * point, atol=1e-9)
     marks = [line.get_xydata()[0] for line in figure.axes[0].lines if line.get_marker() == "o" and len(line.get_xdata()) == 1]
     np.testing.assert_array_equal(marks, [line.get_xydata()[0] for line in lines])  # where the points are at first
+    notes = [text.get_text() for text in figure.axes[0].texts]
+    assert any("x as large" in note and "dots: positions at one time" in note for note in notes)
     assert "x as large" in deck.plot().axes[0].get_title(loc="left")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import equinox as eqx
 import jax
@@ -59,6 +59,9 @@ from jaxvib.steady.regimes.local import (
 from jaxvib.steady.regimes.search import MAX_COMPLETE, all_regimes, is_balanced
 from jaxvib.units import Number, number, numbers
 from jaxvib.units.known import when_known
+
+if TYPE_CHECKING:
+    from jaxvib.draw.motion.regimes import DrawnRegime
 
 _REGIMES_PER_PROGRAM = 16
 """Number of regimes in one program; typical scenes have 2 to 20."""
@@ -177,12 +180,17 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the phases of the masses on a circle, each in its direction of rotation."""
-        from jaxvib.draw.results import phase_circles  # slow import
+        """Plot the phases of the masses on a circle, each in its direction of rotation, and state them with the torques."""
+        from jaxvib.draw.motion.regimes import regimes_chart  # slow import
 
-        one = [(speed_text(self.speed, 6), np.asarray(self.phases))]
-        numbers = np.asarray(self.masses)
-        return phase_circles(one, resultant=_has_resultant(self), numbers=numbers, plural="masses", ax=ax)
+        return regimes_chart([_drawn_regime(self)], None, np.zeros(0), names=(), resultant=_has_resultant(self), ax=ax)
+
+
+def _drawn_regime(regime: SynchronousRegime) -> DrawnRegime:
+    from jaxvib.draw.motion.regimes import DrawnRegime  # slow import
+
+    masses, phases, torque = (np.asarray(values) for values in (regime.masses, regime.phases, regime.torque))
+    return DrawnRegime(float(regime.speed), masses, phases, torque, bool(regime.stable))
 
 
 @cached
@@ -247,19 +255,10 @@ class SynchronousRegimes(AbstractSynchronousRegime):
 
         **Returns** a matplotlib figure, or the given `ax`, which must contain one axes object for each panel.
         """
-        from jaxvib.draw.motion.regimes import DrawnRegime, TorqueCurves, regimes_chart  # slow import
+        from jaxvib.draw.motion.regimes import TorqueCurves, regimes_chart  # slow import
 
         order = np.argsort(~np.asarray(self.stable), kind="stable")[: None if ax is not None else _MAX_CIRCLES]
-        regimes = [
-            DrawnRegime(
-                float(self.speed[k]),
-                np.asarray(self.masses[k]),
-                np.asarray(self.phases[k]),
-                np.asarray(self.torque[k]),
-                bool(self.stable[k]),
-            )
-            for k in order
-        ]
+        regimes = [_drawn_regime(self.select(int(k))) for k in order]
         owners, curves = mass_owners(self.scene), None
         if regimes and self.phases.shape[1] == owners.size:
             curves = TorqueCurves(*map(np.asarray, _torque_curves(self.scene, self.phases[order[0]])))
