@@ -80,7 +80,8 @@ def _throw_angle(angle: Number) -> float:
     """
     radians = number_in(angle, "rad", "angle")
     if not 0.0 < abs(radians) < np.pi / 2.0:
-        raise InputError("angle", f"is {quoted(angle)}; it must be between 0 and 90 deg, or between -90 deg and 0")
+        bounds = "between 0 and 90 deg, or between -90 deg and 0"
+        raise InputError("angle", f"is {quoted(angle)}; it must be {bounds}; a number without a unit is in rad")
     return radians
 
 

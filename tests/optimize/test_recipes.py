@@ -214,6 +214,7 @@ def test_the_widest_range_is_that_of_the_whole_branch():
         (lambda: feeder(SCREEN, points=DECK, range_=0), "range_ is 0; it must be greater than 1"),
         (lambda: feeder(SCREEN, points=DECK, spread=-1), "^spread is -1; it must be greater than 0"),
         (lambda: feeder(SCREEN, points=DECK, angle="100 deg"), "^angle is '100 deg'; it must be between 0 and 90 deg"),
+        (lambda: linear_screen(SCREEN, points=DECK, angle=45), "^angle is 45; .*; a number without a unit is in rad"),
         (lambda: linear_screen(SCREEN, points=DECK, stroke="-8 mm"), "^stroke is '-8 mm'; it must be greater than 0"),
         (lambda: circular_screen(SCREEN, points=DECK, stroke=0.0), "^stroke is 0.0; it must be greater than 0"),
         (lambda: circular_screen(SCREEN, points=DECK, reach=-0.1), "^reach is -0.1; it must be greater than 0"),
