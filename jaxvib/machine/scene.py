@@ -322,7 +322,7 @@ class Scene(Part):
 
     @property
     def not_smooth(self) -> tuple[Effect | Drive, ...]:
-        """Effects and drives whose forces or torques do not have all derivatives, except at the times `Drive.jump_ts`."""
+        """Effects and drives whose forces or torques are not smooth. Jumps at the times `Drive.jump_ts` do not count."""
         effects = [effect for effect in self.all_effects if not all(term.is_smooth for term in effect.terms())]
         return (*effects, *(exciter.drive for exciter in self.exciters if not exciter.drive.is_smooth))
 

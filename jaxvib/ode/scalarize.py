@@ -169,7 +169,7 @@ def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared
     correct but may be slow.
 
     **Arguments**: `function(x, shared)` returns a tree of arrays. The first leaf of x must be a finite scalar, such as a time,
-    because `fenced` makes its hidden 1 from this number.
+    because `fenced` computes a 1 from this number, which the compiler does not recognize.
 
     >>> import jax.numpy as jnp
     >>> scalarized_vmap(lambda x, c: c * x)(jnp.asarray([1.0, 2.0]), jnp.asarray(3.0)).tolist()
