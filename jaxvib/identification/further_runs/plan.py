@@ -92,7 +92,7 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
     **Arguments**
 
     - `fit` from `identify`
-    - `candidates`: a list of `PlannedRun`; typical: 2 to 10
+    - `candidates`: a list of `PlannedRun`
     - `limits`: {"speed": largest rotor speed, rad/s, "acceleration": largest absolute angular acceleration, rad/s^2}; typical:
       {"speed": "1500 rpm", "acceleration": "10 rad/s^2"}; default: no run with an optimized speed
 
