@@ -83,15 +83,14 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
 
     from jaxvib.machine.effects.base import has_term
     from jaxvib.machine.effects.terms import ContactFriction
-    from jaxvib.steady.jams.jam import STABILITY_CRITERION
-    from jaxvib.steady.jams.phases import growth_of_free_loads
+    from jaxvib.steady.jams.jam import STABILITY_CRITERION, growth_of_modes
 
     modes_found = jax.device_get(jv.jam_modes(scene))  # NumPy arrays, because indexing JAX arrays would compile programs
     output.figure("branches.png", lambda: jv.branches(scene).plot())
     if csv is not None:
         output.csv(csv, jv.branches(scene), "point")
     jams = [modes_found.select(k) for k in modes_found.mode_numbers()]
-    growth = dict(zip(modes_found.mode.tolist(), growth_of_free_loads(scene, modes_found.omega).tolist(), strict=True))
+    growth = growth_of_modes(modes_found, scene)
     remaining = [jam for jam in jams if bool(jam.stable) and not growth[int(jam.mode)] > 0.0]
     measures = {int(jam.mode): measures_of(scene, jam) for jam in remaining}
     folds = [k for k, exists in enumerate(np.asarray(modes_found.folds.exists)) if exists]
@@ -118,11 +117,10 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
         head, *rows = modes_table(modes_found, growth)
         lines = [
             f"rotor {speed_text(scene.drive.speed)}; resonances {speed_text(modes_found.resonances)}",
-            table("jam modes (light loads); amplitudes and foundation force are zero to peak", head, rows)
-            if rows
-            else "no jam mode at this speed",
+            table("jam modes (light loads)", head, rows) if rows else "no jam mode at this speed",
         ]
         if rows:
+            lines.append("amplitudes and foundation force are zero to peak")
             lines.append("not stable: after a small disturbance the loads (balls, rollers, pendulums) leave this jam")
         lines += [text] if (text := modes_found.unresolved_text()) else []
         if tolerances:

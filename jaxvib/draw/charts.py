@@ -374,5 +374,8 @@ def regime_chart(
     bottom.axhline(scale * rotor_speed, color="black", lw=1.0, ls="--", label="rotor")
     bottom.set(ylabel=f"load speed, {unit}", xlabel="drag, N s/m", xscale="log")
     log_ticks(bottom, "x")
+    between, share = np.diff(np.log(drag)), 1.0 / 12.0  # the width of a label, relative to the axis
+    if len(drag) < 2 or np.min(between) > share * np.sum(between):
+        bottom.set_xticks(drag, [f"{value:.3g}" for value in drag])
     legend_above(bottom)
     return figure if ax is None else ax

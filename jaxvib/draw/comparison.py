@@ -206,7 +206,8 @@ def audit_chart(
         if not np.any(np.isfinite(values)):
             continue
         # Values below the axis are drawn on its edge.
-        left.plot(np.maximum(100.0 * values, low), place, mark, color=color, ms=6, alpha=0.85, label=name)
+        look: Look = {"color": color, "ms": 6, "alpha": 0.85, "clip_on": False}
+        left.plot(np.maximum(100.0 * values, low), place, mark, label=name, **look)
     left.set_xscale("log")
     left.set_xlim(left=low)
     log_ticks(left, "x")

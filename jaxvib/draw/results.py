@@ -117,13 +117,16 @@ def shapes_chart(
 def phase_circles(
     sets: Sequence[tuple[str, np.ndarray]],
     *,
+    weights: np.ndarray | None = None,
+    imbalance: complex = 0.0,
     resultant: bool = True,
     ax: Onto = None,
 ) -> Drawn:
     """Draw angles of loads (count,) rad as points on a circle, one circle for each (title, angles).
 
     A black arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel.
-    `resultant`: False for masses that turn in different directions, whose mean has no meaning.
+    `resultant`: False for masses that turn in different directions, whose mean has no meaning. `weights` and `imbalance`: see
+    `draw_circle`.
     `ax` must contain one axes object for each circle.
 
     >>> import numpy as np
@@ -136,7 +139,7 @@ def phase_circles(
     for k, axis in enumerate(axes):
         axis.set_axis_off()
         if k < len(sets):
-            draw_circle(axis, *sets[k], resultant=resultant)
+            draw_circle(axis, *sets[k], weights=weights, imbalance=imbalance, resultant=resultant)
     return figure if ax is None else ax
 
 

@@ -67,14 +67,15 @@ def label_map(
     edges = axis.get_xlim(), axis.get_ylim()
     for kind, parts in (lines or {}).items():
         dashes, inside = _DASHES.get(kind, ":"), False
+        width = 1.1 if dashes == "-" else 2.4  # dots remain visible on a solid line at the same place
         for part_x, part_y in parts:
             xs, ys = _to_edges(part_x, part_y, y, edges[1]) if len(part_x) > 1 else (part_x, part_y)
             ys, xs = _to_edges(ys, xs, x, edges[0]) if len(part_x) > 1 else (ys, xs)
-            axis.plot(xs, ys, color="black", lw=1.1, ls=dashes, marker="." if len(xs) == 1 else None)
+            axis.plot(xs, ys, color="black", lw=width, ls=dashes, marker="." if len(xs) == 1 else None)
             within = [(values >= low) & (values <= high) for values, (low, high) in zip((xs, ys), edges, strict=True)]
             inside = inside or bool(np.any(within[0] & within[1]))
         if inside:
-            entries.append(Line2D([], [], color="black", lw=1.1, ls=dashes, label=f"{kind} bifurcations of exact jams"))
+            entries.append(Line2D([], [], color="black", lw=width, ls=dashes, label=f"{kind} bifurcations of exact jams"))
     axis.set(xlim=edges[0], ylim=edges[1])
     _scales(axis, x_label, y_label, log)
     axis.grid(False)

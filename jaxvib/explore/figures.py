@@ -217,7 +217,9 @@ def readings(scene: Scene) -> str:
 
     if not scene.is_plain:
         return regime_readings(scene)
-    return jax.device_get(jam_modes(scene) if has_branches(scene) else critical_speeds(scene)).summary()
+    if has_branches(scene):
+        return jax.device_get(jam_modes(scene)).summary(scene)
+    return jax.device_get(critical_speeds(scene)).summary()
 
 
 def modes_of(scene: Scene) -> list[int]:

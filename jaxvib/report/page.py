@@ -117,9 +117,10 @@ def html_report(
 
 def units_of_document(document: Mapping[str, Plain], result: eqx.Module | None) -> dict[str, str]:
     """Return the units of the numbers in the document of a command, by name: those of its `result`, of measures of vibrations,
-    and of speeds that commands add."""
+    and of numbers that commands add."""
     units = {} if result is None else units_of(result)
     units |= {"natural_frequencies": "rad/s", "rotor_speed": "rad/s", "largest_displacement": "m or rad", "largest_force": "N"}
+    units |= {"growth_of_free_loads": "1/s", "drag": "N s/m"}
     rows = [row for value in document.values() if isinstance(value, list) for row in value if isinstance(row, Mapping)]
     if any("measures" in each for each in (document, *rows)):
         of_measures = {each.name: each.metadata.get("unit", "") for each in dataclasses.fields(VibrationMeasures)}

@@ -177,7 +177,8 @@ def test_the_scale_of_the_criterion_has_no_kink():
 @pytest.mark.parametrize("count", [2, 12])
 def test_bars_of_few_drags_do_not_fill_the_axis(count):
     drag = np.geomspace(0.5, 5.0, count)
-    axis = regime_chart(drag, {"jammed": np.ones(count)}, np.ones((count, 2)), 2.0).axes[0]
+    axis, speeds = regime_chart(drag, {"jammed": np.ones(count)}, np.ones((count, 2)), 2.0).axes
+    assert ([label.get_text() for label in speeds.get_xticklabels()] == ["0.5", "5"]) == (count == 2)
     widths = [np.log(bar.get_x() + bar.get_width()) - np.log(bar.get_x()) for bar in axis.patches]
     assert np.sum(widths) < np.log(10.0) and [bar.get_height() for bar in axis.patches] == [100.0] * count
     assert count > 2 or np.sum(widths) < 0.15 * np.log(10.0)
@@ -199,6 +200,15 @@ def test_a_line_of_folds_reaches_the_edges_of_its_map():
     axis = label_map(x, y, np.zeros((3, 5), int), ["a"], x_label="x", y_label="y", lines=lines).axes[0]
     np.testing.assert_allclose(axis.lines[0].get_xydata()[[0, -1]], [[0.5, -0.5], [3.5, 2.5]])
     assert [t.get_text() for t in axis.get_legend().get_texts()] == ["a", "fold bifurcations of exact jams"]
+
+
+def test_a_dotted_line_of_a_map_remains_visible_on_a_solid_one():
+    x, y, line = np.linspace(0.0, 4.0, 5), np.linspace(0.0, 2.0, 3), [(np.array([1.0, 1.0]), np.array([0.0, 2.0]))]
+    axis = label_map(x, y, np.zeros((3, 5), int), ["a"], x_label="x", y_label="y", lines={"fold": line, "symmetry": line}).axes[
+        0
+    ]
+    fold, symmetry = axis.lines
+    assert symmetry.get_linewidth() > 2.0 * fold.get_linewidth()
 
 
 def test_run_up_shows_the_resonances_that_it_passes():

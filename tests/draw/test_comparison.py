@@ -96,6 +96,7 @@ def test_an_audit_shows_changes_in_percent_from_the_least():
     np.testing.assert_allclose(speed, [[1e-7, 0.0], [np.nan, 1.0]])
     np.testing.assert_allclose(accuracy[:, 0], 1.0)
     assert axis.get_xlim()[0] == pytest.approx(low)
+    assert not any(line.get_clip_on() for line in axis.lines[:2])  # the axis would cut a marker at its edge
     ranges = [segment[:, 0] for segment in axis.collections[0].get_segments()]
     np.testing.assert_allclose(ranges, [[low, 1e-3], [low, low]])
 

@@ -133,3 +133,6 @@ def test_measures_in_documents_of_commands_have_units(document):
     page = Report("", {**document, "natural_frequencies": [10.0]}, units_of_document(document, None)).html()
     assert "rpm" in page and re.search(r"stroke( 2 mm|</th><td>2</td><td class='unit'>mm)", page)
     assert "stroke" not in units_of_document({"regimes": []}, None)
+    modes, drags = [{"mode": 5, "growth_of_free_loads": 13.2}], [{"drag": 0.7, "factor": 0.5}]
+    page = Report("", {"modes": modes, "drag_limits": drags}, units_of_document({}, None)).html()
+    assert "growth of free loads, 1/s" in page and "drag, N s/m" in page

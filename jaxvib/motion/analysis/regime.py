@@ -79,6 +79,8 @@ class Regime(Result):
       first load
     - `unbalance`: residual unbalance of loads and rotor in the frame of the rotor, relative to that of all loads at one angle;
       balanced below 0.02
+    - `weight` (count,): share of each load in the sum of their unbalances
+    - `imbalance`: static imbalance of the rotor relative to this sum, complex, in the frame of the rotor
     - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed`, rad/s
     - `mode`: estimated number of the jam mode; 0 if the loads are not jammed. Let natural frequency k be the last one below the
       mean load speed. Mode 2 k begins at this frequency; mode 2 k + 1 ends at the next one, or at the rotor speed if that is
@@ -96,6 +98,8 @@ class Regime(Result):
     ripple: Array = eqx.field(metadata=in_unit("rad/s"))
     phase: Array = eqx.field(metadata=in_unit("rad", "load"))
     unbalance: Array = eqx.field(metadata=in_unit(""))
+    weight: Array = eqx.field(metadata=in_unit("", "load"))
+    imbalance: Array = eqx.field(metadata=in_unit(""))
     resonance: Array = eqx.field(metadata=in_unit(""))
     resonance_speed: Array = eqx.field(metadata=in_unit("rad/s"))
     mode: Array = eqx.field(metadata=in_unit(""))
@@ -152,15 +156,18 @@ class Regime(Result):
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Plot the loads on a circle at their `phase`, relative to the first load or to the rotor.
 
-        There is no arrow of the loads' mean if they turn with the rotor: its imbalance, and the planes of the loads, also
-        contribute to the remaining unbalance, which the title states.
+        Arrows show the mean of the loads, and the `imbalance` of a rotor with which all loads turn. The title states the
+        remaining unbalance, which for a rotor that tilts includes moments; the arrows do not include them.
         """
         from jaxvib.draw.results import phase_circles  # slow import
 
-        title, is_relative_to_rotor = self.label, self.label in ("balanced", "unbalanced")
-        if is_relative_to_rotor:
-            title += f"\n{100.0 * float(self.unbalance):.2g} % of the loads' unbalance left"
-        return phase_circles([(title, np.asarray(self.phase))], resultant=not is_relative_to_rotor, ax=ax)
+        title, weight, imbalance = self.label, np.asarray(self.weight), 0.0
+        if title in ("balanced", "unbalanced"):
+            imbalance, share = complex(self.imbalance), float(self.unbalance)
+            static = abs(np.sum(weight * np.exp(1j * np.asarray(self.phase))) + imbalance)
+            with_moments = ", with moments" if share > static + _BALANCED_UNBALANCE_SHARE else ""
+            title += f"\n{100.0 * share:.2g} % of the loads' unbalance left{with_moments}"
+        return phase_circles([(title, np.asarray(self.phase))], weights=weight, imbalance=imbalance, ax=ax)
 
 
 @validated
@@ -225,6 +232,8 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
         jnp.max(load_phase_change) < _LOCKED_PHASE_CHANGE
     )
 
+    unbalances, imbalance = _unbalances(scene, turn)
+    size = jnp.sum(jnp.abs(unbalances))
     unbalance = _unbalance(scene, to_rotor, turn)
     name = RegimeName.where(is_steady, RegimeName.parted, RegimeName.unsettled)
     name = RegimeName.where(is_steady & has_one_speed & ~jnp.any(with_rotor), RegimeName.jammed, name)
@@ -247,6 +256,8 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
         ripple=jnp.where(jnp.all(is_known), jnp.max(jnp.max(rate, axis=0) - jnp.min(rate, axis=0)) / 2.0, jnp.nan),
         phase=jnp.where(all_with_rotor, to_rotor, to_first),
         unbalance=unbalance,
+        weight=unbalances / size,
+        imbalance=imbalance / size,
         resonance=nearest + 1,
         resonance_speed=natural[nearest],
         mode=jnp.where(name == RegimeName.jammed, _mode(natural, mean, rotor), 0),
@@ -285,19 +296,24 @@ def _mean_phases(angle: Array, half: int) -> tuple[Array, Array]:
     return jnp.angle(jnp.mean(point, axis=0)), jnp.abs(jnp.angle(late * jnp.conj(early)))
 
 
+def _unbalances(scene: Scene, turn: Array) -> tuple[Array, Array]:
+    """Return the unbalances of the loads (count,), kg m, and the static imbalance of the rotor, complex, in its frame."""
+    loads, origin = scene.loads, jnp.zeros_like(turn[0])
+    static = [term.at(origin).static for term in terms_of(scene.all_effects, RotorImbalance)]
+    imbalance = sum((x + 1j * y for x, y in static), jnp.zeros_like(1j * origin))
+    return jnp.broadcast_to(loads.mass * loads.arm(), (loads.count,)), imbalance
+
+
 def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
     """Return the residual unbalance of rotor and loads at the angles `phase` to the rotor, relative to all loads at one angle.
 
     For a rotor that tilts, the moment about the point of the loads is included, relative to the levers of the loads, or to the
     radius of gyration of the rotor if the levers are 0.
     """
-    mount, loads = scene.mount(), scene.loads
-    unbalances = jnp.broadcast_to(loads.mass * loads.arm(), (loads.count,)) * jnp.exp(1j * phase)
-    origin = jnp.zeros_like(turn[0])
+    mount, origin = scene.mount(), jnp.zeros_like(turn[0])
+    of_loads, rotor_unbalance = _unbalances(scene, turn)
+    unbalances = of_loads * jnp.exp(1j * phase)
     imbalances = [term.at(origin) for term in terms_of(scene.all_effects, RotorImbalance)]
-    rotor_unbalance = sum(
-        (imbalance.static[0] + 1j * imbalance.static[1] for imbalance in imbalances), jnp.zeros_like(unbalances[0])
-    )
     size = jnp.sum(jnp.abs(unbalances))
     residual = jnp.abs(jnp.sum(unbalances) + rotor_unbalance) / size
     if mount.tilt is None:

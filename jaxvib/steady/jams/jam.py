@@ -39,6 +39,7 @@ from jaxvib.steady.jams.folds import (
     rotor_speed_at,
     scanned_speed,
 )
+from jaxvib.steady.jams.phases import growth_of_free_loads
 from jaxvib.steady.outcome import REFUSED, entry, outcome
 from jaxvib.units.known import when_known
 
@@ -197,17 +198,23 @@ class JamModes(AbstractJam):
         """
         return entry(self, Jam, self.row(mode, throw=throw))
 
-    def summary(self) -> str:
+    @validated
+    def summary(self, scene: Scene | None = None) -> str:
         """Return the table of `jaxvib modes` in text; amplitudes and foundation force are zero to peak.
 
-        The command also computes whether the loads stay together, for which it needs the scene.
+        **Arguments**: `scene` of the modes. With it the column "stable" also states whether the loads stay together, as in the
+        table of the command (not computed for loads with a `ball_radius` or dry friction).
         """
         rotor, resonances = (speed_text(speed) for speed in (np.asarray(self.rotor_speed)[0], self.resonances))
-        lines = modes_table(self, {})
+        growth = {} if scene is None else growth_of_modes(self, scene)
+        lines = modes_table(self, growth)
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         rows = ("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in lines)
         notes = [text] if (text := self.unresolved_text()) else []
-        return "\n".join([f"rotor {rotor}; resonances {resonances}", *rows, *notes, f"stable: {STABILITY_CRITERION}"])
+        is_known = any(map(math.isfinite, growth.values()))
+        notes += [f"stable: {STABILITY_OF_FREE_LOADS if is_known else STABILITY_CRITERION}"]
+        notes += ["(summary(scene) computes whether they stay together)"] if scene is None else []
+        return "\n".join([f"rotor {rotor}; resonances {resonances}", *rows, *notes])
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
@@ -224,6 +231,12 @@ def require_mode_number(mode: object, count: int) -> None:
 def require_mode_of(scene: Scene, mode: object) -> None:
     """Raise `InputError` unless `mode` is the number of a jam mode of a `scene`, which has 2 nd + 1."""
     require_mode_number(mode, 2 * len(scene.machine.structure().coordinates) + 1)
+
+
+def growth_of_modes(jams: JamModes, scene: Scene) -> dict[int, float]:
+    """Return `growth_of_free_loads` of each mode, 1/s, by mode number."""
+    numbers = np.asarray(jams.mode).tolist()
+    return dict(zip(numbers, growth_of_free_loads(scene, jams.omega).tolist(), strict=True))
 
 
 def modes_table(jams: JamModes, growth: Mapping[int, float]) -> list[list[str]]:

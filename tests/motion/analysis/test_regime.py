@@ -71,11 +71,19 @@ def test_regimes_of_prescribed_motions(name):
     assert str(jv.RegimeName[found.name]) in found.summary()
 
 
-@pytest.mark.parametrize("name", ["together", "imbalance is balanced"])
-def test_figures_show_a_mean_of_jammed_loads_only(name):
-    """The mean of loads that balance an imbalance is not the unbalance that is left."""
+@pytest.mark.parametrize(
+    ("name", "arrows", "with_moments"),
+    [
+        ("together", "resultant 0.997", False),
+        ("imbalance is balanced", "loads 0.5, rotor 0.5 (orange), sum 0", False),
+        ("imbalance is left", "loads 0, rotor 0.5 (orange), sum 0.5", False),
+        ("a couple is left", "resultant 0", True),
+    ],
+)
+def test_figures_show_the_loads_and_the_imbalance_of_the_rotor(name, arrows, with_moments):
     (axis,) = jv.regime(*made(**CASES[name][0])).plot().axes
-    assert ("resultant" in axis.get_title()) == (name == "together")
+    title = axis.get_title().split("\n")
+    assert (title[0], title[-1]) == (CASES[name][1], arrows) and ("with moments" in title[1]) == with_moments
     plt.close("all")
 
 

@@ -227,7 +227,19 @@ def test_summary_lists_the_modes():
     text = jv.jam_modes(published().scene()).summary()
     lines = text.splitlines()
     assert lines[1].split()[:3] == ["mode", "rpm", "stable"] and lines[2].split()[:2] == ["3", "9.2824"]
-    assert text.endswith("stable: by slope, for light loads that stay together")
+    assert text.endswith("that stay together\n(summary(scene) computes whether they stay together)")
+    assert lines[2].split()[2:6] == ["yes,", "if", "they", "stay"]
+
+
+def test_summary_with_a_scene_states_whether_loads_stay_together():
+    machine = jv.two_mass(
+        mass=(120.0, 117.6), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0
+    )
+    s = jv.Scene(machine, jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed("1500 rpm"))
+    text = jv.jam_modes(s).summary(s)
+    stable = {line.split()[0]: " ".join(line.split()[2:]) for line in text.splitlines()[2:-1]}
+    assert stable["3"].startswith("yes ") and stable["4"].startswith("no ") and stable["5"].startswith("no: the loads spread ")
+    assert text.endswith("stable: for light loads, each of which is free to move separately")
 
 
 def test_vmap_over_rotor_speeds_is_a_loop():
