@@ -75,13 +75,14 @@ class Criterion(Result):
         """Return the characteristic speeds and intervals as a table in text."""
 
         def written(intervals: list[list[float | None]]) -> str:
-            return ", ".join(
-                f"{scale * (a or 0.0):.6g} .. {'infinity' if b is None else f'{scale * b:.6g}'}" for a, b in intervals
-            )
+            ranges = (f"{scale * (a or 0.0):.6g} .. {'infinity' if b is None else f'{scale * b:.6g}'}" for a, b in intervals)
+            return f"{', '.join(ranges)} {unit}" if intervals else "no rotor speed"
 
+        if self.status_name == "not_finite":
+            return self.message
         table, (unit, scale) = criterion_table(self), speed_unit()
         lines = [f"{table['status']}", self.speeds.summary()]
-        lines += [f"{name + ' at':14s}{written(table[name])} {unit}" for name in ("balancing", "gathering")]
+        lines += [f"{name + ' at':14s}{written(table[name])}" for name in ("balancing", "gathering")]
         return "\n".join(lines)
 
     @validated
@@ -197,7 +198,7 @@ def _balancing(resonances: Array, additional: Array) -> Array:
 
 
 def _gathering(resonances: Array, additional: Array) -> Array:
-    starts = jnp.concatenate([jnp.zeros_like(resonances[:1]), additional])
+    starts = jnp.concatenate([0.0 * resonances[:1], additional])  # NaN if the first resonance is unknown
     ends = jnp.where(jnp.isnan(resonances), jnp.inf, resonances)
     return jnp.stack([starts, jnp.where(jnp.isnan(starts), jnp.nan, ends)], axis=1)
 

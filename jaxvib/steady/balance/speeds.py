@@ -261,6 +261,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     frozen, b, poles, zeros, forms = jax.lax.stop_gradient((model, direction, resonances, additional, shapes))
     carrier = model.carrier
     last = jnp.max(jnp.where(jnp.isnan(poles), 0.0, poles))
+    last = jnp.where(last > 0.0, last, 1.0)  # a machine without springs
     tiny_damping = jnp.finfo(last.dtype).eps ** 0.75 * last
     # This term changes neither the real part of 1/A nor the sign changes. It makes the function smooth at the poles.
     participation = jnp.sum(jnp.abs(b.conj() @ forms) ** 2)

@@ -345,6 +345,21 @@ def test_free_machine_balances_at_all_speeds():
     assert "no support" in result.summary()
 
 
+@pytest.mark.parametrize("damping", [0.0, 30.0])
+@pytest.mark.parametrize("count", [1, 2])
+def test_machine_without_springs_balances_at_all_speeds(count, damping):
+    none = [damping] * count
+    links = [] if count == 1 else [(1, 2)]
+    machine = jv.network(
+        mass=[50.0] * count, stiffness=[0.0] * count, damping=none, links=links, link_stiffness=[0.0] * len(links),
+        link_damping=[damping] * len(links), exciter=1,
+    )  # fmt: skip
+    result = jv.criterion(jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(9.0)))
+    table = criterion_table(result)
+    assert result.status_name == "free" and table["balancing"] == [[0.0, None]] and table["gathering"] == []
+    assert result.summary().endswith("balancing at  0 .. infinity rpm\ngathering at  no rotor speed")
+
+
 def test_exciter_that_cannot_move_is_refused():
     class Fixed(jv.Machine):
         kind: str = eqx.field(static=True)
@@ -399,11 +414,14 @@ def test_numbers_that_are_not_finite_are_not_judged(place):
     )
 
     def judged(x):
-        return jv.criterion(eqx.tree_at(place, scene, x)).status
+        return jv.criterion(eqx.tree_at(place, scene, x))
 
     good = place(scene)
-    statuses = [status_name(jax.jit(judged)(x)) for x in (good, -good, good * jnp.inf)]
-    assert statuses == ["decided", "not_finite", "not_finite"]
+    found = [jax.jit(judged)(x) for x in (good, -good, good * jnp.inf)]
+    assert [each.status_name for each in found] == ["decided", "not_finite", "not_finite"]
+    for unknown in found[1:]:
+        assert unknown.summary() == unknown.message and np.all(np.isnan(unknown.gathering))
+        assert criterion_table(unknown)["gathering"] == criterion_table(unknown)["undamped_gathering"] == []
 
 
 @pytest.mark.parametrize("steps", [-1, 0, 1, 2.5])
