@@ -277,7 +277,9 @@ def _problem(value: Any, kind: Any) -> str | InputError | None:
     if kind is int:
         if _is_traced(value):
             return "a whole number that is known outside of jit, grad and vmap"
-        return None if is_whole(value) and abs(value) <= _MAX_WHOLE else "a whole number"
+        if not is_whole(value):
+            return "a whole number"
+        return None if abs(value) <= _MAX_WHOLE else f"a whole number of up to {_MAX_WHOLE.bit_length()} bits"
     if kind is float:
         return _problem_of_float(value)
     if kind is complex and (isinstance(value, complex) or getattr(getattr(value, "dtype", None), "kind", "") == "c"):

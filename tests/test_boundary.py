@@ -71,7 +71,7 @@ def question(
         ({"flag": 1}, "flag is 1; it must be True or False"),
         ({"count": True}, "count is True; it must be a whole number"),
         ({"count": 2.0}, "count is 2.0; it must be a whole number"),
-        ({"count": 10**400}, "count is a whole number of 1329 bits; it must be a whole number"),
+        ({"count": 10**400}, "count is a whole number of 1329 bits; it must be a whole number of up to 63 bits"),
         ({"count": np.timedelta64(3, "s")}, "count is np.timedelta64(3,'s'); it must be a whole number"),
         ({"size": "3"}, "size is '3'; it must be a number"),
         ({"size": float("nan")}, "size is nan; it must be a number, not NaN"),

@@ -12,7 +12,6 @@ from gyroscopic_rotor import rotor
 from scenes import BALLS, machines, scene
 
 import jaxvib as jv
-from jaxvib.results.status import status_name
 from jaxvib.steady.balance.criterion import criterion_functional, criterion_table
 from jaxvib.steady.balance.speeds import CriterionStatus, characteristic_speeds
 from jaxvib.steady.balance.states import balanced_growth, balanced_stability
