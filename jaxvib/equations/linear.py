@@ -337,9 +337,11 @@ def lost_frequencies(model: LinearModel, frequencies: Array, shapes: Array) -> A
     """
     w, x, mass, carrier = jax.lax.stop_gradient((frequencies, shapes, model.mass, model.carrier))
     lost = hermitian_error((carrier.stiffness, mass), w**2, x) > 2.0 * MAX_EIGENVALUE_ERROR
-    # A motion of frequency 0 is free to drift unless a spring to the foundation resists it.
-    restoring = jnp.max(jnp.abs(carrier.foundation_stiffness @ x), axis=0)
-    resisted = restoring > 1e-3 * jnp.max(jnp.abs(carrier.foundation_stiffness)) * jnp.max(jnp.abs(x), axis=0)
+    # A motion of frequency 0 is free to drift unless springs resist it. Beside stiff springs soft ones can be seen in their own
+    # row only; next to stiff links, soft supports can be seen in the force on the foundation only.
+    springs = jnp.concatenate([carrier.stiffness, carrier.foundation_stiffness])
+    largest = jnp.max(jnp.abs(springs), axis=1)[:, None] * jnp.max(jnp.abs(x), axis=0)[None, :]
+    resisted = jnp.any(jnp.abs(springs @ x) > 1e-3 * largest, axis=0)
     return jnp.where(w > 0.0, lost, resisted)
 
 

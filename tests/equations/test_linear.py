@@ -45,6 +45,17 @@ def test_natural_frequencies_without_digits_are_refused(double, support, link):
         assert jnp.isnan(found[0]) and abs(float(found[1]) / closed(support, link)[1] - 1.0) < 1e-3
 
 
+@pytest.mark.parametrize(("double", "stiff"), [(True, 1e18), (False, 1e9)])
+@pytest.mark.parametrize(("support", "link"), [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
+def test_soft_springs_beside_a_stiff_support_are_no_drift(double, stiff, support, link):
+    machine = {"mass": (1.0, 1e3), "stiffness": (stiff, support), "link_stiffness": link, "damping": (0.0, 0.0)}
+    loads = jv.balls(count=1, mass=0.1, radius=0.1, drag=1.0)
+    with jax.enable_x64(double):
+        scene = jv.Scene(jv.two_mass(**machine, link_damping=0.0), loads, jv.ConstantSpeed(60.0))
+        with pytest.raises(jv.ComputationError, match="lost_digits"):
+            jv.natural_frequencies(scene)
+
+
 @pytest.mark.parametrize("double", [True, False])
 def test_a_carrier_that_is_free_to_drift_has_frequency_0(double):
     with jax.enable_x64(double):
