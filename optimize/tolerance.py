@@ -149,7 +149,8 @@ def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
             raise InputError("tolerances", f"is {quoted(text)}; write NAME=PERCENT or NAME=LOW..HIGH, such as stiffness=5%")
         if "." not in name and name not in _SHORT_NAMES and not _MATERIAL.fullmatch(name):
             known = suggest_name(name, [*_SHORT_NAMES, "material"])
-            raise InputError(f"tolerances.{name}", f"is not a short name; {known}, and parameters such as machine.mass")
+            allowed = f"{known} (mass on a platform), and parameters such as machine.mass"
+            raise InputError(f"tolerances.{name}", f"is not a short name; {allowed}")
         if percent := _PERCENT.fullmatch(value):
             size = float(percent[1]) / 100.0
             if not 0.0 < size < 1.0:

@@ -382,12 +382,20 @@ def run(arguments: list[str]) -> int:
         if isinstance(error, click.MissingParameter) and error.param is not None:
             description = getattr(error.param, "help", None) or _ARGUMENTS.get(error.param.name or "", "")
             message = f"{message.rstrip('.')}: {description.rstrip('.')}" if description else message
-        message += hint
+        message += _repeat_hint(arguments, error) + hint
         return _failed(wants_json, 2, {"kind": "input", "field": field, "message": message})
     except click.exceptions.Exit as stop:
         return stop.exit_code
     except (click.Abort, KeyboardInterrupt):
         return _failed(wants_json, 1, {"kind": "computation", "status": "interrupted", "message": "interrupted"})
+
+
+def _repeat_hint(arguments: list[str], error: click.UsageError) -> str:
+    """Return a hint for surplus values of a repeatable option, which click takes for arguments; "" for other errors."""
+    options = error.ctx.command.params if error.ctx and "unexpected extra" in error.format_message() else []
+    names = [option.opts[-1] for option in options if isinstance(option, click.Option) and option.multiple]
+    used = [name for name in names if name in arguments]
+    return f"; repeat the option for each value: {used[0]} ... {used[0]} ..." if used else ""
 
 
 def _with_option_names(arguments: list[str], error: InputError) -> InputError:

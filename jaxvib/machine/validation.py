@@ -139,7 +139,7 @@ _MIN_AMPLITUDE, _MAX_AMPLITUDE = 1e-5, 0.05
 """Smallest and largest usual amplitude above the resonances of a machine that unbalances excite, the sum of the unbalances
 divided by the mass, m."""
 
-_MIN_POWER = 0.02
+_MIN_POWER = 0.05
 """Smallest usual rated power of a motor for each kg of the machine, W; usual values are about 1."""
 
 

@@ -101,6 +101,9 @@ def test_settle_shows_ranges_within_tolerances(typed, tmp_path):
     assert [entry["words"] for entry in ranges] == [f"{name}, mode 1" for name in shown]
     assert "machines with stiffness=5%" in typed(*words)[1]
     assert "--tolerance is 'stiffness'; write NAME=PERCENT" in typed(*words[:-1], "stiffness")[2]
+    assert "material (mass on a platform)" in typed(*words[:-1], "load=0..20kg")[2]
+    assert "repeat the option for each value: --tolerance ... --tolerance ..." in typed(*words, "damping=30%")[2]
+    assert "repeat" not in typed("settle", "one.toml", "two.toml")[2]
     assert "--step-tolerance is -1" in typed(*words[:-2], "--step-tolerance", "-1")[2]
 
 

@@ -196,6 +196,11 @@ def test_implausible_bodies_in_a_plane_are_noted():
     head, _, tail = SCREENS["linear_screen"].partition('kind = "induction_motor"')
     (note,) = implausible_numbers(jv.scene_from_toml(head + motor + tail[tail.index("[[exciters]]") :]))
     assert note == ("exciters[0].drive.power is 1.1 W for a machine of 2600 kg; a plain number is in W: did you mean '1.1 kW'?")
+    motor = jv.NamePlateMotor(power=1.5, rated_speed="1440 rpm", breakdown_ratio=2.5, inertia=0.02)
+    table = jv.Scene(
+        jv.one_mass(mass=60.0, stiffness=2.5e5, damping=1200.0), exciters=[jv.Exciter(unbalance=0.05, drive=motor)]
+    )
+    assert "drive.power is 1.5 W for a machine of 60 kg" in implausible_numbers(table)[0]
     turned = SCREENS["linear_screen"].replace('# angle = "0 deg"', "angle = 15.0     #", 1)
     (note,) = implausible_numbers(jv.scene_from_toml(turned))
     assert note == "machine.supports[0].angle is 15 rad; a plain number is in rad: did you mean '15 deg'?"

@@ -23,7 +23,9 @@ as an additional coordinate."""
 class TorqueTable(Motor):
     """Motor, switched on at t = 0, with a measured or catalogued torque as a function of its speed.
 
-    The torque follows straight lines between the points. The first and the last line continue beyond them.
+    The torque follows straight lines between the points. The first and the last line continue beyond them. In
+    a scene file, `file = "torque.csv"` replaces the two lists: a CSV file with two columns, whose header states their units,
+    such as "speed (rpm);torque (N m)".
 
     **Arguments** (SI, or strings with a unit)
 

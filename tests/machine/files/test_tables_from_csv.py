@@ -66,6 +66,7 @@ def test_units_with_blanks_follow_a_slash(head, name, unit, tmp_path):
     ("text", "column", "words"),
     [
         ("rate (N/mm)\n", None, "has no rows"),
+        ("part;rate\nA;20,5\n", None, r"has no column with a unit such as N/m; write it in the header: NAME \(N/m\)"),
         ("a (N/mm),b (N/m)\n1,2\n", None, "has 2 columns with a unit such as N/m; set column to one of"),
         ("a (N/mm),b (N/m)\n1,2\n", "c", "has no columns 'c'; set column to one of: 'a .N/mm.', 'b .N/m.'"),
         ("a (mm)\n1\n", "a", "whose unit is missing or not convertible to N/m; write a .N/m."),
