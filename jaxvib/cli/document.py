@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -43,12 +42,9 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
         elif parameter.name == "layer":
             value = None if value is None else [part.strip() for part in value.split(",")]
         elif value is not None:
-            from jaxvib.units import number  # slow import, which --help does not need
+            from jaxvib.steady.points import read_slope  # slow import, which --help does not need
 
-            value = float(number(value, "rad", "--slope"))
-            if abs(value) >= math.pi / 2.0:
-                problem = f"is {value:.4g} rad ({math.degrees(value):.4g} degrees), which is not a slope of a deck"
-                raise InputError("--slope", f"{problem}; write degrees as '{value:g} deg'")
+            value = float(read_slope(value, "--slope"))
         if value:
             context.meta.setdefault(_DECK_KEY, {})[parameter.name] = value
 

@@ -33,8 +33,8 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import Jam
 from jaxvib.steady.jams.phases import PhaseJam
 from jaxvib.steady.orbits.describe import Orbit
-from jaxvib.steady.points import at_positive_speed, ellipse_at, require_amplitudes, rows_in_plane
-from jaxvib.units import Number, known_number, number, numbers
+from jaxvib.steady.points import at_positive_speed, ellipse_at, read_slope, require_amplitudes, rows_in_plane
+from jaxvib.units import Number, number, numbers
 from jaxvib.units.columns import STANDARD_GRAVITY
 from jaxvib.units.known import when_known
 
@@ -325,7 +325,7 @@ def vibration_measures(
     shaft: mean torque 0.2969 N m, mean power 12.43 W
     """
     scene = validate_scene(scene)
-    along, kind = known_number(slope, "rad", "slope"), scene.machine.kind
+    along, kind = read_slope(slope), scene.machine.kind
     tilted = when_known(lambda tilt: tilt != 0.0, along)
     for name, given, is_given in (("at", at, at is not None), ("slope", slope, tilted), ("layer", layer, layer is not None)):
         if is_given and scene.machine.places != "plane":
@@ -563,7 +563,7 @@ def conveying_speed(amplitude: Array | complex, speed: Number, *, slope: Number 
     from experiments for conveyors that throw than for those that slide.
     """
     require_amplitudes(amplitude)
-    w, tilt = number(speed, "rad/s", "speed", low=0.0, open_low=True), number(slope, "rad", "slope")
+    w, tilt = number(speed, "rad/s", "speed", low=0.0, open_low=True), read_slope(slope)
     return _conveying_speed(jnp.asarray(amplitude, complex), w, tilt)
 
 

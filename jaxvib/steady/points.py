@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, known_number, number, numbers
 from jaxvib.units.columns import STANDARD_GRAVITY
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_if_known, when_known
 
 
 def _rounding(semi_axis: Array) -> float:
@@ -110,8 +110,17 @@ def ellipse_of(amplitude: Array | complex, speed: Number, *, slope: Number = 0.0
     semi-axes 5 and 5 mm, anticlockwise, a circle, 5.099 g, throw number 5.099
     """
     require_amplitudes(amplitude)
-    w, along = number(speed, "rad/s", "speed"), number(slope, "rad", "slope")
+    w, along = number(speed, "rad/s", "speed"), read_slope(slope)
     return ellipse_at(jnp.asarray(amplitude), w, along, number(remainder, "", "remainder", low=0.0))
+
+
+def read_slope(slope: Number, field: str = "slope") -> Any:
+    """Return the slope of a deck, rad. **Raises** `InputError` for a right angle or more, such as degrees without a unit."""
+    value = known_number(slope, "rad", field)
+    problem = "is {:.4g} rad ({:.4g} degrees), which is not a slope of a deck; write degrees as '{:g} deg'"
+    values = value, np.rad2deg(1.0) * value, value
+    require_if_known(lambda radians, *_: abs(radians) < 0.5 * np.pi, *values, field=field, problem=problem)
+    return value
 
 
 def require_amplitudes(amplitude: Array | complex) -> None:
@@ -245,7 +254,7 @@ class PathsOfPoints(eqx.Module):
         """
         motion = self.harmonic()
         place = on_body(read_place(at), motion.machine.require_body(body))
-        return _ellipse(motion, place, known_number(slope, "rad", "slope"))
+        return _ellipse(motion, place, read_slope(slope))
 
     @validated
     def deck(self, points: Sequence[Sequence[Number]], body: int = 0, *, slope: Number = 0.0) -> Deck:
@@ -255,11 +264,12 @@ class PathsOfPoints(eqx.Module):
 
         **Returns** `Deck`. **Raises** `InputError` for points that the machine does not have.
         """
-        if not (isinstance(points, (list, tuple)) or getattr(points, "ndim", 0) == 2) or len(points) == 0:
+        is_list = isinstance(points, (list, tuple)) and not any(isinstance(x, (int, float, str)) for x in points)
+        if not (is_list or getattr(points, "ndim", 0) == 2) or len(points) == 0:
             raise InputError("points", f"is {quoted(points)}; it must be a list of points, [(x, y), ...]")
         places = jnp.stack([numbers(point, "m", f"points[{k}]", 2) for k, point in enumerate(points)])
         motion = self.harmonic()
-        return _deck(motion, places, known_number(slope, "rad", "slope"), motion.machine.require_body(body))
+        return _deck(motion, places, read_slope(slope), motion.machine.require_body(body))
 
     @validated
     def foundation_moment(self, about: Sequence[Number] = (0.0, 0.0)) -> Array:

@@ -20,7 +20,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.steady.measures import conveying_speed_at
-from jaxvib.steady.points import Ellipse, at_positive_speed
+from jaxvib.steady.points import Ellipse, at_positive_speed, read_slope
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation, require_foundation
 from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier, walk
@@ -130,7 +130,7 @@ def throw_number(*, at: Sequence[Number] = (0.0, 0.0), slope: Number = 0.0, body
     >>> throw_number(at=(1.5, 0.1), slope="-5 deg").unit
     ''
     """
-    along = number_in(slope, "rad", "slope")
+    along = number_in(read_slope(slope), "rad", "slope")
     return _point_quantity("throw_number", "", _throw_number, "throw number", at, body, tier, along)
 
 
@@ -156,7 +156,7 @@ def conveying_speed(
     >>> (conveying_speed(at=(0.0, 0.1)) > "0.25 m/s").words
     'conveying speed at (0, 0.1) m at least 0.25 m/s'
     """
-    along = number_in(slope, "rad", "slope")
+    along = number_in(read_slope(slope), "rad", "slope")
     return _point_quantity("conveying_speed", "m/s", _conveying_speed, "conveying speed", at, body, tier, along)
 
 

@@ -200,6 +200,9 @@ def test_ellipse_of_a_run_is_differentiable():
         (lambda r: r.ellipse(2), "at has 1 number; on a body"),
         (lambda r: r.ellipse((0.0, 1.0, 2.0)), "at has 3 values; 2 are needed"),
         (lambda r: r.deck([]), "points is .*; it must be a list of points"),
+        (lambda r: r.deck((0.0, 1.0)), r"points is \(0\.0, 1\.0\); it must be a list of points"),
+        (lambda r: r.deck([(0.0, 1.0)], slope=-5), r"slope is -5 rad \(-286\.5 degrees\), .* write degrees as '-5 deg'"),
+        (lambda r: r.ellipse((0.0, 0.0), slope=-5), r"slope is -5 rad \(-286\.5 degrees\)"),
         (lambda r: r.deck([(0.0, "1 kg")]), r"points\[0\].*not in m"),
     ],
 )
