@@ -13,6 +13,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.identification.checks import FitStatus, coverage_notes, resembles, status_of
+from jaxvib.identification.descriptions import description_notes
 from jaxvib.identification.directions import (
     Direction,
     combined_information,
@@ -262,7 +263,7 @@ def identify(
         starts = [np.zeros(problem.unknowns.count), track_orders(problem)]
     fitted = fit_with_torques(problem, starts)
     fitted = _near_first_values(scene, problem, fitted)
-    found = _interpret(scene, fitted)
+    found = _interpret(scene, problem, fitted)
     if throw and not resembles(fitted):
         raise ComputationError(found.status_name, "; ".join([found.message, *found.notes]))
     return found
@@ -291,12 +292,12 @@ def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted
     return fitted
 
 
-def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
-    """Return a fit with intervals, directions, a status and notes."""
+def _interpret(scene: Scene, first: Problem, fitted: Fitted) -> MachineFit:
+    """Return a fit of the problem `first` with intervals, directions, a status and notes."""
     problem, known = fitted.problem, information_of(fitted)
     status, p_value, notes = status_of(fitted, known)
+    notes = [*description_notes(first, status), *notes]
     undetermined, by_gain = directions_of(known)
-    exciters = len(problem.unbalances)
     fit_scene = fitted_scene(problem, fitted.x, fitted.linear)
     modes = propagate(
         fit_scene,
@@ -342,7 +343,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         damping_ratio=tuple(modes[len(modes) // 2 :]),
         gain_names=problem.unknowns.gains,
         gains=_gains(fitted),
-        phase=np.array([math.atan2(*fitted.linear[2 * k : 2 * k + 2][::-1]) for k in range(exciters)]),
+        phase=np.array([math.atan2(*fitted.linear[2 * k : 2 * k + 2][::-1]) for k in range(len(problem.unbalances))]),
         first_states=first_states(problem, fitted.linear) if problem.has_loads else (),
         channels=tuple(tuple(channel.name for channel in samples.channels) for samples in problem.runs),
         kinds=tuple(tuple(channel.kind for channel in samples.channels) for samples in problem.runs),

@@ -175,6 +175,8 @@ def test_wrong_direction_of_a_sensor_is_no_fit():
     )
     fit = jv.identify(start(), wrong, unknown=NAMES, throw=False)
     assert fit.status_name in ("not_converged", "patterned")
+    reversed_sign = "with a reversed sign of channel 'a1', or with a reversed sign of channel 'a2'"
+    assert fit.notes[0] == f"the model explains the records {reversed_sign}: correct the description of the channels"
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ _DERIVATIVES = {"displacement": 0, "velocity": 1, "acceleration": 2}
 ROTOR_KINDS = ("pulses", "angle", "speed")
 """Kinds of channels that measure the rotor's rotation, the most accurate one first."""
 
-_OTHER_UNITS = {
+OTHER_UNITS = {
     "displacement": ("m", "mm", "um", "mil"),
     "velocity": ("m/s", "mm/s", "in/s"),
     "acceleration": ("m/s^2", "g", "mm/s^2"),
@@ -129,7 +129,7 @@ def _compare_speeds(reference_signal: _Signal, other: _Signal, source: str) -> l
 
 def _fitting_unit(channel: Channel, factor: float, error: float) -> str | None:
     """Return the unit with which the readings would be `factor` times as large; None if no unit does this."""
-    for unit in _OTHER_UNITS[channel.kind]:
+    for unit in OTHER_UNITS[channel.kind]:
         ratio = (unit_factor(unit, UNITS[channel.kind]) or 1.0) / channel.factor
         if ratio != 1.0 and abs(ratio / factor - 1.0) <= error:
             return unit
