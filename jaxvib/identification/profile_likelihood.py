@@ -61,7 +61,8 @@ class _Profile:
     - `floor`: the least cost
     - `is_vanished`: True if the parameter is not distinguishable from 0; distances are then multiples of the standard error of
       the parameter itself, not of its logarithm
-    - `columns` (n, p + L + 1) of a nonlinear motion, see `nonlinear_columns`
+    - of a nonlinear motion: `columns` (n, p + L), the derivatives of `nonlinear_columns`, and `data` (p + L, p + L), the
+      information of the data
     """
 
     fitted: Fitted
@@ -73,6 +74,7 @@ class _Profile:
     floor: float
     is_vanished: bool = False
     columns: np.ndarray | None = None
+    data: np.ndarray | None = None
 
     def shift(self, distance: float) -> float:
         """Return the change of the coordinate at a `distance` in standard errors."""
@@ -100,8 +102,8 @@ class _Profile:
         """Return the unknowns of a nonlinear motion after a few steps of the Gauss-Newton method with the derivatives
         at the fit. The valley of the cost is curved, and the unknowns of the quadratic form are outside it at a large
         distance."""
-        assert self.columns is not None
-        slopes, p, best, last = self.columns[:, :-1], x.size, (x, linear), math.inf
+        assert self.columns is not None and self.data is not None
+        p, best, last = x.size, (x, linear), math.inf
         for _ in range(_VALLEY_STEPS):
             differences = nonlinear_differences(problem, x, linear)
             cost = nonlinear_cost(problem, x, linear, differences)
@@ -109,7 +111,7 @@ class _Profile:
                 break
             best, last = (x, linear), cost
             prior, gradient = prior_equations(problem, x, linear)
-            step = solved(slopes.T @ slopes + prior, slopes.T @ differences + gradient)
+            step = solved(self.data + prior, self.columns.T @ differences + gradient)
             x, linear = x + step[:p], linear + step[p:]
         return best
 
@@ -168,9 +170,10 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
     free_exciters = free_unbalances(problem)
     indices = np.array([*range(p), *(p + 2 * k for k in free_exciters)], int)
     covariance = np.linalg.pinv(eliminate(data + prior, indices), rcond=1e-13, hermitian=True)
-    floor, intervals, columns = project(problem, fitted.x).cost, {}, None
+    floor, intervals, derivatives = project(problem, fitted.x).cost, {}, ()
     if problem.linear is not None:
-        columns = np.concatenate(nonlinear_columns(problem, fitted.x, problem.linear))
+        columns = np.concatenate(nonlinear_columns(problem, fitted.x, problem.linear))[:, :-1]
+        derivatives = columns, columns.T @ columns
     for i, name in enumerate(known.names):
         if not known.determined[i]:
             continue
@@ -182,7 +185,7 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
         if is_vanished:  # the information about it may be below the accuracy of the pseudoinverse
             slopes, variance = np.zeros(len(data)), known.covariance[i, i]
         spread = math.sqrt(variance)
-        profile = _Profile(fitted, index, is_unbalance, center, spread, slopes, floor, is_vanished, columns)
+        profile = _Profile(fitted, index, is_unbalance, center, spread, slopes, floor, is_vanished, *derivatives)
         if is_vanished:
             intervals[name] = -math.inf, profile.shift(profile.end(1.0))
             continue
