@@ -36,7 +36,7 @@ from jaxvib.motion.analysis.points import (
 from jaxvib.motion.analysis.regime import STILL_SHARE, Regime, regime
 from jaxvib.motion.analysis.separation import overlap, would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
-from jaxvib.numerics.extrema import known_maximum
+from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import member, status_name
@@ -151,18 +151,24 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def largest_displacement(self) -> Array:
-        """Largest displacement of each coordinate from static equilibrium during the run, (nd,), m (rad for tilts), among the
-        stored states; NaN for a run that failed."""
-        return known_maximum(jnp.abs(self._stored.state.displacement), axis=-2)
+        """Largest displacement of each coordinate from static equilibrium during the run, (nd,), m (rad for tilts); NaN for a
+        run that failed.
+
+        A parabola estimates the value between the stored states. It is too small by at most 6e-4 with 16 states in a period,
+        and by at most 9e-3 with 8.
+        """
+        return sampled_maximum(jnp.abs(self._stored.state.displacement), axis=-2)
 
     @property
     def largest_force(self) -> Array:
-        """Largest magnitude of the force on the foundation during the run, N, among the stored states; NaN if the run failed.
+        """Largest magnitude of the force on the foundation during the run, N; NaN if the run failed.
 
-        In two directions this is the largest length of the vector, not the root of the sum of both squared peaks, which is
-        `foundation_force`.
+        It is found between the stored states as `largest_displacement`. In two directions this is the largest length of the
+        vector, not the root of the sum of both squared peaks, which is `foundation_force`.
         """
-        return jnp.sqrt(known_maximum(jnp.sum(self._stored.foundation_force**2, axis=-1), axis=-1))
+        square = jnp.sum(self._stored.foundation_force**2, axis=-1)
+        zero = square == 0.0  # where the square root has no derivative
+        return sampled_maximum(jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square))), axis=-1)
 
     def _require_end(self) -> None:
         """**Raises** `InputError` for a batch of runs, and for a run that failed: its window has no values."""

@@ -57,9 +57,27 @@ def _extrapolation() -> tuple[np.ndarray, np.ndarray]:
 _BEFORE, _AFTER = _extrapolation()
 
 
-def known_maximum(values: Array, axis: int) -> Array:
-    """Return the largest of the values along an axis, and NaN unless all are finite: XLA's maximum can ignore a NaN."""
-    return jnp.where(jnp.all(jnp.isfinite(values), axis=axis), jnp.max(values, axis=axis), jnp.nan)
+_MAX_CURVATURE = 0.6
+"""Largest second difference of three samples, relative to the middle one, for which a parabola is used; that of a cosine with 8
+samples in a period is 0.59."""
+
+
+def sampled_maximum(values: Array, axis: int) -> Array:
+    """Return the largest value of an evenly sampled function that is not negative, along an axis.
+
+    A parabola through a sample and its two neighbours estimates a maximum between the samples. For a cosine with n samples in a
+    period, the estimate is too small by at most 9e-3 (n = 8), 6e-4 (16), 4e-5 (32); the largest sample by 8e-2, 2e-2, 5e-3. If
+    the neighbours are much smaller than the sample, the samples do not resolve the function, and no parabola is used.
+
+    The result is NaN unless all values are finite; XLA's maximum can ignore a NaN.
+    """
+    values = jnp.moveaxis(values, axis, -1)
+    left, middle, right = values[..., :-2], values[..., 1:-1], values[..., 2:]
+    curvature = 2.0 * middle - left - right
+    is_peak = (middle >= left) & (middle >= right) & (curvature > 0.0) & (curvature <= _MAX_CURVATURE * middle)
+    above = jnp.where(is_peak, (right - left) ** 2 / (8.0 * jnp.where(is_peak, curvature, 1.0)), 0.0)
+    largest = jnp.maximum(jnp.max(middle + above, axis=-1, initial=0.0), jnp.max(values, axis=-1))
+    return jnp.where(jnp.all(jnp.isfinite(values), axis=-1), largest, jnp.nan)
 
 
 def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:

@@ -32,9 +32,10 @@ def _times(until: Number, spin_up: Number | None) -> tuple[float, float | None]:
 def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
     """Return the largest foundation force, N, of a run from rest (full equations).
 
-    The force is evaluated at 4000 times of the run. The value is therefore too small by up to a few percent if the run is long
-    and the peak is short, such as the peak of a collision with a `Stop`. The measure `run.peak_force` of sweeps evaluates the
-    force at each step of the integration and does not have this error.
+    The force is computed at 4000 times of the run, and a parabola estimates the largest value between them. The value is too
+    small by at most 0.1 % if a period of the force contains 16 of these times, and by at most 1 % if it contains 8. If the run
+    is longer, or the peak shorter, such as that of a collision with a `Stop`, the value may be too small by a few percent. The
+    measure `run.peak_force` of sweeps evaluates the force at each step of the integration and does not have this error.
 
     **Arguments**
 
@@ -63,7 +64,7 @@ def peak_displacement(
     *, until: Number, at: int | Sequence[Number] | None = None, body: int = 0, spin_up: Number | None = None
 ) -> Quantity:
     """Return the largest displacement, m, of a point during a run from rest (full equations), for example while motors pass
-    the resonances. It is evaluated at 4000 times of the run, see `peak_force`.
+    the resonances. It is computed at 4000 times of the run, see `peak_force`.
 
     **Arguments**
 
@@ -96,8 +97,7 @@ def peak_displacement(
 def _peak_displacement(
     evaluation: Evaluation, tier: Tier, until: float, spin_up: float | None, place: int | Point | None, body: int
 ) -> Array:
-    moves = evaluation.start_up(until, spin_up).point(place, body, part="all").displacement
-    return jnp.sqrt(jnp.max(jnp.sum(moves**2, axis=1)))
+    return evaluation.start_up(until, spin_up).point(place, body, part="all").largest_displacement
 
 
 @validated

@@ -75,7 +75,7 @@ def test_largest_force_is_a_magnitude():
     run = jv.simulate(s, 1.0, estimate=False)
     force, state = np.asarray(run.trajectory.foundation_force), run.trajectory.state
     np.testing.assert_allclose(force, 1e5 * state.displacement + 50.0 * state.velocity, rtol=1e-12, atol=1e-9)
-    np.testing.assert_allclose(run.largest_force, np.max(np.hypot(*force.T)), rtol=1e-12)
+    np.testing.assert_allclose(run.largest_force, np.max(np.hypot(*force.T)), rtol=1e-5)
     assert float(run.largest_force) < 0.9 * np.hypot(*np.max(np.abs(force), axis=0))
     assert f"magnitude of the foundation force {float(run.largest_force):.4g} N" in run.summary()
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.numerics.extrema import between, extremum_value, locate_extrema, step_extrema
+from jaxvib.numerics.extrema import between, extremum_value, locate_extrema, sampled_maximum, step_extrema
 
 
 def samples(per_turn, count, first=0.37):
@@ -20,6 +20,23 @@ def test_extrema_of_a_cosine_have_the_stated_error(per_turn, error):
     np.testing.assert_allclose(np.abs([low, high]), 1.0, rtol=0.0, atol=error + 1e-15)
     if per_turn == 16:
         assert np.max(np.abs(np.abs([low, high]) - 1.0)) > error / 100.0  # no better than it can be: the bound says something
+
+
+@pytest.mark.parametrize(("per_turn", "error"), [(8, 9e-3), (16, 6e-4), (32, 4e-5)])
+def test_maximum_between_samples_has_the_stated_error(per_turn, error):
+    phases = 2.0 * np.pi / per_turn * np.linspace(0.0, 1.0, 51)
+    x = jnp.asarray(np.abs(np.cos(phases + 2.0 * np.pi / per_turn * np.arange(4 * per_turn)[:, None])))
+    found = sampled_maximum(x, axis=0)
+    assert np.all(found <= 1.0 + 1e-15)
+    assert error / 2.0 < np.max(1.0 - found) < error < np.max(1.0 - jnp.max(x, axis=0)) / 5.0
+
+
+def test_unresolved_maximum_is_the_largest_sample():
+    for values in ([0.0, 1.0, 0.99, 0.0], [0.3, 0.2, 0.1], [0.1, 0.2, 0.3], [0.0, 0.0, 1.0, 1.0], [0.7], [0.0] * 5):
+        assert sampled_maximum(jnp.asarray(values), axis=0) == max(values)
+    assert np.isnan(sampled_maximum(jnp.asarray([0.1, jnp.nan, 0.2]), axis=0))
+    slope = jax.grad(lambda x: sampled_maximum(x, axis=0))(jnp.asarray([0.0, 0.0, 0.9, 1.0, 0.8]))
+    np.testing.assert_allclose(jnp.sum(slope), 1.0, rtol=1e-12)  # a constant that is added to all samples moves the maximum
 
 
 def test_extrema_of_steps_have_the_stated_error_and_no_overshoot():

@@ -23,7 +23,7 @@ from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory, turning_angles, turning_directions
-from jaxvib.numerics.extrema import known_maximum
+from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit
 from jaxvib.results.readable import Readable
@@ -60,8 +60,8 @@ class PointMotion(Readable):
 
     @property
     def largest_displacement(self) -> Array:
-        """Largest distance from the place at rest, m, among the stored states; NaN for a run that failed."""
-        return known_maximum(magnitude(self.displacement[..., 0] + 1j * self.displacement[..., 1]), axis=-1)
+        """Largest distance from the place at rest, m, between the stored states as in `Run`; NaN for a run that failed."""
+        return sampled_maximum(magnitude(self.displacement[..., 0] + 1j * self.displacement[..., 1]), axis=-1)
 
 
 @cached

@@ -39,8 +39,11 @@ def test_peak_of_a_coast_down_is_scipys():
     assert w[-1] < 0.7 * 63.0  # it passes the resonance
     found = np.asarray(run.trajectory.state.displacement[:, 0])
     np.testing.assert_allclose(found, y, atol=1e-6 * np.max(np.abs(y)))
-    np.testing.assert_allclose(run.largest_displacement[0], np.max(np.abs(y)), rtol=1e-6)
-    np.testing.assert_allclose(run.largest_force, np.max(np.abs(K * y + C * v)), rtol=1e-6)
+    y, _, v, _ = by_scipy(np.linspace(0.0, 4.0, 100001))
+    np.testing.assert_allclose(
+        run.largest_displacement[0], np.max(np.abs(y)), rtol=1e-5
+    )  # 50 stored states or more in a period
+    np.testing.assert_allclose(run.largest_force, np.max(np.abs(K * y + C * v)), rtol=1e-5)
 
 
 def test_peaks_of_start_and_stop_are_quantities_of_designs():

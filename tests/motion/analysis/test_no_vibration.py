@@ -91,8 +91,8 @@ def test_an_averaged_stop_has_no_measures():
 
 def test_peaks_of_a_deck_are_those_of_its_rigid_motion(stopped):
     x, y, turn = np.asarray(stopped.trajectory.state.displacement).T
-    expected = np.max(np.hypot(x - AT[1] * turn, y + AT[0] * turn))
-    np.testing.assert_allclose(stopped.point(AT, part="all").largest_displacement, expected, rtol=1e-12)
+    stored = np.max(np.hypot(x - AT[1] * turn, y + AT[0] * turn))
+    assert 1.0 <= stopped.point(AT, part="all").largest_displacement / stored < 1.001  # larger between two stored states
 
 
 def test_a_deck_without_vibration_has_a_note_and_its_peak(stopped, tmp_path, monkeypatch, capsys):
