@@ -27,12 +27,12 @@ from jaxvib.ode.dopri8 import (
 )
 from jaxvib.ode.types import VF, Args, Batched, BoolScalarLike, RealScalarLike, Tangents, Terms, Y
 
-_Known: TypeAlias = "tuple[Array, Array] | None"
+_PreviousStage: TypeAlias = "tuple[Array, Array] | None"
 """Last stage of the previous step (n,), and the number of stages that it provides: 1, or 0 without a previous step. None if
 each step computes all of its stages."""
 
-_Inputs: TypeAlias = tuple[RealScalarLike, Array, Y, _Known, Args, Terms]
-"""Inputs of a step: the time at its start, its length, the state, its known rates, the arguments of the equations, the
+_Inputs: TypeAlias = tuple[RealScalarLike, Array, Y, _PreviousStage, Args, Terms]
+"""Inputs of a step: the time at its start, its length, the state, the last stage before it, the arguments of the equations, the
 equations."""
 
 _Step: TypeAlias = tuple[Y, Array, Y]
@@ -82,7 +82,7 @@ class LoopDopri8(AbstractDopri8):
         """Interpolation for states within a step."""
         return _WITH_TANGENTS if self.tangents else _WITHOUT_TANGENTS
 
-    def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> _Known:
+    def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> _PreviousStage:
         """Return the initial state of the method, without a known stage."""
         return (jnp.zeros_like(ravel(y0)), jnp.asarray(0)) if self.reuse else None
 
@@ -93,9 +93,9 @@ class LoopDopri8(AbstractDopri8):
         t1: RealScalarLike,
         y0: Y,
         args: Args,
-        solver_state: _Known,
+        solver_state: _PreviousStage,
         made_jump: BoolScalarLike,
-    ) -> tuple[Y, Array, Y, _Known]:
+    ) -> tuple[Y, Array, Y, _PreviousStage]:
         """See `AbstractDopri8.advance`."""
         advance = multi_tangent_jvp(_advance_batch_last, _advance_jvp) if self.tangents else _advance_batch_last
         known = None if made_jump is True else solver_state
