@@ -28,8 +28,8 @@ _MAX_TICKS = 5
 _MIN_POINT_DISTANCE = 0.03
 """Minimum distance between two points of a line, in units of the drawing: about two pixels. Nearer points are omitted."""
 
-_COLUMNS = ((0.05, 1.6, 3.5), (8.3, 9.6, 10.9, 12.2))
-"""Positions of the left ends of the columns of the legend, for each of its two groups."""
+_COLUMNS = ((0.05, 1.6, 3.5), (8.3, 9.6, 10.9, 12.2), (13.1, 14.4))
+"""Positions of the left ends of the columns of the legend, for each of its groups."""
 
 _GRID = {"color": "#e2e2e2", "lw": 0.6, "zorder": 0.5}
 
@@ -120,8 +120,8 @@ def dot(x: float, y: float, look: Look, square: bool = False) -> Part:
 def legend(groups: Sequence[Mapping[str, Look]]) -> tuple[list[Part], list[Text]]:
     """Return the legend above the charts, with two entries in a column: samples of lines and dots with their names.
 
-    A style with a fill colour ("fc") is drawn as a dot, other styles as a line. The first of the `groups` begins above the
-    first chart, the second one above the second chart.
+    A style with a fill colour ("fc") is drawn as a dot, other styles as a line. The `groups` begin above the first,
+    the second and the third chart.
     """
     parts, texts = [], []
     for columns, looks in zip(_COLUMNS, groups, strict=False):

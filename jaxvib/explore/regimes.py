@@ -112,11 +112,11 @@ def regime_chart(scene: Scene, max_speed: float) -> str:
     speeds = panels[0][0]
     parts += [speeds.line([0.0, high], [scale * w] * 2, _RESONANCE) for w in resonances.tolist() if w <= max_speed]
     parts.append(speeds.line([0.0, high], [0.0, high], ROTOR))
-    names = {
-        name: {**_LINE, "color": color} for _, drawn in panels[1:] for name, color in zip(drawn, COLORS, strict=False) if name
-    }
+    names = [
+        {name: {**_LINE, "color": color} for name, color in zip(drawn, COLORS, strict=False) if name} for _, drawn in panels[1:]
+    ]
     unstable = {} if np.all(curves.stable) else {"unstable": {**_UNSTABLE, "color": "black"}}
-    keys, words = legend([{**_LEGEND, **unstable}, names])
+    keys, words = legend([{**_LEGEND, **unstable}, *names])
     width = FIRST + 3.0 * WIDE + 2.0 * APART + LAST
     return svg((0.0, width, -0.95, TALL + 1.1), [[*parts, *keys]], [[*texts, *words]], "", 1.0, 0.0)
 

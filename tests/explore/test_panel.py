@@ -53,9 +53,10 @@ def test_dots_are_round_or_square():
 
 def test_a_legend_has_two_entries_in_a_column():
     line, point = {"color": "red"}, {"fc": "white"}
-    parts, texts = legend([{"a": line, "b": point, "c": line}, {"d": line}])
+    parts, texts = legend([{"a": line, "b": point, "c": line}, {"d": line}, {"e": line}])
     places = {text.text: (text.x, text.y) for text in texts}
     expected = {"a": (0.55, TALL + 0.95), "b": (0.55, TALL + 0.68), "c": (2.1, TALL + 0.95), "d": (8.8, TALL + 0.95)}
+    expected["e"] = (13.6, TALL + 0.95)
     assert places == {name: pytest.approx(place) for name, place in expected.items()}
     np.testing.assert_allclose(parts[0].points, [[0.05, TALL + 0.95], [0.45, TALL + 0.95]])
     np.testing.assert_allclose(np.mean(parts[1].points[:-1], axis=0), [0.25, TALL + 0.68])

@@ -77,6 +77,8 @@ def test_the_chart_shows_the_working_regime_at_each_speed(linear):
     def panel(x):
         return int(np.searchsorted(starts, x + 1.0)) - 1
 
+    places = {text: panel(x) for x, _, text, _ in spans if text in {"x", "y", "psi", "exciter 2"}}
+    assert places == {"x": 1, "y": 1, "psi": 1, "exciter 2": 2}  # the legend
     compared = 0
     for number, color, value in (
         (0, COLORS[0], lambda regime: RPM * regime.speed),
