@@ -96,27 +96,7 @@ class MeasuredRun(Readable):
         >>> run.change["machine.mass[0]"].action, round(float(np.max(run.values["frame"])), 3)
         ('add', 0.981)
         """
-        names = [channel.name for channel in channels]
-        if not names:
-            raise InputError("channels", "is empty; give at least one Channel")
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError("channels", f"has the name {quoted(name)} twice; names must differ")
-        samples = {channel.name: _read_channel(channel, times, values, source) for channel in channels}
-        parsed = {name: parse_change(value, f"change[{quoted(name)}]") for name, value in (change or {}).items()}
-        times_by_name, values_by_name = (
-            {k: each.time for k, each in samples.items()},
-            {k: each.value for k, each in samples.items()},
-        )
-        grids: dict[tuple[int, float, float], np.ndarray] = {}  # channels with the same times share one array
-        for channel in channels:
-            time = times_by_name[channel.name]
-            if channel.kind != "pulses":
-                times_by_name[channel.name] = grids.setdefault((time.size, time[0], time[-1]), time)
-        notes = [note for each in samples.values() for note in each.notes]
-        notes += check_agreement(channels, times_by_name, values_by_name, source)
-        clipped = {name: each.clipped for name, each in samples.items()}
-        return cls(tuple(channels), times_by_name, values_by_name, clipped, parsed, tuple(notes), source)
+        return run_of(channels, times, values, {}, change, source)
 
     @classmethod
     @validated
@@ -144,11 +124,11 @@ class MeasuredRun(Readable):
         >>> run.to_sep005()[0]["unit_str"], round(float(np.max(run.values["frame"])), 3)
         ('m/s^2', 9.807)
         """
-        times, values = described_channels(recorded_from_sep005(timeseries, source), channels, source)
+        times, values, units = described_channels(recorded_from_sep005(timeseries, source), channels, source)
         for channel in channels:  # numbers of pulses ascend, a sampled signal does not
             if channel.kind == "pulses" and np.all(np.diff(values[channel.name]) > 0.0):
                 del values[channel.name]
-        return cls.from_arrays(channels, times, values, change, source)
+        return run_of(channels, times, values, units, change, source)
 
     def to_sep005(self) -> list[dict[str, Any]]:
         """Return the channels as dictionaries in the format SEP-005, in SI units, with these entries:
@@ -203,6 +183,38 @@ class MeasuredRun(Readable):
     def span(self) -> tuple[float, float]:
         """First and last time of all channels, s."""
         return min(float(t[0]) for t in self.times.values()), max(float(t[-1]) for t in self.times.values())
+
+
+def run_of(
+    channels: Sequence[Channel],
+    times: np.ndarray | Sequence[float] | Mapping[str, ArrayLike],
+    values: Mapping[str, ArrayLike],
+    units: Mapping[str, str],
+    change: Mapping[str, Number] | None,
+    source: str,
+) -> MeasuredRun:
+    """Return the run of `MeasuredRun.from_arrays`; `units`: units that a file states, by the name of the channel."""
+    names = [channel.name for channel in channels]
+    if not names:
+        raise InputError("channels", "is empty; give at least one Channel")
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError("channels", f"has the name {quoted(name)} twice; names must differ")
+    samples = {channel.name: _read_channel(channel, times, values, source) for channel in channels}
+    parsed = {name: parse_change(value, f"change[{quoted(name)}]") for name, value in (change or {}).items()}
+    times_by_name, values_by_name = (
+        {k: each.time for k, each in samples.items()},
+        {k: each.value for k, each in samples.items()},
+    )
+    grids: dict[tuple[int, float, float], np.ndarray] = {}  # channels with the same times share one array
+    for channel in channels:
+        time = times_by_name[channel.name]
+        if channel.kind != "pulses":
+            times_by_name[channel.name] = grids.setdefault((time.size, time[0], time[-1]), time)
+    notes = [note for each in samples.values() for note in each.notes]
+    notes += check_agreement(channels, times_by_name, values_by_name, source, units)
+    clipped = {name: each.clipped for name, each in samples.items()}
+    return MeasuredRun(tuple(channels), times_by_name, values_by_name, clipped, parsed, tuple(notes), source)
 
 
 def parse_change(value: Number, field: str) -> Change:

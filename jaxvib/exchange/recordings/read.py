@@ -11,7 +11,7 @@ from jaxvib.errors import InputError
 from jaxvib.exchange.recordings.formats import read_channels
 from jaxvib.identification.records.channel import Channel
 from jaxvib.identification.records.recorded import Recorded, described_channels
-from jaxvib.identification.run import MeasuredRun
+from jaxvib.identification.run import MeasuredRun, run_of
 from jaxvib.units import Number, number
 
 
@@ -61,8 +61,7 @@ def read_run(
     if low >= high:
         raise InputError("until", f"is {high:g} s; it must be later than start, {low:g} s")
     recorded = read_channels(path, sampling_rate)
-    times, values = described_channels(recorded, channels, str(path), low, high)
-    return MeasuredRun.from_arrays(channels, times, values, change, str(path))
+    return run_of(channels, *described_channels(recorded, channels, str(path), low, high), change, str(path))
 
 
 @validated

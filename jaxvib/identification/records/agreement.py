@@ -56,21 +56,36 @@ _LEAST_DRIFT_ERROR, _MAX_CONDITION = 1e-7, 1e3
 
 class _Signal(NamedTuple):
     channel: Channel
+    unit: str
     time: np.ndarray
     value: np.ndarray
 
 
 def check_agreement(
-    channels: Sequence[Channel], times: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray], source: str
+    channels: Sequence[Channel],
+    times: Mapping[str, np.ndarray],
+    values: Mapping[str, np.ndarray],
+    source: str,
+    file_units: Mapping[str, str],
 ) -> list[str]:
     """Compare the channels of a run with one another, and return notes about clocks and aliasing.
+
+    **Arguments**: `channels`; `times`, s, and `values`, SI, by the name of the channel; `source` for messages; `file_units`:
+    units that the file states, for messages about wrong units.
 
     **Raises** `InputError` for a wrong unit, a reversed sign, swapped channels, different shafts, and a sampling rate that is
     too low for the rotor speed.
     """
-    signals = [_Signal(channel, times[channel.name], values[channel.name]) for channel in channels]
-    speeds = [_Signal(each.channel, *turn_speed(*each)) for each in signals if each.channel.kind in ROTOR_KINDS]
-    motions = [_Signal(each.channel, each.time, _filled(each.value)) for each in signals if each.channel.kind in _DERIVATIVES]
+    signals = [
+        _Signal(each, each.unit or file_units.get(each.name) or UNITS[each.kind], times[each.name], values[each.name])
+        for each in channels
+    ]
+    speeds = [
+        _Signal(each.channel, each.unit, *turn_speed(each.channel, each.time, each.value))
+        for each in signals
+        if each.channel.kind in ROTOR_KINDS
+    ]
+    motions = [each._replace(value=_filled(each.value)) for each in signals if each.channel.kind in _DERIVATIVES]
     notes = []
     for one, other in itertools.combinations(sorted(speeds, key=lambda each: each.channel.kind == "speed"), 2):
         notes += _compare_speeds(one, other, source)
@@ -114,7 +129,7 @@ def _compare_speeds(reference_signal: _Signal, other: _Signal, source: str) -> l
         pair = f"{name} and {quoted(other.channel.name)}"
         return _drift(time, reference, np.sign(ratio) * speed, f"{source}: the clocks of {pair}")
     if other.channel.kind == "speed":
-        fitting_unit = _fitting_unit(other.channel, 1.0 / abs(ratio), _SPEED_ERROR)
+        fitting_unit = _fitting_unit(other, 1.0 / abs(ratio), _SPEED_ERROR)
         if fitting_unit:
             problem = f"is {abs(ratio):.4g} times the speed of {name}"
             raise InputError(where, f"{problem}; the unit {quoted(fitting_unit)} would fit")
@@ -127,10 +142,11 @@ def _compare_speeds(reference_signal: _Signal, other: _Signal, source: str) -> l
     raise InputError(where, f"{problem}: correct per_turn, or leave out the channel of the shaft without the exciter")
 
 
-def _fitting_unit(channel: Channel, factor: float, error: float) -> str | None:
+def _fitting_unit(signal: _Signal, factor: float, error: float) -> str | None:
     """Return the unit with which the readings would be `factor` times as large; None if no unit does this."""
-    for unit in OTHER_UNITS[channel.kind]:
-        ratio = (unit_factor(unit, UNITS[channel.kind]) or 1.0) / channel.factor
+    kind = signal.channel.kind
+    for unit in OTHER_UNITS[kind]:
+        ratio = (unit_factor(unit, UNITS[kind]) or 1.0) / (unit_factor(signal.unit, UNITS[kind]) or 1.0)
         if ratio != 1.0 and abs(ratio / factor - 1.0) <= error:
             return unit
     return None
@@ -185,7 +201,7 @@ def _check_motions(motions: Sequence[_Signal], source: str) -> None:
         units = [
             f"{quoted(unit)} for {quoted(each.channel.name)}"
             for each, need in ((other, 1.0 / abs(factor)), (one, abs(factor)))
-            if (unit := _fitting_unit(each.channel, need, _UNIT_ERROR))
+            if (unit := _fitting_unit(each, need, _UNIT_ERROR))
         ]
         problem = f"is {abs(factor):.3g} times the motion that follows from {name} at the same place"
         fix = f"the unit {' or '.join(units)} would fit" if units else "correct the unit, the place or the gain of one of them"

@@ -55,8 +55,8 @@ def recorded_from_sep005(timeseries: Sequence[Mapping[str, Any]], source: str) -
 
 def described_channels(
     recorded: Sequence[Recorded], channels: Sequence[Channel], source: str, low: float = -math.inf, high: float = math.inf
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return the times (s, from `low` to `high`) and the values of channels.
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, str]]:
+    """Return the times (s, from `low` to `high`) and the values of channels, and the units that the file states.
 
     The values are in SI units. If the channel has a `unit`, they are the values of the file, unchanged, in this unit. If a
     channel of pulses has no times in the file, its recorded values are the times of the pulses; it then has no values.
@@ -64,11 +64,12 @@ def described_channels(
     **Raises** `InputError` for a channel that the file does not have or has more than once, a wrong unit, and times and values
     of different length.
     """
-    times, values = {}, {}
+    times, values, units = {}, {}, {}
     for channel in channels:
         where = f"{source}: channel {quoted(channel.name)}"
         recorded_channel = _find(recorded, channel, where)
         factor = _factor(recorded_channel, channel, where)
+        units[channel.name] = recorded_channel.unit or split_head(recorded_channel.name, UNITS[channel.kind])[1]
         if recorded_channel.time is None:
             if channel.kind != "pulses":
                 raise InputError(where, "has no times in the file; give the sampling rate of the run, `rate`")
@@ -80,7 +81,7 @@ def described_channels(
         times[channel.name] = _between(recorded_channel.time, low, high, recorded_channel.time)
         in_span = _between(recorded_channel.time, low, high, recorded_channel.values)
         values[channel.name] = in_span if factor == 1.0 else in_span * factor
-    return times, values
+    return times, values, units
 
 
 def _between(time: np.ndarray, low: float, high: float, values: np.ndarray) -> np.ndarray:

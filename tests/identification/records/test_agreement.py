@@ -56,7 +56,7 @@ def speed(unit=None):
 def test_the_time_at_which_records_begin_changes_no_factor():
     def factor(begin):
         pairs = (("velocity", FIRST[1]), ("acceleration", FIRST[2]))
-        return _factor(*(_Signal(sensor(kind), T + begin, value) for kind, value in pairs))
+        return _factor(*(_Signal(sensor(kind), "", T + begin, value) for kind, value in pairs))
 
     assert factor(0.0) == pytest.approx(1.0, abs=0.01) and factor(64.0) == pytest.approx(factor(0.0), rel=1e-9)
 

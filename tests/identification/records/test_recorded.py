@@ -1,5 +1,7 @@
 """Channels of files by their names and units, and runs from dictionaries."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -69,16 +71,16 @@ RECORDED = [
 )
 def test_channels_by_name_and_unit(name, kind, unit, expected):
     channel = jv.Channel(name, kind, unit=unit)
-    times, values = described_channels(RECORDED, [channel], "run", 3.0, 5.0)
+    times, values, _ = described_channels(RECORDED, [channel], "run", 3.0, 5.0)
     inside = (T >= 3.0) & (T <= 5.0)
     np.testing.assert_array_equal(times[name], T[inside])
     np.testing.assert_allclose(values[name], expected[inside], rtol=1e-12)
-    times, values = described_channels(RECORDED, [channel], "run")
+    times, values, _ = described_channels(RECORDED, [channel], "run")
     assert times[name].size == values[name].size == T.size
 
 
 def test_times_of_pulses_alone():
-    times, values = described_channels(RECORDED, [jv.Channel("edges", "pulses")], "run", 3.0, 4.0)
+    times, values, _ = described_channels(RECORDED, [jv.Channel("edges", "pulses")], "run", 3.0, 4.0)
     np.testing.assert_array_equal(times["edges"], T[(T >= 3.0) & (T <= 4.0)])
     assert values == {}
 
@@ -203,6 +205,24 @@ def test_range_of_a_sensor_clips():
 )  # fmt: skip
 def test_changes_in_words(text, change):
     assert parse_change(text, "change") == change
+
+
+@pytest.mark.parametrize(
+    ("kind", "stated", "real", "fits"),
+    [("speed", "rpm", 1.0, "rad/s"), ("speed", "", 30.0 / np.pi, "rpm"), ("acceleration", "g", 1.0, "m/s^2")],
+)
+def test_wrong_unit_in_a_file_names_a_fitting_unit(kind, stated, real, fits):
+    time = np.arange(0.0, 20.0, 0.01)
+    speed, wave = 20.0 + 2.0 * time, np.random.default_rng(0).normal(size=time.size).cumsum()
+    first = ("angle", "rad", 20.0 * time + time**2) if kind == "speed" else ("acceleration", "m/s^2", wave)
+    second = (kind, stated, real * (speed if kind == "speed" else wave))
+    series = [
+        {"name": name, "unit_str": unit, "time": time, "data": data}
+        for name, (_, unit, data) in zip(("one", "other"), (first, second), strict=True)
+    ]
+    channels = [jv.Channel("one", first[0], gain_error=0.0), jv.Channel("other", kind, gain_error=0.0)]
+    with pytest.raises(jv.InputError, match=rf"the unit '{re.escape(fits)}' (for 'other' .*)?would fit"):
+        jv.MeasuredRun.from_sep005(channels, series)
 
 
 def test_wrong_samples_are_refused():
