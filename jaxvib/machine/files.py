@@ -118,9 +118,11 @@ def _tables(text: str, name: str) -> Tables:
         raise
     except RecursionError as error:
         raise InputError(name, too_deep) from error
-    except ValueError as error:  # not TOML, or a number with more digits than Python reads
+    except tomllib.TOMLDecodeError as error:
         hint = "; write decimals with a point, not with a comma" if _DECIMAL_COMMA.search(text) else ""
         raise InputError(name, f"is not a TOML file: {error}{hint}") from error
+    except ValueError as error:
+        raise InputError(name, "has a whole number with more digits than Python reads; write it as 1e6, for example") from error
     return tables
 
 

@@ -211,6 +211,11 @@ def test_keys_of_thousands_of_names_are_refused_at_once(key):
         jv.scene_from_toml(f"{key} = 1")
 
 
+def test_numbers_with_too_many_digits_are_no_toml_error():
+    with pytest.raises(jv.InputError, match="scene has a whole number with more digits than Python reads; write it as 1e6"):
+        jv.scene_from_toml(f"[machine]\nmass = {'1' * 4301}")
+
+
 def test_byte_order_mark_is_read_and_other_encodings_named(tmp_path):
     text = TEMPLATES["one_mass"]
     (tmp_path / "bom.toml").write_text(text, encoding="utf-8-sig")
