@@ -401,6 +401,22 @@ def test_kilograms_as_a_force_are_refused_with_kgf(text, unit, force, value):
         number("3 kg", "N/m", "field")
 
 
+@pytest.mark.parametrize("unit", ["m*9**9**9", "m^9^9^9", "m*9**(99*99*99*99)", "m*9⁹⁹⁹⁹⁹⁹⁹⁹", "m*9⁹⁹^99", "m*9**-+9e9"])
+def test_large_powers_in_units_are_refused_at_once(unit):
+    assert unit_factor(unit, "m") is None and unit_factor("m", unit) is None
+    with pytest.raises(jv.InputError, match="not in m"):
+        to_float(f"5 {unit}", "m", "length")
+
+
+@pytest.mark.parametrize("unit", ["m^(4/2)", "m^2.0", "m**+2", "m²", "m³/m", "m⁴ m^-2", "1e4 cm^2"])
+def test_powers_in_units_are_read(unit):
+    assert unit_factor(unit, "m^2") == pytest.approx(1.0, rel=1e-15)
+
+
+def test_long_units_are_refused_at_once():
+    assert unit_factor("m", "m" * 10**5) is None
+
+
 def test_bounds_of_numpy_values_are_decided_while_tracing():
     @jax.jit
     def signed(x):

@@ -211,7 +211,7 @@ def unsaid(answer: Any) -> bool:
 
 def takes_for_a_number(function: Callable[..., Any], name: str, valid: Any, text: str) -> bool:
     """True if a parameter is a number and the value is none, so that it must be refused."""
-    if text not in NO_NUMBERS or isinstance(valid, (bool, str)):
+    if text not in NO_NUMBERS or isinstance(valid, (bool, str)) or getattr(valid, "dtype", None) == np.bool_:
         return False
     number, kind = isinstance(valid, (int, float)) or hasattr(valid, "dtype"), ""
     with contextlib.suppress(ValueError, TypeError, KeyError):
@@ -262,8 +262,8 @@ def judged(ask: Callable[[], Any], *, number: bool = True) -> tuple[str, str]:
             warnings.simplefilter("error")
             with contextlib.chdir(FOLDER):
                 answer = ask()
-            answer = jax.block_until_ready(answer) if isinstance(answer, eqx.Module) else answer
-            repr(answer)
+            if isinstance(answer, eqx.Module):
+                repr(jax.block_until_ready(answer))
     except (jv.InputError, jv.ComputationError) as error:
         taken = time.process_time() - began
         said = str(error)

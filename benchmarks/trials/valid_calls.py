@@ -119,7 +119,6 @@ def calls() -> Iterator[Callable[[], Call]]:
     path = FOLDER / "file"
     force = later(lambda: op.foundation_force(mode=3))
     demand = later(lambda: (op.foundation_force(mode=3) < 1e5,))
-    plain = {"name": "x", "unit": "N"}
     yield call("InputError", field="x", problem="is wrong")
     yield call("ComputationError", status="bad", message="is bad")
     yield call("prepare_cpu", devices=1)
@@ -341,21 +340,12 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("Cost.cheapest", lambda: cost_of().cheapest, error=1e-3)
     # Design
     mode = dict(mode=3)
-    of = dict(of=1)
     tier = dict(tier="leading")
-    yield call("amplitude", **mode, **of, **tier)
-    yield call("force_per_amplitude", **mode, **of, **tier)
     yield call("foundation_force of a jam", lambda: op.foundation_force, **mode, harmonic=None, **tier)
-    yield call("jam_frequency", **mode, **tier)
     yield call("phase", **mode, of=(1, 2), **tier)
     yield call("power of a jam", lambda: op.power, **mode, **tier)
-    yield call("fold_margin", **mode)
-    yield call("largest_multiplier", **mode)
     yield call("peak_force", until=1.0, spin_up=0.5)
     yield call("settling_time", until=1.0, spin_up=0.5, within=0.05, of=1)
-    yield call("product", field="machine.mass")
-    yield call("total", field="machine.mass")
-    yield call("static_deflection", of=1)
     yield call("spring_cost", prices=[(1e4, 10.0), (1e5, 20.0)], unit="EUR")
     for name in ("expected", "worst"):
         yield call(name, quantity=force, tolerances={"machine.stiffness": 0.05}, samples=4, seed=0)
@@ -364,7 +354,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("hold", quantity=force, value=10.0)
     yield call("largest", lambda: lambda first: op.largest(first), first=force)
     yield call("least", lambda: lambda first: op.least(first), first=force)
-    yield call("Quantity", **plain, function=lambda s: s.drive.speed, mode=None, of=None, parts=())
+    yield call("Quantity", name="x", unit="N", function=lambda s: s.drive.speed, mode=None, of=None, parts=())
     for sign in ("+", "-", "*", "/", "<", ">", "**"):
         yield call(f"Quantity {sign}", lambda sign=sign: _operator(sign), other=2.0 if sign in "*/**" else "2 N")
     yield call("Quantity.at_tier", lambda: op.foundation_force(mode=3).at_tier, tier="exact")
@@ -387,6 +377,152 @@ def calls() -> Iterator[Callable[[], Call]]:
         iterations=2, polishing=0, rate=0.05, searcher="gradients", begin=None, verify=False, throw=False, progress=None
     )
     yield call("synthesize", space=later(space), objective=force, subject_to=demand, **search, **ended)
+    yield from machine_calls(call)
+
+
+@functools.cache
+def twins() -> jv.Scene:
+    springs = [jv.support(at=(x, 0.0), stiffness=(3e3, 3e3), damping=(150.0, 150.0)) for x in (-0.6, 0.6)]
+    motor = jv.DCMotor(100.0, stall_torque=60.0, inertia=0.05)
+    placed = [jv.Exciter(drive=motor, unbalance=0.4, at=(x, 0.0), direction=s) for x, s in ((-0.6, 1), (0.6, -1))]
+    return jv.Scene(jv.plane_body(mass=300.0, inertia=75.0, supports=springs), exciters=placed)
+
+
+@functools.cache
+def regimes() -> jv.SynchronousRegimes:
+    found = jv.synchronous_regimes(twins())
+    assert isinstance(found, jv.SynchronousRegimes)
+    return found
+
+
+TIMES = np.arange(0.0, 4.0, 0.01)
+SHAKER_DRIVE = jv.RunUp(60.0, acceleration=15.0)
+
+
+def frame(name: str = "frame") -> jv.Channel:
+    return jv.Channel(name, "acceleration", at=1, gain_error=0.0)
+
+
+@functools.cache
+def shaker() -> jv.Scene:
+    exciters = [jv.Exciter(drive=SHAKER_DRIVE, unbalance=0.05)]
+    return jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0), exciters=exciters)
+
+
+@functools.cache
+def measured() -> jv.MeasuredRun:
+    return jv.MeasuredRun.from_arrays([frame()], TIMES, {"frame": 0.01 * np.random.default_rng(0).normal(size=TIMES.size)})
+
+
+@functools.cache
+def fit() -> jv.MachineFit:
+    found = jv.identify(shaker(), measured(), unknown=["machine.stiffness", "machine.damping"], throw=False)
+    assert isinstance(found, jv.MachineFit)
+    return found
+
+
+def _text(name: str, text: str) -> pathlib.Path:
+    (FOLDER / name).write_text(text)
+    return FOLDER / name
+
+
+RECORDING = "# rate: 100 Hz\nframe (g),speed (rpm)\n" + "0.5,600\n0.4,601\n" * 20
+SPRINGS = "part;rate (N/mm);length (mm)\nA1;12,5;80\nA2;20,0;80\n"
+
+
+@functools.cache
+def swept() -> pathlib.Path:
+    jv.sweep(scene(), {"drive.speed": [100.0, 120.0]}, [op.jam_frequency(mode=3)], FOLDER / "sweep.zarr")
+    return FOLDER / "sweep.zarr"
+
+
+def machine_calls(call: Callable[..., Any]) -> Iterator[Callable[[], Call]]:
+    """Valid calls of functions of machines with several exciters, of recorded runs, of sweeps and of quantities of designs."""
+    later = functools.partial
+    s, pair, jam = later(scene), later(twins), later(lambda: jv.jam_modes(scene()).select(3))
+    yield call("ball_mass", ball_radius="20 mm", material="steel")
+    oil = dict(ball_radius="20 mm", viscosity=0.1, density=870.0, mass=None, rolling_lever=None, friction=None, diameter=None)
+    yield call("drag_of", cause="oil", radius=0.12, load_speed="780 rpm", rotor_speed="1500 rpm", **oil)
+    yield call("body", mass=2000.0, inertia=600.0)
+    yield call("plane_network", bodies=later(lambda: [jv.body(mass=2000.0, inertia=600.0)]), supports=later(springs))
+    matrices = dict(mass=[[2.0, 0.0], [0.0, 1.0]], damping=[[2.0, -1.0], [-1.0, 1.0]], stiffness=[[2e3, -1e3], [-1e3, 1e3]])
+    matrices |= dict(foundation=([[1.0, 0.0]], [[0.1, 0.0]]), gyroscopic=None)
+    yield call("from_matrices", **matrices, places=[[0], [1]], reduce=2)
+    start = later(lambda: jv.initial_state(screen_scene()))
+    yield call("foundation_moment", scene=later(screen_scene), state=start, about=(0.1, 0.0))
+    yield call("Scene.replace", lambda: scene().replace, drive=later(lambda: scene().drive))
+    yield call("drag_limits", scene=s, phases=False)
+    turns = dict(scene=later(screen_scene), phases=None, points=50, most=200.0)
+    yield call("response", speeds=None, **turns)
+    yield call("response at speeds", lambda: jv.response, speeds=[10.0, 20.0], **turns | {"phases": [0.0, 1.0], "most": None})
+    showing = dict(unit="rpm", show=("amplitude",), ax=None)
+    yield call("Response.plot", lambda: jv.response(screen_scene(), points=50).plot, **showing)
+    yield call("synchronous_regimes", scene=pair, masses=(0, 1), near=None)
+    near = later(lambda: (float(regimes().speed[0]), np.asarray(regimes().phases[0])))
+    yield call("synchronous_regimes near one", lambda: jv.synchronous_regimes, scene=pair, masses=None, near=near)
+    yield call("SynchronousRegimes.select", lambda: regimes().select, index=0)
+    yield call("working_regime", scene=pair, throw=True)
+    yield call("regime_partitions", scene=pair, stable=True)
+    yield call("RegimePartitions.select", lambda: jv.regime_partitions(twins()).select, index=0)
+    yield call("synchronization_limit", scene=pair, regime=later(lambda: regimes().select(0)), over="exciters[1].drive.speed")
+    yield call("SynchronousOrbit.at", lambda: jv.synchronous_orbit(twins(), phases=(0.0, 3.1)).at, theta=1.0)
+    yield call("run_up", scene=pair, until=4.0, least=False)
+    yield call("conveying_speed", amplitude=jnp.array([0.002, -0.002j]), speed=100.0, slope=0.1)
+    yield call("vibration_measures", scene=s, motion=jam, at=None, body=0, slope=0.0, layer=None)
+    plane = dict(at=(0.1, 0.2), body=0, slope=0.1, layer=(0.05, 1.0, 1500.0))
+    motion = later(lambda: regimes().select(0).vibration())
+    yield call("vibration_measures of a body", lambda: jv.vibration_measures, scene=pair, motion=motion, **plane)
+    yield call("vibration_zone", velocity="3 mm/s", machine="medium", supports="flexible", limits=(1e-3, 2e-3, 4e-3))
+    yield call("Run.point", lambda: run().point, at=1, body=0, part="window")
+    yield call("estimate_share", flags=np.asarray([True, False, True]))
+    # Recorded runs
+    sensor = dict(direction="up", unit="g", gain_error=0.01, delay=0.0, high_pass=0.5, range="50 g", per_turn=1)
+    yield call("Channel", name="frame", kind="acceleration", at=1, **sensor)
+    noise, change = {"frame": 0.1 * np.sin(TIMES)}, {"machine.mass[0]": "+10 kg"}
+    of_arrays = dict(channels=[frame()], times=TIMES, values=noise, change=change, source="run")
+    yield call("MeasuredRun.from_arrays", lambda: jv.MeasuredRun.from_arrays, **of_arrays)
+    given = dict(channels=[frame()], timeseries=later(lambda: measured().to_sep005()), change=change, source="run")
+    yield call("MeasuredRun.from_sep005", lambda: jv.MeasuredRun.from_sep005, **given)
+    yield call("MeasuredRun.rate", lambda: measured().rate, name="frame")
+    parts = dict(start=0.1, until=0.3, change=change, rate=None)
+    yield call("read_run", path=later(_text, "run.csv", RECORDING), channels=[frame()], **parts)
+    yield call("read_recording", path=later(_text, "run.csv", RECORDING), rate=None)
+    yield call("csv_column", path=later(_text, "springs.csv", SPRINGS), unit="N/m", column="rate")
+    planned: Any = dict(duration="4 s", channels=[frame()], rate=100.0, noise={"frame": 0.01}, change=change)
+    yield call("PlannedRun", name="slow", drive=SHAKER_DRIVE, **planned)
+    runs = later(lambda: [jv.PlannedRun("slow", SHAKER_DRIVE, **planned)])
+    yield call("plan_runs", fit=later(fit), candidates=runs, limits=None)
+    yield call("predict_run", fit=later(fit), run=later(measured))
+    yield call("MachineFit.estimate", lambda: fit().estimate, name="machine.stiffness[0]")
+    yield call("MachineFit.interval_of", lambda: fit().interval_of, quantity=lambda x: jv.natural_frequencies(x)[0])
+    told = dict(unknown=["machine.stiffness"], known={"machine.mass": "50 kg +- 1 %"}, throw=False)
+    yield call("identify a machine", lambda: jv.identify, subject=later(shaker), records=later(measured), **told)
+    # Sweeps
+    study = dict(axes={"drive.speed": [100.0, 120.0]}, measure=[op.jam_frequency(mode=3)], store=FOLDER / "new.zarr")
+    kept = dict(tier=None, until=None, start="rest", mode=None, steps=None, samples=0, sampling="random", seed=0, chunk=2)
+    yield call("sweep", scene=s, **study, **kept, workers=None, scheduler=None, timeout="30 s", report=None)
+    yield call("open_sweep", store=later(swept))
+    # Quantities of designs
+    tier, point = dict(tier="leading"), dict(at=(0.1, 0.0), body=0, tier="leading")
+    for names, given in (
+        ("acceleration amplitude force_per_amplitude stroke velocity", dict(mode=3, of=1, **tier)),
+        ("jam_frequency shaft_torque transmissibility", dict(mode=3, **tier)),
+        ("amplitude_spread motion_spread", dict(points=((0.1, 0.0), (0.2, 0.0)), body=0, **tier)),
+        ("force_per_throw roundness throw_angle throw_stroke", point),
+        ("response_amplitude response_stroke", dict(at=1, body=0, speed=None, between=(10.0, 20.0))),
+        ("response_force response_torque response_transmissibility", dict(speed=10.0, between=None)),
+        ("fold_margin largest_multiplier", dict(mode=3)),
+        ("support_load", dict(mode=3, of=1)),
+        ("static_deflection", dict(of=1)),
+        ("product total", dict(field="machine.mass")),
+        ("throw_number", dict(slope=0.1, **point)),
+        ("peak_displacement", dict(until=1.0, at=1, body=0, spin_up=0.5)),
+    ):
+        for name in names.split():
+            yield call(name, **given)
+    yield call("conveying speed of a design", lambda: op.conveying_speed, slope=0.1, **point)
+    of_machines = dict(tolerances=["stiffness=2%"], samples=4, seed=0)
+    yield call("tolerance_ranges", scene=s, quantities=later(lambda: [op.jam_frequency(mode=3)]), **of_machines)
 
 
 @functools.cache
@@ -450,15 +586,12 @@ def _vector(name: str) -> dict[str, Any]:
 
 
 def _csv() -> pathlib.Path:
-    path = FOLDER / "swing.csv"
     lines = [f"{a:.3f},{b:.6f}" for a, b in zip(record().time, record().angle, strict=True)]
-    path.write_text("time (s),angle (rad)\n" + "\n".join(lines))
-    return path
+    return _text("swing.csv", "time (s),angle (rad)\n" + "\n".join(lines))
 
 
 def _design() -> pathlib.Path:
     jv.save_scene(scene(), FOLDER / "machine.toml")
     objective = '[objective]\nquantity = "foundation_force"\nmode = 3\n'
     text = f'scene = "machine.toml"\n[free]\n"machine.stiffness[0]" = [3e4, 8e4]\n{objective}'
-    (FOLDER / "design.toml").write_text(text)
-    return FOLDER / "design.toml"
+    return _text("design.toml", text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +49,7 @@ def animate(
 
     SOURCE is a file run.npz of `jaxvib simulate`, the folder of such a file, or a scene file. For a scene file, --until
     simulates the scene first; --mode without --until shows the exact jam."""
-    if source.is_dir():
+    if os.path.isdir(source):
         source = source / "run.npz"
     if source.suffix == ".npz":
         if until is not None or start is not None or mode is not None:

@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import call_user, is_real, validated
 from jaxvib.display import Drawn, Onto
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.identification.checks import FitStatus, coverage_notes, resembles, status_of
@@ -113,12 +113,14 @@ class MachineFit(Result):
     readings: tuple[np.ndarray, ...]
     fitted: tuple[np.ndarray, ...]
 
+    @validated
     def estimate(self, name: str) -> Estimate:
         """Return the estimate of the parameter `name`. **Raises** `InputError` for a parameter that was not unknown."""
         if name not in self.names:
             raise InputError("name", f"is {quoted(name)}; the unknown parameters were: {', '.join(self.names)}")
         return self.estimates[self.names.index(name)]
 
+    @validated
     def interval_of(self, quantity: Callable[[Scene], float]) -> Estimate:
         """Return a quantity of the fitted scene with the interval that follows from the errors of the parameters.
 
@@ -131,11 +133,13 @@ class MachineFit(Result):
         errors = np.array([each.error for each in self.undetermined])
 
         def values(scene: Scene) -> np.ndarray:
-            found = np.asarray(quantity(scene), float)
+            found = np.asarray(call_user(quantity, "quantity", scene))
             if found.size != 1:
                 problem = f"returns an array of shape {found.shape}; it must return one number, such as its entry [0]"
                 raise InputError("quantity", problem)
-            return found.reshape(1)
+            if not is_real(found):
+                raise InputError("quantity", f"returns {quoted(found.item())}; it must return one real number")
+            return found.astype(float).reshape(1)
 
         return propagate(self.scene, self.names, self.scale, self.covariance, axes, errors, values)[0]
 
@@ -413,7 +417,9 @@ def propagate(
         number = find_number(scene, name, "unknown")
         now = np.asarray(number.read(scene))
         high, low = (function(put_numbers(scene, (number,), now + sign * step)) for sign in (1.0, -1.0))
-        slopes.append((high - low) / (2.0 * _STEP) if high.shape == low.shape == values.shape else np.full_like(values, np.nan))
+        with np.errstate(invalid="ignore"):  # infinite values
+            change = high - low if high.shape == low.shape == values.shape else np.full_like(values, np.nan)
+        slopes.append(change / (2.0 * _STEP))
     slopes = np.stack(slopes, axis=1)
     spread = np.sqrt(np.maximum(np.einsum("mk,kl,ml->m", slopes, covariance, slopes), 0.0))
     undetermined_changes = np.abs(slopes @ axes) * np.minimum(errors, 1e3)

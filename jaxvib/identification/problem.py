@@ -59,6 +59,10 @@ _MAX_DELAY = 450
 """Largest delay of readings in steps; the longest filter contains it and a whitening filter."""
 
 
+_LEAST_RELATIVE_ERROR = 1e-12
+"""Relative standard error up to which a value counts as exactly known. The square of its inverse is lost in rounding errors."""
+
+
 class Known(NamedTuple):
     """Known parameter: its `value`, SI, and its standard `error`, SI, 0 if it is exact."""
 
@@ -120,7 +124,7 @@ class Problem(NamedTuple):
 def read_known(text: Number, number: NamedNumber, field: str) -> Known:
     """Return a known value with its standard error: "95 kg", "95 kg +- 1 %" or "95 kg +- 0.5 kg".
 
-    The number after the sign is the standard error.
+    The number after the sign is the standard error. One of at most 1e-12 of the value counts as 0.
     """
     parts = re.split(r"\+-|\+/-|±", text) if isinstance(text, str) else []
     if not isinstance(text, str) or len(parts) < 2:
@@ -138,7 +142,7 @@ def read_known(text: Number, number: NamedNumber, field: str) -> Known:
         size = float(_unbounded(number).value(error, field))
     if not 0.0 <= size < math.inf:
         raise InputError(field, f"is {quoted(text)}; the standard error after +- must be a finite number, at least 0")
-    return Known(value, size)
+    return Known(value, size if size > _LEAST_RELATIVE_ERROR * abs(value) else 0.0)
 
 
 def _unbounded(number: NamedNumber) -> NamedNumber:

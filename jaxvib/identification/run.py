@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxvib.boundary import validated
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.identification.records.agreement import ROTOR_KINDS, check_agreement, turn_speed
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.records.pulses import fit_pulses, number_pulses, rising_edges
@@ -19,6 +19,9 @@ from jaxvib.identification.records.sampling import clipped_at, continued_angle, 
 from jaxvib.results.readable import Readable
 from jaxvib.results.table import is_number
 from jaxvib.units import Number, number
+
+_MAX_READING = 1e100
+"""Largest absolute reading, SI units. Squares of larger readings overflow."""
 
 _FULL = 0.999
 """Share of the range of a sensor above which a reading counts as clipped."""
@@ -151,6 +154,7 @@ class MeasuredRun(Readable):
             entries.append(entry)
         return entries
 
+    @validated
     def of_kind(self, *kinds: str) -> tuple[Channel, ...]:
         """Return the channels of the given `kinds`."""
         return tuple(channel for channel in self.channels if channel.kind in kinds)
@@ -160,8 +164,13 @@ class MeasuredRun(Readable):
         """Channel of the rotor: pulses, else an angle or a speed; None without such a channel."""
         return min(self.of_kind(*ROTOR_KINDS), key=lambda channel: ROTOR_KINDS.index(channel.kind), default=None)
 
+    @validated
     def rate(self, name: str) -> float:
-        """Return the sampling rate, Hz, of the channel `name`: the inverse of the median time step."""
+        """Return the sampling rate, Hz, of the channel `name`: the inverse of the median time step.
+
+        **Raises** `InputError` for a channel that the run does not have.
+        """
+        require_one_of(name, self.times, "name")
         return 1.0 / float(np.median(np.diff(self.times[name])))
 
     def rotor_speed(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -264,6 +273,8 @@ def _read_channel(
     value = _as_samples(values[name], where)
     if channel.factor != 1.0 or value is values[name]:  # one copy only, because a recording may be long
         value = value * channel.factor
+    if np.max(np.abs(value), initial=0.0, where=np.isfinite(value)) > _MAX_READING:
+        raise InputError(where, f"has a reading above {_MAX_READING:g} {UNITS[channel.kind]}; correct the file or the unit")
     if time.shape != value.shape:
         raise InputError(where, f"has {time.size} times but {value.size} values; each value needs its time")
     if channel.kind == "pulses":

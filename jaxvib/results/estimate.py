@@ -63,7 +63,7 @@ def estimate_share(flags: Any) -> Share:
 
     Source: see `wilson`.
     """
-    if getattr(getattr(flags, "dtype", None), "kind", "") != "b" or not np.size(flags):
+    if getattr(getattr(flags, "dtype", None), "kind", "") != "b" or not np.size(flags) or np.ma.is_masked(flags):
         raise InputError("flags", f"is {quoted(flags)}; it must be an array of at least one Boolean value")
     hits, cases = int(np.sum(np.asarray(flags))), np.size(flags)
     low, high = (float(end) for end in wilson(np.asarray(hits), np.asarray(cases)))

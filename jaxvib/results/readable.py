@@ -43,6 +43,7 @@ class Readable(eqx.Module):
         return "\n".join([f"{type(self).__name__}:", *_lines(self)])
 
 
+@np.errstate(over="ignore")
 def values_text(values: object, unit: str = "") -> str:
     """Return numbers of any shape, given in the SI `unit`, as text in their display unit.
 

@@ -70,7 +70,7 @@ class Store:
     def __init__(self, path: Path, writable: bool = False):
         zarr = optional_module("zarr", "sweep")
         self.path = path
-        if not path.exists():
+        if not os.path.exists(path):  # `Path.exists` raises an error for long names
             raise InputError("store", f"is {quoted(str(path))}; there is no such store")
         changed = seals.changed_layout(path)
         if changed is not None:

@@ -258,7 +258,7 @@ def run_study(
         count(workers, "workers")
         if workers > (limit := max(_MAX_WORKERS, 4 * (os.cpu_count() or 1))):
             raise InputError("workers", f"is {workers}, too many processes for this computer; give at most {limit}")
-    if not path.exists():
+    if not os.path.exists(path):
         Store.create(path, new_study)
     opened = Store(path, writable=True)
     with opened.locked():

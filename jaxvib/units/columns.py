@@ -80,8 +80,8 @@ def unit_factor(unit: str, si: str) -> float | None:
     multiple = _MULTIPLE.match(unit)
     if multiple is not None:
         factor = unit_factor(multiple[2], si)
-        return None if factor is None or float(multiple[1]) == 0.0 else float(multiple[1]) * factor
-    return unit_ratio(unit, si) if si and 0 < len(unit) < 100 else None  # pint takes minutes for long texts
+        return None if factor is None or not 0.0 < float(multiple[1]) < np.inf else float(multiple[1]) * factor
+    return unit_ratio(unit, si) if si and unit else None
 
 
 def split_head(head: str, si: str) -> tuple[str, str]:

@@ -103,6 +103,14 @@ _FACTORS = {
 }
 """Factors of the most common units of engineering drawings. Other units are read by pint, whose import takes half a second."""
 
+_POWER = re.compile(
+    r"(?:\^|\*\*)\s*(?:[+-]?\d{1,2}(?:\.\d{1,2})?|\([+-]?\d{1,2}(?:[./]\d{1,2})?\))(?![\d.e⁰¹²³⁴-⁹]|\s*(?:\^|\*\*))|[⁰¹²³⁴-⁹]{1,2}(?![⁰¹²³⁴-⁹^]|\*\*)"
+)
+"""Power of at most two digits. pint would compute any other, such as 9**9**9, which takes minutes."""
+
+_MAX_UNIT_CHARACTERS = 100
+"""Largest length of a unit. pint takes minutes for long strings."""
+
 _UNREADABLE = (AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError, tokenize.TokenError)
 """Errors, other than pint's own classes, that pint raises for a string that is not a unit; it parses the string as Python."""
 
@@ -209,6 +217,8 @@ def _parsed(unit: str) -> Any:
 
     if any(pattern.search(unit) for pattern, _ in _AMBIGUOUS):
         raise ValueError("a name with several meanings")
+    if len(unit) > _MAX_UNIT_CHARACTERS or re.search(r"\^|\*\*|[⁰¹²³⁴-⁹]", _POWER.sub("", unit)):
+        raise ValueError("a long text, or a large power")
     name = _PLAIN_POWER.sub(r"^\1", _SPELLINGS.get(unit, unit))
     return pint.get_application_registry().Unit(
         _JOINED_PATTERN.sub(lambda found: f"({_JOINED[found[1]]}{found[2] or ''})", name) or "dimensionless"

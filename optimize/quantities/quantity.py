@@ -54,8 +54,8 @@ class Quantity:
     comparison must have the same unit. A string such as "50 N" can be an operand: `force < "50 N"`,
     `0.3 * a / "1 mm" + force / "10 N"`.
 
-    **Raises** `InputError` if `function` is not a function of one or two arguments. The operators raise it for units that do
-    not match.
+    **Raises** `InputError` if `name` or `unit` is not a string, or if `function` is not a function of one or two arguments. The
+    operators raise it for units that do not match.
 
     >>> import jaxvib as jv
     >>> from optimize import Quantity, foundation_force
@@ -73,6 +73,9 @@ class Quantity:
     """Quantities from which this quantity is computed, for example the terms of a sum."""
 
     def __post_init__(self) -> None:
+        for argument, value in (("name", self.name), ("unit", self.unit)):
+            if not isinstance(value, str):
+                raise InputError(f"quantity.{argument}", f"is {quoted(value)}; it must be a string")
         if self.mode is not None:
             count(self.mode, f"quantity {quoted(self.name)}.mode")
         if type(self) is Quantity and not (callable(self.function) and count_required_arguments(self.function) in (1, 2)):
@@ -138,6 +141,7 @@ class Quantity:
         """
         return replace(self, parts=tuple(part.simplified for part in self.parts)) if self.parts else self
 
+    @validated
     def named(self, name: str) -> Quantity:
         """Return the same quantity under another `name`."""
         return replace(self, name=name)
@@ -230,6 +234,7 @@ class BuiltinQuantity(Quantity):
     def simplified(self) -> Quantity:
         return self.at_tier("leading")
 
+    @validated
     def named(self, name: str) -> Quantity:
         return replace(self, name=name, text=name)
 

@@ -102,6 +102,22 @@ def test_value_0_has_an_absolute_error():
     assert found[1] == (0.0, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("value", ["a", 1j, None, True])
+def test_quantity_of_a_fit_is_a_real_number(value):
+    parts = {"names": ("machine.stiffness[0]",), "scale": np.array([4e4]), "covariance": np.eye(1)}
+    fit = SimpleNamespace(undetermined=(), scene=scene_of(), **parts)
+    with pytest.raises(jv.InputError, match=r"quantity returns .*; it must return one real number"):
+        jv.MachineFit.interval_of(fit, lambda scene: value)
+    with pytest.raises(jv.InputError, match="quantity cannot be called with"):
+        jv.MachineFit.interval_of(fit, lambda: value)
+
+
+def test_quantity_of_a_fit_may_be_infinite():
+    parts = {"names": ("machine.stiffness[0]",), "scale": np.array([4e4]), "covariance": np.eye(1)}
+    fit = SimpleNamespace(undetermined=(), scene=scene_of(), **parts)
+    assert jv.MachineFit.interval_of(fit, lambda scene: np.inf).error == np.inf
+
+
 def test_quantity_of_a_fit_is_one_number():
     parts = {"names": ("machine.stiffness[0]",), "scale": np.array([4e4]), "covariance": np.eye(1)}
     fit = SimpleNamespace(undetermined=(), scene=scene_of(), **parts)

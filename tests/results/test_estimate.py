@@ -22,7 +22,10 @@ def test_intervals_hold_the_share_as_often_as_they_say():
     assert wilson(np.asarray(0), np.asarray(0)) == (0.0, 1.0)
 
 
-@pytest.mark.parametrize("flags", [np.zeros(0, bool), np.ones(3), [True, False], None])
+MASKED = np.ma.array([True, False], mask=[False, True])
+
+
+@pytest.mark.parametrize("flags", [np.zeros(0, bool), np.ones(3), [True, False], None, MASKED])
 def test_share_of_other_than_booleans_is_refused(flags):
     with pytest.raises(jv.InputError, match=r"^flags is .*; it must be an array of at least one Boolean value"):
         jv.estimate_share(flags)

@@ -142,6 +142,11 @@ def test_damaged_metadata_are_refused(copy, harm):
             ask()
 
 
+def test_a_store_of_a_long_name_is_missing():
+    with pytest.raises(jv.InputError, match="there is no such store"):
+        jv.open_sweep("1" * 400)
+
+
 def test_what_a_killed_write_left_is_computed_again(stores, copy):
     """Numbers without statuses are cut off before the end, statuses without a seal just before it."""
     (copy / seals.FOLDER / "1").unlink()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,7 +36,7 @@ def sweep(
 
     optional_module("zarr", "sweep")  # before the study, whose preparation takes seconds
     path = store or study.with_suffix(".zarr")
-    if not resume and path.exists():
+    if not resume and os.path.exists(path):
         raise InputError("--no-resume", f"is given, but {quoted(str(path))} exists already; give another folder with --store")
     definition = load_study(study)
     try:

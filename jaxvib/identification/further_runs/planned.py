@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -23,7 +24,10 @@ from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.noise import Noise, noise_of, resampled
 from jaxvib.results.readable import Readable
-from jaxvib.units import Number, number
+from jaxvib.units import Number, count, number
+
+_BYTES_PER_SAMPLE = 1000.0
+"""Memory for each sample of a planned run, bytes: readings, their derivatives and copies."""
 
 
 class PlannedRun(Readable):
@@ -75,6 +79,8 @@ class PlannedRun(Readable):
         self.name, self.drive, self.channels = name, drive, tuple(channels)
         self.duration = float(number(duration, "s", "duration", low=0.0, open_low=True))
         self.rate = float(number(rate, "Hz", "rate", low=0.0, open_low=True))
+        samples = min(self.duration * self.rate, 2.0**62)
+        count(math.ceil(samples), "samples (duration times rate)", each=_BYTES_PER_SAMPLE)
         self.change = dict(change or {})
         units, self.noise = {each.name: UNITS[each.kind] for each in channels}, {}
         for channel, value in (noise or {}).items():

@@ -13,7 +13,7 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.results.readable import Readable
 from jaxvib.results.table import is_number
-from jaxvib.units import Number, number
+from jaxvib.units import Number, count, number
 from jaxvib.units.columns import unit_factor
 
 Kind = Literal["acceleration", "velocity", "displacement", "force", "pulses", "speed", "angle", "torque", "current"]
@@ -154,8 +154,8 @@ def _place(at: int | Sequence[Number] | None, where: str) -> int | tuple[float, 
     if at is None or isinstance(at, (int, np.integer)):
         if at is not None and at < 1:
             raise InputError(f"{where}: at", f"is {at}; it must be the number of a platform, from 1, or a pair (x, y)")
-        return None if at is None else int(at)
-    if len(at) != 2:
+        return None if at is None else count(at, f"{where}: at")
+    if not (isinstance(at, (list, tuple)) or getattr(at, "ndim", 0) == 1) or len(at) != 2:
         raise InputError(f"{where}: at", f"is {quoted(at)}; it must be the number of a platform, or a pair (x, y)")
     x, y = (float(number(each, "m", f"{where}: at[{k}]")) for k, each in enumerate(at))
     return x, y

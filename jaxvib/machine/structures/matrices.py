@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -185,6 +185,8 @@ def _number_of_equal(squares: np.ndarray, number: int) -> int:
 
 def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:
     """Return a matrix, square if `shape` is None; a number stands for a 1 x 1 matrix."""
+    if isinstance(value, (Iterator, range)):
+        raise InputError(name, f"is {quoted(value)}; it must be a square array of numbers, in SI units")
     try:
         is_complex = any(map(np.iscomplexobj, jax.tree.leaves(value)))
         matrix = jnp.array(value, dtype=None if is_complex else float)  # a copy: JAX may share the memory of an array of NumPy
@@ -264,7 +266,7 @@ def _read_foundation(foundation: Any, size: int) -> Array:
 def _shape_of(value: Any) -> tuple[int, ...]:
     """Return the shape of an array or of nested lists; () if the lists have different lengths."""
     try:
-        return np.shape(value)
+        return () if isinstance(value, (Iterator, range)) else np.shape(value)
     except jax.errors.TracerArrayConversionError:
         return jnp.asarray(value).shape
     except ValueError:

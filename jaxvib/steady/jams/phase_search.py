@@ -260,7 +260,7 @@ def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
     loads = loads_with_drag(scene)
     speeds = np.asarray(omega, dtype=float)
     top = float(scene.drive.speed)
-    if speeds.ndim != 1 or not np.all((speeds > 0.0) & (speeds < top)) or not np.all(np.diff(speeds) > 0.0):
+    if speeds.ndim != 1 or speeds.size == 0 or not np.all((speeds > 0.0) & (speeds < top)) or not np.all(np.diff(speeds) > 0.0):
         raise InputError("omega", f"must be an ascending list of load speeds above 0 and below the rotor speed {top:g}")
     # From the jam upward, then from the jam downward.
     places, cut = np.arange(speeds.size), int(np.searchsorted(speeds, float(jam.omega)))

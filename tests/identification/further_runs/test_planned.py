@@ -302,3 +302,9 @@ def test_planned_run_reads_units():
         "x", jv.ConstantSpeed(30.0), "1 min", [FRAME], rate="1 kHz", noise={"frame": "2 mm/s"}, change={"a": "+1 kg"}
     )
     assert (found.duration, found.rate, found.noise, found.change) == (60.0, 1000.0, {"frame": 2e-3}, {"a": "+1 kg"})
+
+
+@pytest.mark.parametrize(("duration", "rate"), [(4.0, 1e12), (1e308, 100.0), (1e308, 1e308)])
+def test_runs_that_do_not_fit_into_memory_are_refused(duration, rate):
+    with pytest.raises(jv.InputError, match=r"^samples \(duration times rate\) is "):
+        PlannedRun("long", jv.RunUp(60.0, 6.0), duration, [FRAME], rate=rate)

@@ -230,6 +230,7 @@ def test_wrong_samples_are_refused():
     for times, values, says in (
         (T, np.zeros((40, 2)), r"has an array of shape \(40, 2\); one list of numbers is needed"),
         (T, WAVE[:-1], "has 40 times but 39 values; each value needs its time"),
+        (T, 1e300 * WAVE, "has a reading above 1e\\+100 "),
     ):
         with pytest.raises(jv.InputError, match=rf"^record 2: channel 'f' {says}"):
             MeasuredRun.from_arrays([channel], times, {"f": values}, source="record 2")
@@ -237,3 +238,11 @@ def test_wrong_samples_are_refused():
         MeasuredRun.from_arrays([channel, channel], T, {"f": WAVE})
     with pytest.raises(jv.InputError, match="change is empty; write for example"):
         parse_change("  ", "change")
+
+
+@pytest.mark.parametrize("name", ["none", None, [], np.zeros(2)])
+def test_rate_of_an_unknown_channel_is_refused(name):
+    run = MeasuredRun.from_arrays([jv.Channel("f", "force")], T, {"f": WAVE})
+    assert run.rate("f") == pytest.approx(10.0)
+    with pytest.raises(jv.InputError, match=r"^name is "):
+        run.rate(name)

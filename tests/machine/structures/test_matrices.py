@@ -265,6 +265,15 @@ def test_a_chain_without_support_is_read_in_single_precision():
             lambda: jv.from_matrices(np.array([[1.0, 2.0], [2.0, 1.0]]), ONE, ONE, places=[[0]]),
             "machine.mass has the eigenvalue -1; all must be greater than 0",
         ),
+        (
+            lambda: jv.from_matrices(range(10**9), ONE, ONE, places=[[0]]),
+            r"machine.mass is range\(0, 1000000000\); it must be a square array of numbers",
+        ),
+        (lambda: jv.from_matrices(ONE, iter(ONE), ONE, places=[[0]]), "machine.damping is .*iterator.*; it must be a square"),
+        (
+            lambda: jv.from_matrices(ONE, ONE, ONE, places=[[0]], foundation=range(10**9)),
+            "machine.foundation must be two arrays",
+        ),
         (lambda: jv.from_matrices(ONE, ONE, ONE, places=[]), r"machine.places is \[\]; it must be a list of places"),
         (
             lambda: jv.from_matrices(ONE, ONE, ONE, places=[[2]]),

@@ -174,8 +174,9 @@ def test_a_branch_over_the_drag_passes_its_folds():
     assert not np.any(branch.stable[int(np.argmax(branch.drag_factor)) :])
     last = np.max(np.asarray(branch.drag_factor)[np.asarray(branch.stable)])
     assert 9.2e-4 < 9.2e-4 * last < 9.6e-4
-    with pytest.raises(jv.InputError, match="omega must be an ascending list of load speeds"):
-        phase_branch(scene, jam, [100.0, 500.0])
+    for wrong in ([100.0, 500.0], []):
+        with pytest.raises(jv.InputError, match="omega must be an ascending list of load speeds"):
+            phase_branch(scene, jam, wrong)
 
 
 def test_figure_of_a_branch_is_solid_where_it_is_stable():
