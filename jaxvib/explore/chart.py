@@ -14,7 +14,6 @@ from jaxvib.draw.style import COLORS, GUIDE, join_names
 from jaxvib.explore.panel import APART, FIRST, LAST, ROTOR, TALL, WIDE, WORKING, Panel, dot, legend
 from jaxvib.steady.branches import Branches
 from jaxvib.steady.jams.branch_plot import MARKS
-from jaxvib.steady.jams.jam import STABILITY_CRITERION
 
 _STABLE = {"color": COLORS[0], "lw": 1.5}
 _UNSTABLE = {"color": COLORS[0], "lw": 1.2, "ls": "--"}
@@ -28,6 +27,9 @@ _LEGEND = {
     "working speed; numbers: jam modes": WORKING,
 }
 """Styles of the lines in the legend, by their names."""
+
+_STRIDE = 16
+"""Stride of the points at which the stability of free loads is computed; all would take five times as long as the chart."""
 
 
 def chart(result: Branches, max_speed: float) -> str:
@@ -47,6 +49,7 @@ def chart(result: Branches, max_speed: float) -> str:
     True
     """
     scale, at = speed_unit("rpm")[1], float(result.scene.drive.speed)
+    result, criterion = result.with_free_loads(_STRIDE)
     rotor_speed = np.asarray(result.rotor_speed)
     rotor_speed = np.where(rotor_speed <= max_speed, rotor_speed, np.nan)
     panels = _panels(result, scale, rotor_speed)
@@ -61,6 +64,7 @@ def chart(result: Branches, max_speed: float) -> str:
             panel.line(scale * rotor_speed[along], values[along], {**(_STABLE if solid else _UNSTABLE), "color": color})
             for values, color in zip(curves.values(), COLORS, strict=False)
             for along, solid in segments(stable)
+            if np.any(np.isfinite(rotor_speed[along]))
         ]
         dots, numbers = _jams_at_working_speed(panel, [*curves.values()], crossed, scale * at)
         parts += [panel.line([scale * at] * 2, panel.y, WORKING), *dots]
@@ -76,7 +80,7 @@ def chart(result: Branches, max_speed: float) -> str:
     platforms = {name: {**_STABLE, "color": color} for name, color in zip(panels[1][1], COLORS, strict=False)}
     keys, names = legend([{**_LEGEND, MARKS["fold"]: _FOLD} if folds else _LEGEND, platforms])
     width = FIRST + 3.0 * WIDE + 2.0 * APART + LAST
-    texts.append(Text(0.5 * width, -0.8, f"stable {STABILITY_CRITERION}", {"fontsize": "small", "ha": "center"}))
+    texts.append(Text(0.5 * width, -0.8, f"stable {criterion}", {"fontsize": "small", "ha": "center"}))
     return svg((0.0, width, -0.95, TALL + 1.1), [[*parts, *keys]], [[*texts, *names]], "", 1.0, 0.0)
 
 

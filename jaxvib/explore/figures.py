@@ -168,9 +168,9 @@ def heading(scene: Scene) -> str:
         )
     if has_branches(scene):
         return (
-            "Jams of light loads: load speed, amplitudes and foundation force over the rotor speed. Solid lines: stable by "
-            "slope, for loads that stay together; dashed lines: unstable. The numbers on the vertical line of the working "
-            "speed are those of the jam modes at this rotor speed."
+            "Jams of light loads: load speed, amplitudes and foundation force over the rotor speed. Solid lines: stable; "
+            "dashed lines: unstable, or the loads spread. The numbers on the vertical line of the working speed are those of "
+            "the jam modes at this rotor speed."
         )
     return (
         "Whirl frequencies of the rotor over the rotor speed (Campbell diagram), with the masses of the loads fixed to the "

@@ -80,22 +80,29 @@ class Branches(AbstractJam):
         folds = self.folds
         existing = np.flatnonzero(np.asarray(folds.exists)).tolist()
         marks = [("fold", float(folds.omega[k]), float(folds.rotor_speed[k])) for k in existing]
-        growth = self._growth_of_free_loads()
-        text = STABILITY_CRITERION if np.all(np.isnan(growth)) else STABILITY_OF_FREE_LOADS
-        stricter = eqx.tree_at(lambda branch: branch.stable, self, np.asarray(self.stable) & ~(growth > 0.0))
+        stricter, text = self.with_free_loads()
         return plot_branch(
             stricter, marks, unit, most, text, show, linear, ax, np.asarray(self.mode), np.asarray(self.resonances)
         )
 
-    def _growth_of_free_loads(self) -> np.ndarray:
-        """Return `growth_of_free_loads` at the points that are stable by slope; NaN at all others."""
-        growth = np.full(np.shape(self.omega), np.nan)
-        points = np.flatnonzero(np.asarray(self.stable))
-        if points.size:
-            # A fixed number of points, so that the program is not compiled for each branch.
-            padded = np.resize(points, growth.shape)
-            growth[padded] = growth_of_free_loads(self.scene, self.omega[padded], self.rotor_speed[padded])
-        return growth
+    def with_free_loads(self, stride: int = 1) -> tuple[Branches, str]:
+        """Return the branches with `stable` for loads that are free to move separately, and the name of the criterion.
+
+        Where this stability is unknown, `stable` does not change. **Arguments**: `stride`: the growth of disturbances is
+        computed at one of so many points that are stable by slope; other points have that of the nearest one.
+        """
+        stable = np.array(self.stable)
+        points = np.flatnonzero(stable)
+        if not points.size:
+            return self, STABILITY_CRITERION
+        # A fixed number of points, so that the program is not compiled for each branch.
+        chosen = points[::stride]
+        padded = np.resize(chosen, -(-stable.size // stride))
+        growth = growth_of_free_loads(self.scene, self.omega[padded], self.rotor_speed[padded])
+        nearest = np.searchsorted((chosen[1:] + chosen[:-1]) / 2.0, points)
+        stable[points] &= ~(growth[nearest] > 0.0)
+        text = STABILITY_CRITERION if np.all(np.isnan(growth)) else STABILITY_OF_FREE_LOADS
+        return eqx.tree_at(lambda branch: branch.stable, self, stable), text
 
 
 @overload

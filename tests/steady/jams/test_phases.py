@@ -325,6 +325,13 @@ def test_branch_diagram_is_dashed_where_loads_separate():
             assert min(far) < 1e-2 and lines[int(np.argmin(far))].get_linestyle() == style
 
 
+def test_stability_with_a_stride_differs_at_few_points():
+    curve = jv.branches(platforms())
+    (each, text), (some, same) = curve.with_free_loads(), curve.with_free_loads(stride=16)
+    assert text == same and np.sum(np.asarray(curve.stable) & ~np.asarray(each.stable)) > 300
+    assert np.sum(np.asarray(each.stable) != np.asarray(some.stable)) < 50
+
+
 def test_every_jam_is_listed_once_and_in_order():
     """Three equal balls on two platforms; many starts hardly reach the jams next to the rotor speed."""
     jams = jv.phase_jams(platforms())
