@@ -134,9 +134,9 @@ class MeasuredRun(Readable):
         return run_of(channels, times, values, units, change, source)
 
     def to_sep005(self) -> list[dict[str, Any]]:
-        """Return the channels as dictionaries in the format SEP-005, in SI units, with these entries:
+        """Return the channels as dictionaries in the format SEP-005 with these entries:
 
-        - `name`, `data` and `unit_str`
+        - `name`, `data` and `unit_str`, in the unit of the channel, or in SI if it has none
         - `quantity` for accelerations, velocities, displacements and forces
         - `fs` (Hz), except for channels of pulses
         - `time` (s), a list, for channels of pulses and for channels that do not begin at 0 s
@@ -145,6 +145,8 @@ class MeasuredRun(Readable):
         for channel in self.channels:
             time = self.times[channel.name]
             entry: dict[str, Any] = {"name": channel.name, "data": self.values[channel.name], "unit_str": UNITS[channel.kind]}
+            if channel.factor != 1.0:
+                entry |= {"data": entry["data"] / channel.factor, "unit_str": channel.unit}
             if channel.kind in _QUANTITIES:
                 entry["quantity"] = _QUANTITIES[channel.kind]
             if channel.kind != "pulses":

@@ -57,9 +57,9 @@ class Channel(Readable):
     - `delay`, s, of the readings relative to the motion; typical: 0 to 1e-3
     - `high_pass`, Hz, corner frequency of the sensor's first-order high-pass filter, 0 for none; typical: 0.1 to 1 for IEPE
       accelerometers
-    - `range`: largest absolute reading of the sensor, as a number in `unit` or a string with a unit, such as "50 g"; readings
-      of at least 99.9 % of the range count as clipped. Clipping is also detected from the histogram of the readings, except for
-      speeds and angles. Without a range (the default), only the histogram is used
+    - `range`: largest absolute reading of the sensor, as a number in `unit` (in SI without a `unit`) or a string with a unit,
+      such as "50 g"; readings of at least 99.9 % of the range count as clipped. Clipping is also detected from the histogram of
+      the readings, except for speeds and angles. Without a range (the default), only the histogram is used
     - `per_turn`: number of marks per turn, a missing tooth included (36 for a 36-1 wheel); typical: 1 to 60 (default 1)
 
     **Raises** `InputError` for an unknown kind or direction, a unit of another dimension, and numbers that are not allowed.

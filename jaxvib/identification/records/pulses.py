@@ -79,7 +79,7 @@ def number_pulses(time: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray,
     ([15.0, 16.0, 18.0, 19.0], ["run: channel 'tacho' missed 1 pulse, at 1.6 s, which is counted"])
     """
     if time.size < MIN_PULSES:
-        raise InputError(where, f"has {time.size} pulses; at least {MIN_PULSES} are needed; record more turns")
+        raise InputError(where, f"has {time.size} {_pulses(time.size)}; at least {MIN_PULSES} are needed; record more turns")
     not_ascending = np.flatnonzero(~(np.diff(time) > 0.0))
     if not_ascending.size:
         k = int(not_ascending[0])

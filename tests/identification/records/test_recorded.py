@@ -114,6 +114,15 @@ def test_channels_with_similar_names():
             described_channels(same, [jv.Channel(name, "force")], "run")
 
 
+def test_a_stated_unit_goes_through_dictionaries_and_back():
+    channel = jv.Channel("frame", "acceleration", at=1, unit="g")
+    run = MeasuredRun.from_arrays([channel], T, {"frame": WAVE})
+    (only,) = run.to_sep005()
+    assert only["unit_str"] == "g"
+    np.testing.assert_allclose(only["data"], WAVE, rtol=1e-12)
+    np.testing.assert_allclose(MeasuredRun.from_sep005([channel], [only]).values["frame"], 9.80665 * WAVE, rtol=1e-12)
+
+
 def test_runs_go_through_dictionaries_and_back():
     """A channel that begins at 0 s has its rate only, one that begins later its times as well."""
     channels = [jv.Channel("frame", "acceleration", at=1), jv.Channel("late", "speed"), jv.Channel("tacho", "pulses")]
