@@ -29,6 +29,10 @@ _MAX_LINEAR_PERCENT = 10.0
 _MAX_EQUAL_DIFFERENCE = 1e-4
 """Relative difference of the objectives of two machines below which they count as equally good."""
 
+_ROUNDING_PERCENT = 1e-6
+"""Difference of the objectives of two machines, percent of the change by 1 % of the most influential parameter, below which
+they count as equally good: both objectives are then almost zero."""
+
 _MIN_LIMIT_CHANGE = 1e-6
 """Smallest change of a limit, percent, for which the change of the objective is shown."""
 
@@ -242,7 +246,9 @@ class Synthesis(Result):
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
         for influence in ranked[:5]:
             lines.append(f"  1 % less / more {influence.what}: {change_text(sign * influence.less, sign * influence.more)}")
-        equal = [m for m in self.machines if abs(m.value - best) <= _MAX_EQUAL_DIFFERENCE * abs(best)]
+        most = max((abs(change) for i in ranked[:1] for change in i[1:]), default=0.0) / 100.0 * max(abs(best), 1e-300)
+        close = max(_MAX_EQUAL_DIFFERENCE * abs(best), _ROUNDING_PERCENT / 100.0 * most)
+        equal = [m for m in self.machines if abs(m.value - best) <= close]
         unit, factor = shown_unit(self.unit, abs(best))
         factor *= sign
         if len(equal) > 1 and len(equal) == len(self.machines):

@@ -144,3 +144,13 @@ def test_machines_of_one_value_are_equally_good(searched):
     machines = (Machine(2, 2e4, (1.0,)), Machine(1, 2e4, (2.0,)), Machine(1, 2e4, (3.0,)))
     (line,) = dataclasses.replace(searched, limits=(), influences=(), machines=machines).findings()
     assert line == "  3 different machines are equally good (20 kN): the objective does not decide between them"
+
+
+def test_machines_whose_objective_vanishes_are_equally_good(searched):
+    """Both forces are 0 within rounding: 1 % of the stiffness changes them by 4 N."""
+    machines = (Machine(1, 2e-15, (1.0,)), Machine(1, 9e-15, (2.0,)))
+    found = dataclasses.replace(searched, limits=(), influences=(Influence("stiffness", 2e17, 1e17),), machines=machines)
+    lines = found.findings()
+    assert lines[-1] == "  2 different machines are equally good (2e-15 N): the objective does not decide between them"
+    lines = dataclasses.replace(found, machines=(*machines, Machine(1, 1e-6, ()))).findings()
+    assert lines[-1] == "  3 different machines: 1 x 2e-15, 1 x 9e-15, 1 x 1e-06 N"
