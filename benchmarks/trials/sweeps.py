@@ -155,7 +155,8 @@ def killed(folder: pathlib.Path, out: pathlib.Path) -> None:
             run.stdout.readline()
         time.sleep(generator.random() * 0.05)
         run.send_signal(signal.SIGKILL)
-        run.wait()
+        if run.wait() not in (0, -signal.SIGKILL):
+            raise RuntimeError("the sweep failed before it was killed")
         kills += 1
         kept = jv.open_sweep(broken)
         print(f"kill {kills}: {dict(kept.counts).get('done', 0)} of {kept.cases} cases kept", flush=True)
