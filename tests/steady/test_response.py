@@ -429,6 +429,12 @@ def test_scenes_with_loads_are_refused():
         jv.response(scene)
 
 
+@pytest.mark.parametrize(("name", "value"), [("most", b"12"), ("most", True), ("most", -1.0), ("points", 0)])
+def test_settings_of_default_speeds_are_validated_beside_speeds(name, value):
+    with pytest.raises(jv.InputError, match=rf"^{name} is "):
+        jv.response(one_mass(drive=motor()), [10.0], **{name: value})
+
+
 def test_the_figure_shows_curves_motor_and_folds():
     found = jv.response(one_mass(drive=motor()))
     labels = [text for axis in found.plot().axes for text in axis.get_legend_handles_labels()[1]]
