@@ -25,8 +25,9 @@ ACCURACY_FIELDS = (
 )  # fmt: skip
 """Names of the fields about the accuracy and the cost of a result."""
 
-_HIDDEN_FIELDS = ("scene", "toml")
-"""Names of the fields that the page shows in another way."""
+_HIDDEN_FIELDS = ("scene", "toml", "before", "after", "verified")
+"""Names of the fields that the page shows in another way. The last three are machines of a search, without units; its table has
+them as columns, with the unit of each row."""
 
 _MAX_INLINE_ENTRIES = 12
 """Maximum number of entries of a list that fits into one cell."""

@@ -128,6 +128,12 @@ def test_wrong_input(tmp_path, capsys):
     assert "cannot be created" in capsys.readouterr().err
 
 
+def test_values_of_a_search_are_shown_with_their_units_only():
+    row = {"what": "speed", "unit": "rad/s", "before": 104.4, "after": 104.5}
+    page = Report("", {"before": {"omega": 104.4}, "after": {"omega": 104.5}, "verified": None, "table": [row]}, {}).html()
+    assert page.count("104.4") == page.count("104.5") == page.count("rad/s") == 1 and "omega" not in page
+
+
 @pytest.mark.parametrize("document", [{"measures": {"stroke": [0.002]}}, {"regimes": [{"measures": {"stroke": [0.002]}}]}])
 def test_measures_in_documents_of_commands_have_units(document):
     page = Report("", {**document, "natural_frequencies": [10.0]}, units_of_document(document, None)).html()
