@@ -13,7 +13,7 @@ import numpy as np
 from run_ups_by_scipy import TRUTH, accelerations, bound, ending_ramp, motor_run_up, ramp, record, scene_of
 
 import jaxvib as jv
-from repeated_records import jammed, supports
+from repeated_records import jammed, linearized, supports
 
 TIMES = 0.016 * np.arange(1000)
 NOISE, JAMMED_NOISE = 0.05, 0.2
@@ -56,7 +56,7 @@ class Repeated:
 
     **Attributes** (r records, p numbers): `away` (r, p), distances from the truth relative to the standard error; `relative`
     (r, p), relative errors; `bound` (p,), Cramer-Rao bound; `statuses` (r,); `linear` (r, p), relative errors of the linearized
-    fit to the same noise, computed for records with nonlinear supports only.
+    fit to the same noise, computed for nonlinear supports and for jammed balls with white noise only.
     """
 
     away: np.ndarray
@@ -154,12 +154,13 @@ def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None
     true, statuses = np.array([truth[name] for name in order]), np.array([each["status"] for each in fits])
     values, errors = np.moveaxis(np.array([list(each["estimates"].values()) for each in fits]), 2, 0)
     away, relative = (values - true) / errors, values / true - 1.0
+    linear, is_white = None, options.keys() <= {"impact"}
     options.pop("full_scale", None)
-    linear = None
-    if support:
-        estimates, clean = supports.estimator(support, order), supports.clean_motion(support)
-        least = supports.bound(estimates, NOISE)
-        linear = np.array([supports.linear_errors(estimates, run, clean) for run in runs])
+    if support or (balls and is_white):
+        estimates = supports.estimator_of_supports(support, order) if support else jammed.estimator_of_loads(order, **options)
+        clean = supports.clean_motion(support) if support else jammed.clean(**options)
+        least = linearized.bound(estimates, NOISE if support else JAMMED_NOISE)
+        linear = np.array([linearized.linear_errors(estimates, run, clean) for run in runs])
     else:
         least = jammed.bound(order, JAMMED_NOISE, **options) if balls else _bound(turning, **options)
     return Repeated(away, relative, least, statuses, linear)

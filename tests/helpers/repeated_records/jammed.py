@@ -8,6 +8,7 @@ from run_ups_by_scipy import record
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
+from repeated_records.linearized import estimator, used_samples
 
 TRUTH = MACHINE | {"loads.mass": 0.8, "loads.drag": 1.5}
 """Numbers of the machine, and of each of two balls on a track of 0.12 m."""
@@ -68,11 +69,9 @@ def clean(impact=0.1, added=0.0, drag=1.5):
     return accelerations([numbers], [first_state(impact)], [PHASE])[0]
 
 
-def bound(names, noise, impact=0.1, color=0.0, outliers=0.0):
-    """Return the Cramer-Rao bound of the relative standard errors of `names`; states, offsets and phase are free.
-
-    The noise is that of `record`, and the places of the outliers are known.
-    """
+def _slopes(names, impact):
+    """Return the derivatives (n, 2, unknowns) of the readings with respect to the logarithms of `names`, the states at the
+    start, the phase of the unbalance and the offsets."""
     step, numbers, starts, phases = 1e-5, [], [], []
     for sign in (1.0, -1.0):
         for name in names:
@@ -88,10 +87,23 @@ def bound(names, noise, impact=0.1, color=0.0, outliers=0.0):
         phases.append(PHASE + sign * step)
     high, low = np.split(accelerations(numbers, starts, phases), 2)
     columns = [*((high - low) / (2.0 * step)), *np.repeat(np.eye(2)[:, None], TIMES.size, axis=1)]
-    slopes = np.stack(columns, axis=-1)
+    return np.stack(columns, axis=-1)
+
+
+def estimator_of_loads(names, impact=0.1):
+    """Return the `estimator` of the relative errors of `names`; states, offsets and phase are free."""
+    return estimator(_slopes(names, impact), used_samples(TIMES, turning), len(names))
+
+
+def bound(names, noise, impact=0.1, color=0.0, outliers=0.0):
+    """Return the Cramer-Rao bound of the relative standard errors of `names`; states, offsets and phase are free.
+
+    The noise is that of `record`, and the places of the outliers are known.
+    """
+    slopes = _slopes(names, impact)[used_samples(TIMES, turning)]
     slopes[1:] -= color * slopes[:-1]
     slopes[0] *= np.sqrt(1.0 - color**2)
-    slopes = slopes.reshape(-1, len(columns)) * np.sqrt((1.0 - outliers) / (1.0 - color**2)) / noise
+    slopes = slopes.reshape(-1, slopes.shape[2]) * np.sqrt((1.0 - outliers) / (1.0 - color**2)) / noise
     scale = np.linalg.norm(slopes, axis=0)
     covariance = np.linalg.inv((slopes / scale).T @ (slopes / scale)) / np.outer(scale, scale)
     return np.sqrt(np.diagonal(covariance)[: len(names)])

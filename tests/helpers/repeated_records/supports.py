@@ -4,11 +4,12 @@ import functools
 
 import numpy as np
 from run_ups_by_scipy import TRUTH as MACHINE
-from run_ups_by_scipy import pulse_times, ramp, record
+from run_ups_by_scipy import ramp, record
 from run_ups_by_scipy import scene_of as linear_scene_of
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
+from repeated_records.linearized import estimator, used_samples
 
 STOP = {"effects.stop[0].stiffness": 3e5, "effects.stop[0].gap": 1e-3, "effects.stop[0].damping": 100.0}
 """Stop on both sides of the second mass. Both resonances press against it."""
@@ -72,12 +73,10 @@ def motion(numbers, first=(0.0,) * 4, phase=0.4, times=TIMES, turning=ramp):
     return np.array(found)
 
 
-def estimator(kind, names, times=TIMES):
-    """Return the matrix (numbers, n, 2) from the noise of a record to the relative errors of `names` in the linearized fit.
+def estimator_of_supports(kind, names, times=TIMES):
+    """Return the `estimator` of the relative errors of `names`; states, offsets and phase are free.
 
-    The derivatives of the motion are differences of those by SciPy; states, offsets and phase are free. The rows for white
-    noise of standard deviation 1 have the lengths of the Cramer-Rao bound. Samples before the first pulse do not count,
-    because the angle of the rotor is unknown.
+    The derivatives of the motion are differences of those by SciPy.
     """
     step, numbers, columns = 1e-4, truth(kind), []
     for name in names:
@@ -88,21 +87,7 @@ def estimator(kind, names, times=TIMES):
         columns.append((high - low) / (2.0 * step))
     high, low = (motion(numbers, phase=0.4 + sign * step, times=times) for sign in (1.0, -1.0))
     columns += [(high - low) / (2.0 * step), *np.repeat(np.eye(2)[:, None], times.size, axis=1)]
-    used = times >= pulse_times(ramp, float(times[-1]), 24)[1][0]
-    slopes = (np.stack(columns, axis=-1) * used[:, None, None]).reshape(-1, len(columns))
-    scale = np.linalg.norm(slopes, axis=0)
-    return (np.linalg.pinv(slopes / scale) / scale[:, None])[: len(names)].reshape(-1, times.size, 2)
-
-
-def bound(estimates, noise):
-    """Return the Cramer-Rao bound of the relative standard errors for an `estimator` and white noise, m/s^2."""
-    return noise * np.linalg.norm(estimates, axis=(1, 2))
-
-
-def linear_errors(estimates, run, clean):
-    """Return the relative errors of the linearized fit by an `estimator` to a record of the `clean` accelerations (n, 2)."""
-    readings = np.stack([run.values[name] for name in ("a1", "a2")], axis=1)
-    return np.einsum("kij,ij->k", estimates, readings - clean)
+    return estimator(np.stack(columns, axis=-1), used_samples(times, ramp), len(names))
 
 
 @functools.cache

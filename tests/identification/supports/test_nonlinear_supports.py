@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from repeated_records.fits import NAMES, SUPPORT_CASES, repeated
-from repeated_records.supports import STOP, TIMES, bound, estimator, linear_errors, motion, scene_of, support_record, truth
+from repeated_records.linearized import bound, linear_errors
+from repeated_records.supports import STOP, TIMES, estimator_of_supports, motion, scene_of, support_record, truth
 from run_ups_by_scipy import Ramp, ramp
 
 import jaxvib as jv
@@ -259,7 +260,7 @@ def test_friction_of_a_support_is_found():
     fit = jv.identify(scene_of(numbers), run, unknown=names)
     assert fit.status_name == "found"
     true, found = np.array([truth("friction")[name] for name in fit.names]), np.array([each.value for each in fit.estimates])
-    estimates = estimator("friction", fit.names, SHORT)
+    estimates = estimator_of_supports("friction", fit.names, SHORT)
     least = bound(estimates, LOW_NOISE)
     np.testing.assert_allclose([each.error for each in fit.estimates], least * true, rtol=0.05)
     linear = linear_errors(estimates, run, motion(truth("friction"), times=SHORT))
