@@ -206,11 +206,17 @@ class Synthesis(Result):
         starts = f"{self.starts} starts chosen from {self.drawn} designs"
         counted = f"{starts}, {self.converged} converged, {self.same} to the best machine"
         lines = [f"{objective_text(self.objective)}: {self.message}", counted]
-        lines += [" ".join(line) for line in _align_columns([["", "before", "after", "exact", "verified"], *self.rows()])]
+        lines += [" ".join(line) for line in _align_columns(self.columns())]
         if self.unverified:
             lines.append(f"  not verified: {self.unverified}")
         lines += self.findings()
         return "\n".join(line.rstrip() for line in lines)
+
+    def columns(self) -> list[list[str]]:
+        """Return the header of the table and its `rows`, without columns that are empty."""
+        heads, rows = ["", "before", "after", "exact", "verified"], self.rows()
+        shown = [k for k in range(len(heads)) if k < 3 or any(row[k] for row in rows)]
+        return [[row[k] for k in shown] for row in (heads, *rows)]
 
     def rows(self) -> list[list[str]]:
         """Return the table as text in practical units: name, before, after, by the exact motion, by time integration."""

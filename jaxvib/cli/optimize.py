@@ -129,10 +129,8 @@ def _text(best: Synthesis) -> str:
 
     starts = f"{best.starts} starts chosen from {best.drawn} designs"
     counts = f"{starts}, {best.converged} converged, {best.same} to the best machine"
-    rows = best.rows()
-    heads = ["", "before", "after", "exact", "verified"]
-    columns = [k for k in range(len(heads)) if k < 3 or any(row[k] for row in rows)]
-    quantities = table(objective_text(best.objective), [heads[k] for k in columns], [[row[k] for k in columns] for row in rows])
+    heads, *rows = best.columns()
+    quantities = table(objective_text(best.objective), heads, rows)
     verification = "verified by the full equations, integrated until the motion settled"
     if best.verified is None:
         verification = f"not verified: {best.unverified}"

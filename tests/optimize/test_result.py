@@ -65,6 +65,7 @@ def test_rows_are_in_units_of_the_largest_value(searched):
         and "2 starts chosen from 2 designs, 2 converged, 2 to" in summary[1]
     )
     assert "  not verified: not requested" in summary
+    assert summary[2].split() == ["before", "after", "exact"]  # without a column of blanks
     columns = [line.index(word) + len(word) for line, word in zip(summary[2:5], ("before", "0.5", "-3"), strict=True)]
     assert len(set(columns)) == 1
     assert objective_text("negative foundation_force") == "greatest foundation force"
