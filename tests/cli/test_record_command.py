@@ -51,7 +51,7 @@ def test_recording_is_described_by_a_text(typed):
         (("run.csv", "--pulses", "key"), "pulses is 'key'; the channels are 'frame', 'tacho', 'n'"),
         (("run.csv", "--speed", "frame"), "speed is 'frame', which is in 'g'; give a channel in rpm, rad/s or Hz"),
         (("run.csv", "--rate", "2 kg"), "rate is '2 kg', which is not in Hz"),
-        (("run.csv", "--pulses", "n"), "channel 'n' has 1 pulses; at least 12 are needed"),
+        (("run.csv", "--pulses", "n"), "channel 'n' has 1 pulse; at least 12 are needed"),
     ],
 )
 def test_wrong_commands(typed, words, says):

@@ -151,6 +151,16 @@ def test_one_column_takes_its_rate_from_a_remark(tmp_path, line):
     assert run.rate("frame") == pytest.approx(2000.0) and run.values["frame"].size == T.size
 
 
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_names_in_a_comment_are_read(tmp_path, mark):
+    rows = np.column_stack([1e3 * T, FRAME])
+    head = mark.join(["time (ms)", "frame (g)"])
+    np.savetxt(tmp_path / "run.csv", rows, delimiter=mark, header=f"recorder 7, state ready\n{head}\n2 channels")
+    run = jv.read_run(tmp_path / "run.csv", CHANNELS[:1])
+    np.testing.assert_allclose(run.times["frame"], T, atol=1e-9)
+    np.testing.assert_allclose(run.values["frame"], 9.80665 * FRAME, atol=1e-6)
+
+
 def test_rate_replaces_times_of_the_file(tmp_path):
     path = tmp_path / "run.csv"
     path.write_text("time (s),frame\n" + "".join(f"{t:.2f},{x:.6f}\n" for t, x in zip(T, FRAME, strict=True)))

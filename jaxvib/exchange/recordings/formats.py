@@ -19,7 +19,7 @@ import numpy as np
 from jaxvib.errors import InputError, open_regular, optional_module, quoted
 from jaxvib.exchange.uff import read_uff
 from jaxvib.identification.records.recorded import Recorded
-from jaxvib.results.table import read_table
+from jaxvib.results.table import TextTable, read_table
 from jaxvib.units.columns import split_head, unit_factor
 
 _MAX_BYTES = 2**32
@@ -98,12 +98,13 @@ def _with_unique_names(channels: list[Recorded]) -> list[Recorded]:
 
 def _read_text(path: Path, rate: float | None) -> Iterator[Recorded]:
     table = read_table(path, "time and readings")
-    heads = table.heads or [f"column {k + 1}" for k in range(table.width)]
+    named = table.heads or _commented_heads(table)
+    heads = named or [f"column {k + 1}" for k in range(table.width)]
     split = [split_head(head, "s") for head in heads]
     if table.units:
         split = [(name, unit or below) for (name, unit), below in zip(split, table.units, strict=True)]
     clocks = _clocks(split)
-    if not table.heads and table.width > 1 and rate is None:
+    if not named and table.width > 1 and rate is None:
         clocks = [0]
     if rate is None and not clocks:
         rate = _stated_rate(table.remarks, path)
@@ -129,6 +130,16 @@ def _read_text(path: Path, rate: float | None) -> Iterator[Recorded]:
         time = np.arange(len(values)) / rate
     for n, k in enumerate(places):
         yield Recorded(split[k][0], split[k][1], time, values[:, n])
+
+
+def _commented_heads(table: TextTable) -> list[str]:
+    """Return the names of the columns from a line that begins with #, as NumPy writes it: one name for each column, one of them
+    that of the times. Return an empty list without such a line."""
+    for line in reversed(table.remarks):
+        cells = [cell.strip().strip('"') for cell in line.split(table.mark)]
+        if len(cells) == table.width > 1 and _clocks([split_head(cell, "s") for cell in cells]):
+            return cells
+    return []
 
 
 def _clocks(columns: Sequence[tuple[str, str]]) -> list[int]:
