@@ -19,9 +19,10 @@ from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drives.controlled import SwitchedOff
-from jaxvib.machine.drives.drive import Motor
-from jaxvib.machine.effects.base import static_imbalances, total_gravity
+from jaxvib.machine.drives.drive import Drive, Motor
+from jaxvib.machine.effects.base import Effect, static_imbalances, total_gravity
 from jaxvib.machine.files import rebuild_part
+from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import MAX_USUAL_SPEED, Exciter, Scene, read_unbalance, require_comparable
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.runtime.devices import float_dtype
@@ -55,6 +56,7 @@ def validate_scene(scene: Scene) -> Scene:
     precision = float_dtype()
     if _VALID_SCENES.get((id(scene), precision)) is scene:
         return scene
+    _require_parts(scene)
     leaves, structure = jax.tree_util.tree_flatten_with_path(scene)
     one = ".exciters[0]" if len(scene.exciters) == 1 else "-"
     arrays = [_number(f"scene{jax.tree_util.keystr(path).removeprefix(one)}", leaf) for path, leaf in leaves]
@@ -71,6 +73,22 @@ def validate_scene(scene: Scene) -> Scene:
                 _require_valid(_SceneKey(numbers, scene))
         _VALID_SCENES[id(scene), precision] = scene
     return scene
+
+
+def _require_parts(scene: Scene) -> None:
+    """**Raises** `InputError` for an object of another class in place of a part of the scene."""
+    for name, value, kind in (("exciters", scene.exciters, Exciter), ("effects", scene.effects, Effect)):
+        if not isinstance(value, tuple) or not all(isinstance(each, kind) for each in value):
+            raise InputError(f"scene.{name}", f"is {quoted(value)}; it must be a tuple of objects of the class {kind.__name__}")
+    if not scene.exciters:
+        raise InputError("scene.exciters", "is empty; at least one Exciter is needed")
+    parts: list[tuple[str, object, type]] = [("machine", scene.machine, Machine)]
+    for k, exciter in enumerate(scene.exciters):
+        parts.append((f"{scene.prefix_of(k)}drive", exciter.drive, Drive))
+        parts += [] if exciter.loads is None else [(f"{scene.prefix_of(k)}loads", exciter.loads, Loads)]
+    for name, value, kind in parts:
+        if not isinstance(value, kind):
+            raise InputError(name, f"is {quoted(value)}; it must be an object of the class {kind.__name__}")
 
 
 def require_double(scene: Scene, purpose: str) -> Scene:
@@ -394,7 +412,7 @@ def _number(name: str, leaf: object) -> Array:
     if not isinstance(leaf, jax.Array) or leaf.dtype != float_dtype():
         try:
             leaf = jnp.asarray(leaf, dtype=float)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError(name, f"is {quoted(leaf)}, which is not a number; give a number in SI units") from error
     when_known(functools.partial(_require_finite, name), leaf)
     return leaf

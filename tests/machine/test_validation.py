@@ -254,3 +254,23 @@ def test_equal_motors_that_cannot_start_have_one_note():
     assert start_notes(scene, [1, 3]) == [fourth]
     group = jv.synchronous_regimes(scene, masses=[1, 3]).summary()
     assert group.count("cannot start") == 1 and fourth in group
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "says"),
+    [
+        (lambda s: s.machine, None, "machine is None; it must be an object of the class Machine"),
+        (lambda s: s.exciters[0].drive, None, "drive is None; it must be an object of the class Drive"),
+        (lambda s: s.exciters[0].drive, "dc", "drive is 'dc'; it must be an object of the class Drive"),
+        (lambda s: s.exciters[0].loads, 1.0, "loads is 1.0; it must be an object of the class Loads"),
+        (lambda s: s.exciters, (), "scene.exciters is empty; at least one Exciter is needed"),
+        (lambda s: s.exciters, None, "scene.exciters is None; it must be a tuple of objects of the class Exciter"),
+        (lambda s: s.exciters, (1,), "scene.exciters is (1,); it must be a tuple of objects of the class Exciter"),
+        (lambda s: s.effects, None, "scene.effects is None; it must be a tuple of objects of the class Effect"),
+        (lambda s: s.effects, (1,), "scene.effects is (1,); it must be a tuple of objects of the class Effect"),
+        (lambda s: s.loads.drag, 10**400, "scene.loads.drag is a whole number of 1329 bits, which is not a number"),
+    ],
+)
+def test_other_objects_in_place_of_parts_are_refused(where, value, says):
+    with pytest.raises(jv.InputError, match=f"^{re.escape(says)}"):
+        validate_scene(changed(where, value))
