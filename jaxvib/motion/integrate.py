@@ -169,7 +169,7 @@ class IntegrationPlan(NamedTuple):
 
     - `solver` of diffrax, None for the method of order 8 in its fastest form
     - `control` of the steps; `max_steps`
-    - `adjoint` of diffrax, None for step replay
+    - `adjoint` of diffrax, None for that of `jaxvib.ode.replay`, which differentiates the steps that were taken
     - `samples`: number of stored states of the whole run, 0 for none
     - `periods`: length of the measuring window in periods of the slowest motion
     - `bounds`, see `frequency_bounds`
@@ -375,7 +375,7 @@ def whole_turns(scene: Scene, segment: float) -> float:
     if not speeds:
         return segment
     if len(speeds) > 1:
-        problem = f"have unbalances or supplies at {speeds} rad/s and no common period; use simulate, or other motors"
+        problem = f"have unbalances or supplies at {speeds} rad/s; these must be equal; use simulate, or other motors"
         raise InputError("exciters", problem)
     turn = 2.0 * math.pi / speeds[0]
     turns = segment / turn

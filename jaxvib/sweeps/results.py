@@ -25,8 +25,8 @@ def results_table(store: str | Path) -> tuple[str, list[str], list[list[str]]]:
     """Return the results of a study as title, headers and rows of a table, in display units.
 
     A study with at most 40 cases has a row for each finished case, in which absent quantities are empty. For more cases the
-    table has a row for each measure with numbers: smallest value, median and largest value. For more than a million cases the
-    table is empty.
+    table has a row for each numerical measure, with its smallest value, its median and its largest value. For more than a
+    million cases the table is empty.
     """
     opened = Store(Path(store))
     if np.prod(opened.shape, dtype=np.int64) > _MAX_READ:

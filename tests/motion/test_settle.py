@@ -61,7 +61,7 @@ def test_a_segment_is_a_whole_number_of_periods_of_the_supply():
         return jv.Scene(body, exciters=[jv.Exciter(drive=motor(each), unbalance=0.1) for each in frequencies])
 
     np.testing.assert_allclose(whole_turns(screen("50 Hz", "50 Hz"), 0.99), 0.98, rtol=1e-12)
-    with pytest.raises(jv.InputError, match=r"^exciters have unbalances or supplies at .* and no common period"):
+    with pytest.raises(jv.InputError, match=r"^exciters have unbalances or supplies at .* rad/s; these must be equal"):
         whole_turns(screen("50 Hz", "60 Hz"), 0.99)
 
 

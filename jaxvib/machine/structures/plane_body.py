@@ -189,7 +189,8 @@ class _Bodies(Machine):
     def moment_rows(self, about: Array) -> Array:
         """Return the rows (2, nd), see `Machine.moment_rows`.
 
-        **Raises** `InputError` unless exactly one body stands on the foundation: the distances of several are not known.
+        **Raises** `InputError` unless exactly one body stands on the foundation: the distances between several bodies
+        are not known.
         """
         on_foundation = [each for each in self.supports if each.to is None]
         bodies = sorted({each.body for each in on_foundation})

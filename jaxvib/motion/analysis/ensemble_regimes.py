@@ -119,9 +119,9 @@ class EnsembleRegimes(Result):
     """Regimes in which the runs of an `Ensemble` of machines with several exciters end, the most frequent first.
 
     Returned by `Ensemble.regimes`. A rotating mass is a load, or the rotor of an exciter without loads. Two runs have the same
-    regime if the same masses turn at one speed, if the same resonances catch the same masses, and if their phases belong to one
-    range: phases of different regimes are separated by at least 45 degrees without a run. Runs that differ by an exchange of
-    equal loads of one exciter have the same regime.
+    regime if the same masses turn at one speed, if the same resonances catch the same masses, and if the phase of each mass
+    lies in the same range. Two ranges of a phase are separated by a gap of at least 45 degrees in which no run has its phase.
+    Runs that differ by an exchange of equal loads of one exciter have the same regime.
 
     **Attributes** (n regimes, B runs)
 

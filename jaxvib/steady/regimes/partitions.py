@@ -5,10 +5,11 @@ speeds, with the amplitude
 
     T_ik = (S_i S_k / 2) w_k^4 |H_ik(w_k)|
 
-where w_i is the speed of mass i, S_i its unbalance, and H_ik the influence coefficient of the masses (see `local`). It changes
-the speed of mass i, whose inertia is I_i and whose driving torque has the slope L_i' = dL_i/dw_i, with the amplitude
-T_ik/sqrt((d I_i)^2 + L_i'^2) at the difference d = w_k - w_i. The groups are independent if this change is small compared with
-d. The ratios are added over the masses k of all other groups. The `interaction` of a motion is the largest of these sums.
+where w_i is the speed of mass i, S_i its unbalance, and H_ik the influence coefficient of the masses (see `local`). The torque
+changes the speed of mass i, whose inertia is I_i and whose driving torque has the slope L_i' = dL_i/dw_i. The change alternates
+at the difference d = w_k - w_i, with the amplitude T_ik/sqrt((d I_i)^2 + L_i'^2). The groups are independent if this amplitude
+is small compared with |d|. For each mass i, the ratios of amplitude to |d| are added over the masses k of all other groups. The
+`interaction` of a motion is the largest of these sums.
 """
 
 from __future__ import annotations
@@ -73,8 +74,8 @@ class RegimePartitions(Result):
     - `group` (n, mass): number of the group of each rotating mass, from 0
     - `speed` (n, mass), rad/s, and `phases` (n, mass), rad, of each rotating mass; the phases of a group are those of a
       `SynchronousRegime` of the group
-    - `growth` (n,), 1/s: the largest of all groups; `stable` (n,): True if it is negative by more than a rounding
-      error
+    - `growth` (n,), 1/s: the largest growth rate of a small disturbance of any group, see `SynchronousRegime`; `stable` (n,):
+      True if it is negative by more than a rounding error
     - `interaction` (n,): estimated relative error of the differences of the speeds; the error arises because groups act on each
       other. It is 0 for a single group; typical: 1e-4 to 0.3
     - `scene`

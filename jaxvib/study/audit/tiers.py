@@ -126,9 +126,12 @@ def _call(
 class Tier(NamedTuple):
     """Method to compute a jam.
 
-    **Attributes**: `name`; `purpose`: text; `require(scene)` raises `InputError` if the tier does not support the scene; the
-    message names the part and the reason; `jam(scene, mode, until)` returns the result for a jam mode, where the averaged
-    equations are integrated to the time `until`, s; None for the full equations, which start from the state of the comparison.
+    **Attributes**
+
+    - `name`; `purpose`: text
+    - `require(scene)` raises `InputError` if the tier does not support the scene; the message names the part and the reason
+    - `jam(scene, mode, until)` returns the result for the jam mode with number `mode`. Only the averaged equations use `until`,
+      s: they are integrated up to this time. `jam` is None for the full equations, which start from the state of the comparison
     """
 
     name: str
