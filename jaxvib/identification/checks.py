@@ -15,8 +15,9 @@ from jaxvib.identification.records.orders import foreign_vibration
 from jaxvib.identification.torque import MAX_MISFIT
 
 SIGNIFICANCE_LEVEL = 1e-5
-"""p-value below which residuals are not noise, and below which a run deviates from other runs. Each test of pure noise (of a
-channel, for the angle of the rotor or of jammed loads) causes the status `patterned` with this probability."""
+"""p-value below which residuals are not noise, and below which a run deviates from other runs. A channel is tested for
+the angle of the rotor and for that of jammed loads. If its residuals are pure noise, each of these tests causes the status
+`patterned` with this probability."""
 
 _ANGLE_NAMES = ("the rotor's angle", "the angle of the jammed loads")
 
@@ -106,9 +107,9 @@ def status_of(fitted: Fitted, information: Information) -> tuple[FitStatus, floa
             if shares[k][c] > _ANGLE_SHARE:
                 is_inaccurate = True
                 notes.append(
-                    f"a part of the error of the rotor's angle in run {k + 1}, {fitted.problem.angle_errors[k]:.2g} rad, is "
-                    f"not in the intervals, and it is {shares[k][c]:.0%} of the residuals of channel {channel.name!r}: use "
-                    "more pulses per turn, or sample them faster"
+                    f"the intervals do not include an error of {fitted.problem.angle_errors[k]:.2g} rad of the rotor's angle "
+                    f"in run {k + 1}, which causes {shares[k][c]:.0%} of the residuals of channel {channel.name!r}: use more "
+                    "pulses per turn, or sample them faster"
                 )
             if fitted.outliers[k][c]:
                 notes.append(

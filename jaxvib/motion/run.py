@@ -154,8 +154,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """Largest displacement of each coordinate from static equilibrium during the run, (nd,), m (rad for tilts); NaN for a
         run that failed.
 
-        A parabola estimates the value between the stored states. It is too small by at most 6e-4 with 16 states in a period,
-        and by at most 9e-3 with 8.
+        A parabola estimates the maximum between the stored states. For a sinusoidal motion the estimate is too small by at most
+        6e-4 of the amplitude with 16 states in a period, and by at most 9e-3 with 8.
         """
         return sampled_maximum(jnp.abs(self._stored.state.displacement), axis=-2)
 
@@ -163,8 +163,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
     def largest_force(self) -> Array:
         """Largest magnitude of the force on the foundation during the run, N; NaN if the run failed.
 
-        It is found between the stored states as `largest_displacement`. In two directions this is the largest length of the
-        vector, not the root of the sum of both squared peaks, which is `foundation_force`.
+        The maximum between the stored states is estimated as for `largest_displacement`. In two directions this is the largest
+        length of the vector, not the root of the sum of both squared peaks, which is `foundation_force`.
         """
         square = jnp.sum(self._stored.foundation_force**2, axis=-1)
         zero = square == 0.0  # where the square root has no derivative
@@ -178,7 +178,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def _has_end(self) -> bool:
-        """True unless the run failed, so that the states of its window are unknown."""
+        """True if the states of the window are known; False for a run that failed."""
         return all(np.all(np.isfinite(np.asarray(values))) for values in (self.window.time, self.window.state.displacement))
 
     @property

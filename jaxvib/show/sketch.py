@@ -36,8 +36,9 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
 
     Platforms are drawn above each other, numbered from the foundation upward, with all their exciters. A rotor is drawn as seen
     along its axis, a rotor with tilt also as seen from the side. Loads are spread over their circle so that each is visible.
-    Only the positions of the loads, and the size of loads with a `ball_radius`, are to scale. A body in a plane is drawn to
-    scale, with an outline around its centre of mass, its supports and its exciters, and with its springs in their directions.
+    Platforms and rotors are not to scale, except for the circles of the loads and the size of loads with a `ball_radius`; very
+    small ones are enlarged. A body in a plane is drawn to scale, with an outline around its centre of mass, its supports and
+    its exciters, and with its springs in their directions.
 
     **Arguments**
 

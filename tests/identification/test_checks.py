@@ -222,7 +222,7 @@ def outcome(monkeypatch, **changes):
             {"shares": (0.0, 0.12)},
             "patterned",
             0.3,
-            ["angle in run 1, 0.05 rad, is not in the intervals, and it is 12% of the"],
+            ["an error of 0.05 rad of the rotor's angle in run 1, which causes 12% of the"],
         ),
         ({"shares": (0.0, 0.09)}, "found", 0.3, []),
         ({"misfits": (0.9, 2.1)}, "patterned", 0.3, ["run 2 deviates from the torque balance of its motor by 2.1"]),

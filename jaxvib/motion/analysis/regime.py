@@ -156,8 +156,8 @@ class Regime(Result):
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Plot the loads on a circle at their `phase`, relative to the first load or to the rotor.
 
-        Arrows show the mean of the loads, and the `imbalance` of a rotor with which all loads turn. The title states the
-        remaining unbalance, which for a rotor that tilts includes moments; the arrows do not include them.
+        An arrow shows the mean of the loads. If all loads turn with the rotor, a second arrow shows the `imbalance` of the
+        rotor, and the title states the remaining unbalance. For a rotor that tilts this includes moments, unlike the arrows.
         """
         from jaxvib.draw.results import phase_circles  # slow import
 
@@ -178,7 +178,7 @@ def regime(scene: Scene, segment: Trajectory) -> Regime:
     - Loads turn with the rotor if their mean speed differs from the rotor speed by less than 0.3 %, unless they fall behind
       steadily: by more than 0.1 rad over the part, with lags in its two halves that agree within 2 %
     - They balance the rotor if the residual unbalance of loads and rotor together is less than 2 % of the unbalance of the
-      loads (static, and about tilts if the loads have stations)
+      loads. For a rotor that tilts the same applies to their moments
     - Loads that all turn at another speed with constant relative phases are jammed
     - A motion is not steady if the speed of a load changes by more than 0.3 % of the rotor speed from one half of the part to
       the other

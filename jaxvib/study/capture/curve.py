@@ -36,8 +36,9 @@ class ThresholdCurve(Result):
     - `least` (V,): the lowest speed at which a start was captured, NaN if there is none. If it is below the threshold, both
       captures and failures occur between this speed and the threshold
     - `last_change` (V,): change of the threshold by the last doubling of the steps
-    - `converged` (V,): False if this change was larger than the `resolution`, or without one than the spacing of the speeds
-    - `turns` of the rotor of each run
+    - `converged` (V,): False if this change was larger than the `resolution` or, if no `resolution` was given, larger than the
+      distance between neighbouring speeds
+    - `turns`: number of turns of the rotor in each run
     """
 
     status = Computed.done
