@@ -217,7 +217,7 @@ def _programs(scene: Scene, equations: Equations, events: bool, parameters: int)
         tangents = scalar_program(tangent, *arguments, *arguments[2:]), scalar_program(full_tangent, *arguments, *arguments)
     except NotScalarizable as error:
         problem = f"needs the operation {str(error)!r} of JAX, which is not available for scalars"
-        remedy = "write the part that needs it by other operations, such as jnp.stack in place of .at[].set, or remove the part"
+        remedy = "write the part of the scene with other operations, such as jnp.stack in place of .at[].set, or remove it"
         raise InputError("scene", f"{problem}; {remedy}") from error
     numbers, number_seeds = ([f"{name}[{k}]" for k in range(parameters)] for name in ("p", "p_seed"))
     count = {"x": len(equations.state_signals), "u": len(equations.input_signals), "y": len(equations.output_signals)}
@@ -370,8 +370,9 @@ def _compile(files: dict[str, bytes], fmi: Fmi, identifier: str) -> tuple[dict[s
     folders = _PLATFORMS.get((platform.system(), platform.machine()))
     compiler = next(filter(None, map(shutil.which, filter(None, (os.environ.get("CC"), *_COMPILERS)))), None)
     if folders is None or compiler is None:
-        missing = "a C compiler (CC, cc, gcc or clang)" if compiler is None else "a name of this platform in FMI"
-        return None, f"source only: {missing} was not found; the tool that reads the file has to compile it"
+        no_compiler, no_platform = "a C compiler (CC, cc, gcc or clang) was not found", "this platform is not supported"
+        reason = no_compiler if compiler is None else no_platform
+        return None, f"source only: {reason}; the tool that reads the file has to compile it"
     folder = folders[0] if fmi == "2.0" else folders[1]
     with tempfile.TemporaryDirectory() as home:
         for name, content in files.items():

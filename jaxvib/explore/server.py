@@ -1,4 +1,4 @@
-"""Server of the page, which listens only on this computer.
+"""Server of the page of `jaxvib explore`. It listens only on this computer.
 
 A browser lets every open web site send requests to servers on the same computer. The address of the page therefore contains a
 random token, and a request is answered only if it has that token, names this computer as its host, and comes from the page.
@@ -63,11 +63,13 @@ def require_free(port: int) -> None:
 
 
 def guarded(page: _Page, token: str, port: int) -> _Page:
-    """Return an ASGI application that forwards only requests to `/token/` from the page itself; others receive an empty 404.
+    """Return an ASGI application that forwards only requests to `/token/` from the page itself.
+
+    Other requests receive an empty 404, and other websockets are refused.
 
     The header Host must name this computer and `port`. This rejects sites whose name points to this computer (DNS rebinding).
-    Browsers add the header Origin to requests of other sites and to all websockets; if the header is present, it must agree
-    with Host.
+    Browsers add the header Origin to all websockets, and to those requests of other sites that send data or read the answer;
+    if the header is present, it must agree with Host.
     """
     hosts = [f"{name}:{port}".encode() for name in (_HOST, "localhost")]
 

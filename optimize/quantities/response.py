@@ -142,7 +142,7 @@ def response_amplitude(
     **Arguments**
 
     - `at`: the number of a platform, a distance along a rotor's axis, m, or the point (x, y) of a body, m; default: platform 1,
-      the common station of a rotor's loads, or the centre of mass
+      the common station of a rotor (with several stations its centre of mass), or the centre of mass of a body
     - `body`: number of the body from 0; typical: 0 (the default)
     - `speed`, rad/s or text, of all exciters; typical: 50 to 160 rad/s; default: the speed of `jaxvib.working_regime`
     - `between`: the lowest and the highest speed in place of `speed`, for the largest value in this range; typical:

@@ -1,5 +1,5 @@
-"""Motion of a machine with loads or nonlinear supports and a rotor of known angle, at the samples of a record, and its
-derivatives.
+"""Motion, at the samples of a record, of a machine that has loads or nonlinear supports and whose rotor angle is known, and
+derivatives of this motion.
 
 The state is y = (q, q', angles of the loads, their rates, states of high-pass filters). The exact equations of the scene are
 integrated by equal steps of order 8, over J segments of a record at once. A step also ends where the contact with a stop

@@ -130,15 +130,15 @@ class BalancedStates(Result):
     @property
     def share(self) -> np.ndarray:
         """Imbalance of the rotor in each plane of the loads, divided by the sum of m_j R_j there, (planes,): 0 for a balanced
-        rotor. Loads cannot cancel a share above 1, see `planes`."""
+        rotor. Loads cannot cancel a share above 1. `planes` lists the loads of each plane."""
         sides = _sides(turning_loads(self.scene))
         return np.array([abs(plane.imbalance) / np.sum(sides[plane.loads]) for plane in _planes(self.scene)])
 
     @property
     def capacity(self) -> np.ndarray:
-        """Largest imbalance of the rotor that the loads in each plane cancel, (planes,) kg m: the unbalance of all loads at one
-        angle, or of balls and rollers with a `ball_radius` side by side. If one load outweighs all others together, they do not
-        cancel small imbalances."""
+        """Largest imbalance of the rotor that the loads in each plane can cancel, (planes,) kg m: the unbalance of all loads at
+        one angle (balls and rollers with a `ball_radius`: side by side). If one load outweighs all others together, the loads
+        cannot cancel small imbalances."""
         sides, touching = _sides(turning_loads(self.scene)), _touching_angle(self.scene)
         chains = [sides[plane.loads] * np.exp(1j * touching * np.arange(plane.loads.size)) for plane in _planes(self.scene)]
         return np.array([abs(np.sum(chain)) for chain in chains])
@@ -422,8 +422,8 @@ def balanced_intervals(
     stable.
 
     The intervals are searched for on `points` speeds (typical: 200, the default), and their ends are refined by bisection to
-    1e-7 of the speed. An interval narrower than the spacing of the points can be missed. The intervals of the criterion for the
-    same range are `criterion(scene).balancing`. `angles` and `steps`: as for `balanced_stability`.
+    1e-7 of the speed. An interval narrower than the spacing of the points can be missed. The intervals of the criterion,
+    over all speeds, are `criterion(scene).balancing`. `angles` and `steps`: as for `balanced_stability`.
 
     **Returns** a list of pairs, rad/s, which is printed in the unit of `display_units`. **Raises** the errors of
     `balanced_stability`, and `InputError` for an empty range.

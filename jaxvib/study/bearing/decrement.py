@@ -222,7 +222,7 @@ def ten_periods(
       interval in this case
     - Dry friction is neglected. If it is present, it increases the result by 4 T_f/(pi w A) (torque T_f of the friction,
       amplitude A, frequency w), more for smaller swings. The attribute `drift` then differs from 0 by several standard errors,
-      and the interval does not contain mu1. `identify` determines both the viscous and the dry friction
+      and the interval is not valid for mu1. `identify` determines both the viscous and the dry friction
 
     **Arguments**
 

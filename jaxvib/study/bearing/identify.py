@@ -25,15 +25,16 @@ from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, Friction
 
 _MAX_HALF_PERIODS = 1.3
-"""Longest time, in half periods, before the first and after the last turning point in which the pendulum counts as swinging.
-If the time is longer, the record begins before the release or ends with the pendulum at rest. A swing needs at most 1.2."""
+"""Longest time, in half periods, from the first sample to the first turning point, or from the last turning point to the last
+sample, if the pendulum swings (a swing needs at most 1.2). If the time is longer, the record begins before the release, or ends
+with the pendulum at rest."""
 
 _PATTERN_PROBABILITY = 1e-5
 """Probability with which the F test of residuals that are pure noise gives the status `patterned`."""
 
 _MAX_FREQUENCY_DIFFERENCE = 0.05
-"""Relative difference of frequencies, in addition to instrument errors, above which errors of length and mass cannot explain
-it."""
+"""Largest relative difference between the fitted frequency and that of the pendulum, without the part due to the instruments,
+that errors of length and mass can explain. A larger difference gives the status `contradicted`."""
 
 
 class IdentifyStatus(eqx.Enumeration):
@@ -68,7 +69,8 @@ class Identified(Result):
     - `structure`: F statistic of the residuals for slow changes and for vibrations at the frequency of the swing and its
       multiples, about 1 for noise
     - `fitted` (n,): the fitted angles, rad
-    - `until`: time, s, after which the pendulum is at rest and the record was not used
+    - `until`: end of the used part of the record, s; after it the pendulum is at rest, its swing is below the noise, or the
+      record ends
     - `stopped_at`: time of the stop, s; NaN if the pendulum swings to the end
     - `width`: width over which the sign of dry friction was smoothed, rad/s (NaN without mu2)
     - `decrement`: result of the formula of ten periods for the same record, None if the record is too short
@@ -137,8 +139,9 @@ def identify_bearing(
       Levenberg and Marquardt's method with forward-mode derivatives through the integration
     - The frequency is a free parameter, because the dimensions of a pendulum are never known accurately enough to predict the
       phase of many swings; g is adapted to the frequency. J is taken from `pendulum`; therefore mu1 is proportional to this J
-    - Samples before the release and after the last clear turning point are not used. After this point the pendulum is at rest,
-      or its swing is below the noise. The position at which it comes to rest is not a smooth function of the friction
+    - Samples before the release are not used. If the record continues for more than 1.3 half periods after the last clear
+      turning point, the samples after this point are not used either: the pendulum is at rest, or its swing is below the noise.
+      The position at which it comes to rest is not a smooth function of the friction
     - `width` is 0.005 of the speed of the smallest swing. In this swing the dry friction then dissipates 0.001 % less energy
       than with a sudden change of its sign; the difference is smaller for larger swings
 
@@ -290,7 +293,7 @@ def _notes(result: Identified, *, is_patterned: bool) -> Iterator[str]:
     if is_patterned:
         yield "the residuals of the fit are not noise: the intervals include their correlation, but not the error of the law"
     if decrement is not None and decrement.is_drifting:
-        yield "the formula of ten periods assumes viscous friction only: here its interval does not contain mu1"
+        yield "the formula of ten periods assumes viscous friction only: here its interval is not valid for mu1"
 
 
 _LAWS = {"dry": "dry friction", "air": "drag of the air", "torque": "a constant torque"}
@@ -300,8 +303,7 @@ _CLEARLY = 4.0
 """Distance of a coefficient from 0, in standard errors, above which its part of the law is named."""
 
 _LESS_NOISE = 0.9
-"""Ratio of the residuals with further parts of the law to those without them, below which the larger law fits clearly
-better."""
+"""A law with further parts fits clearly better if it reduces the residuals to less than this fraction."""
 
 
 def _better_law(result: Identified, weight: Array, start: Unknowns, width: Array, steps: int) -> Iterator[str]:

@@ -197,10 +197,10 @@ def published_tables(
 
     Results:
 
-    - "printed": 35 of the 47 speeds are within 0.05 of the paper; "gap lever": 28 (`doublings=1`). The lever arm R_1 is
-      wrong, but it reproduces the tables more closely. At three of the smallest gaps with the lower friction, captures take
-      long: with n = 0.1 and a gap of 0.5 the lowest speed is -0.757 in 2000 turns and -0.865 in 4000 (paper: -0.857). At p =
-      0.010 and a gap of 5.1 failures occur among captures up to -0.87 (paper: -0.868), at other speeds with other steps
+    - "printed": 35 of the 47 speeds differ by less than 0.05 from the paper; "gap lever": 28 (`doublings=1`). The lever arm
+      R_1 is wrong, but it reproduces the tables more closely. At three of the smallest gaps with the lower friction, captures
+      take long: with n = 0.1 and a gap of 0.5 the lowest speed is -0.757 in 2000 turns and -0.865 in 4000 (paper: -0.857). At p
+      = 0.010 and a gap of 5.1 failures occur among captures up to -0.87 (paper: -0.868), at other speeds with other steps
     - "cosine", computed for two points with the gap as lever arm: no boundary changes by more than 0.002, except chaotic ones
     - "derived": no captures from speeds below -0.7, except isolated ones. The thresholds at p = 0.003 and 0.005 are 0.2 to 0.7
       above those of the paper, whose equations contain the rotation of the ball with f'^2 and not with f' (f' - w)
