@@ -292,7 +292,9 @@ def _problem(value: Any, kind: Any) -> str | InputError | None:
         return _problem_of_container(value, origin, inner)
     if isinstance(kind, type):
         if getattr(kind, "_is_protocol", False):
-            return None if not getattr(kind, "_is_runtime_protocol", False) or isinstance(value, kind) else "another object"
+            if not getattr(kind, "_is_runtime_protocol", False) or isinstance(value, kind):
+                return None
+            return f"an object with {' and '.join(name for name in vars(kind) if not name.startswith('_'))}"
         if kind is Callable or kind is types.FunctionType:
             return None if callable(value) else "a function"
         if kind.__module__ == "jaxtyping":

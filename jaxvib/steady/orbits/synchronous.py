@@ -5,7 +5,7 @@ Choices that depend on parameters of a scene are made on the host (`plan_synchro
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -75,6 +75,7 @@ class SynchronousStatus(eqx.Enumeration):
     refused = REFUSED
 
 
+@runtime_checkable
 class HasSpeedAndPhases(Protocol):
     """Motion with a speed and phases, such as a synchronous regime of the averaged theory."""
 
@@ -288,7 +289,8 @@ def plan_synchronous(
         raise InputError("regime", "is given together with speed or phases; leave one of them out")
     scene = validate_scene(scene)
     if regime is not None:
-        speed, phases = regime.speed, _phases_of_exciters(scene, regime)
+        speed = number(regime.speed, "rad/s", "regime.speed", low=0.0, open_low=True)
+        phases = _phases_of_exciters(scene, regime)
     require_terms(scene.all_effects, _SYNCHRONOUS_TERMS, "is|are not part of a synchronous motion")
     for k, exciter in enumerate(scene.exciters):
         _require_one_body(exciter, scene.prefix_of(k))
@@ -298,7 +300,7 @@ def plan_synchronous(
     if prescribed:
         start = prescribed[0].drive.speed
     elif speed is not None:
-        start = number(speed, "rad/s", "speed" if regime is None else "regime.speed", low=0.0, open_low=True)
+        start = number(speed, "rad/s", "speed", low=0.0, open_low=True)
     elif motors:
         start = jnp.mean(jnp.stack(motors))
     else:
@@ -326,7 +328,7 @@ def _phases_of_exciters(scene: Scene, regime: HasSpeedAndPhases) -> Array:
     **Raises** `InputError` for a regime of some of the masses, and for loads of one exciter at different phases.
     """
     owners = mass_owners(scene)
-    phases, masses = jnp.asarray(regime.phases), getattr(regime, "masses", None)
+    phases, masses = numbers(regime.phases, "rad", "regime.phases", None), getattr(regime, "masses", None)
     if masses is not None and masses.shape != owners.shape:
         raise InputError(
             "regime.masses", f"are {masses.size} of the scene's {owners.size} rotating masses; give a regime of all"

@@ -318,6 +318,14 @@ def test_wrong_input_ends_in_one_sentence(general):
         jv.synchronous_orbit(general, phases=[0.0, 1.0, 2.0])
     with pytest.raises(jv.InputError, match="regime is given together with speed"):
         jv.synchronous_orbit(general, jv.synchronous_orbit(general, phases=[0.0, 3.0]), speed=100.0)
+    for regime, problem in (
+        (1, "regime is 1; it must be an object with speed and phases"),
+        (SimpleNamespace(speed=100.0, phases=None), "regime.phases is None, which is not a number"),
+        (SimpleNamespace(speed=100.0, phases=[0.0, "a"]), r"regime.phases\[1\] is 'a', which is not in rad"),
+        (SimpleNamespace(speed=None, phases=[0.0, 3.0]), "regime.speed is None, which is not a number"),
+    ):
+        with pytest.raises(jv.InputError, match=problem):
+            jv.synchronous_orbit(general, regime)
 
 
 def test_regimes_of_loads_start_from_their_angle():
