@@ -180,7 +180,7 @@ def test_steps_lead_into_a_curved_valley(monkeypatch):
     monkeypatch.setattr(
         profile_likelihood, "prior_equations", lambda problem, x, linear: (prior, -1e6 * np.array([x[0] - 0.5, 0.0, 0.0, 0.0]))
     )
-    profile = _Profile(None, 0, False, 0.0, 0.25, np.zeros(4), 0.0, columns=np.column_stack([slopes, np.zeros(5)]))
+    profile = _Profile(None, 0, False, 0.0, 0.25, np.zeros(4), 0.0, columns=slopes, data=slopes.T @ slopes)
     x, linear = profile._in_valley(None, np.array([0.5, 0.0]), np.array([0.5, 0.0]))
     left = differences(None, np.array([0.5, 0.0]), np.array([0.5, 0.0]))
     assert left @ left > 20.0 and np.sum(differences(None, x, linear) ** 2) == pytest.approx(0.25, abs=1e-3)
