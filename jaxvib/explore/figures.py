@@ -78,7 +78,7 @@ def text(read: Callable[[], str], scene: SceneOrProblem) -> str:
     """Return preformatted text as HTML, or the message of the error."""
 
     def preformatted() -> str:
-        return f'<pre style="white-space:pre-wrap;font-size:0.8rem">{html.escape(read())}</pre>'
+        return f'<pre style="overflow-x:auto;font-size:0.8rem">{html.escape(read())}</pre>'
 
     return _html_or_problem(preformatted, scene, "No results")
 

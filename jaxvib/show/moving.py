@@ -58,7 +58,7 @@ def moving_svg(scene: Scene, jam: Jam) -> str:
     if not np.isfinite(jam.omega) or not np.isfinite(jam.displacement).all():
         raise ComputationError("absent", f"jam mode {int(jam.mode)} cannot be shown: {jam.message}")
     rotors = [(pose,) for pose in _rotor_poses(scene.exciters[0], np.zeros(scene.loads.count))]
-    words = f"jam mode {int(jam.mode)}, {jam.judgement}"
+    words = f"jam mode {int(jam.mode)}"
     return _moving(view, words, float(jam.omega), np.asarray(jam.displacement), rotors, float(jam.rotor_speed / jam.omega))
 
 

@@ -180,7 +180,7 @@ def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
     diagram, machine = (base64.b64decode(image).decode() for image in images)
     assert "stable: for light loads, each of which is free to move separately" in shown and "foundation force, N" in diagram
     assert "stable for light loads, each of which is free to move separately" in diagram
-    assert found["mode"].value == 1 and "jam mode 1, stable by slope" in machine
+    assert found["mode"].value == 1 and "jam mode 1: slowed down" in machine
     assert found["controls"].value == {each.name: each.start for each in sliders_of(one_mass)}
     assert jv.scene_to_toml(found["machine"].value) == jv.scene_to_toml(one_mass)
 
