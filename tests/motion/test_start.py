@@ -19,7 +19,7 @@ def test_a_mode_that_is_not_there_is_no_start():
 
 
 def test_spin_up_of_a_drive_that_spins_up_is_refused():
-    with pytest.raises(jv.InputError, match="the drive is 'spin_up' already"):
+    with pytest.raises(jv.InputError, match="needs a constant speed, but the drive is 'spin_up'; start at 'rest'"):
         jv.simulate(small_machine(drive=jv.SpinUp(3.0, 2.0)), 5.0, start="spin_up")
 
 

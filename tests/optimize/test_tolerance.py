@@ -72,7 +72,10 @@ def test_deviations_of_two_kinds_of_tolerances_are_independent(scene):
 
 
 def test_unknown_short_names_are_answered_by_the_known_ones(scene):
-    for text, says in (("stiffnes=5%", "did you mean 'stiffness'"), ("load=0..20kg", "unbalance, material, and parameters")):
+    for text, says in (
+        ("stiffnes=5%", "did you mean 'stiffness'"),
+        ("load=0..20kg", r"unbalance, material \(mass on a platform\), and parameters"),
+    ):
         with pytest.raises(jv.InputError, match=says):
             read_tolerances(scene, [text])
 

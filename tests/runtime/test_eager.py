@@ -22,7 +22,7 @@ def known():
         "orbit": jv.jam_orbit(s, mode=3),
         "window": jv.simulate(s, 1.0, start=state, save="window").window,
         "states": jv.balanced_states(s),
-        "t": jnp.asarray(0.5),
+        "t": jnp.asarray(0.5, dtype=float),
     }
 
 

@@ -62,7 +62,8 @@ def _closed_forms() -> str:
 
 def _outcome(case: Case, precision: str) -> str:
     which = PRECISIONS.index(precision)
-    return " or ".join(f"`{name}`" for name in case.named[which]) or f"within {case.within[which]:g}"
+    within = f"within {case.within[which]:g}"
+    return " or ".join(within if name == "found" else f"`{name}`" for name in case.named[which]) or within
 
 
 def _summary() -> str:

@@ -41,7 +41,7 @@ def test_hard_case(case, precision, record_property):
     found = outcome(case, precision)
     for name in ("status", "error", "claimed"):
         record_property(name, getattr(found, name))
-    assert found.verdict == case.verdict(precision), found
+    assert found.verdict in case.verdicts(precision), found
 
 
 ONE_LOAD = BY_NAME["one load"]

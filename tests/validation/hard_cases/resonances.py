@@ -128,7 +128,7 @@ CASES = (
             answer=_exact((3, 4))[0],
             reference=_exact((3, 4))[1],
             within=(1e-8, 1e-3),
-            named=(() if sign < 0.0 else ("absent",), ()),
+            named=(() if sign < 0.0 else ("absent",), ("found", "at_fold")),
         )
         for side, sign in (("below", -1.0), ("above", 1.0))
     ),
