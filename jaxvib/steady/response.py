@@ -164,7 +164,10 @@ class Response(AbstractResponse, Result):
 
     def peaks(self) -> list[int]:
         """Return the indices of the speeds at which the foundation force has a maximum."""
-        order = np.unique(np.asarray(self.speed), return_index=True)[1]
+        speed = np.asarray(self.speed)
+        order = np.argsort(speed, kind="stable")
+        # Two points at one speed, which may differ by rounding, would be a peak if their forces differ by rounding.
+        order = order[np.diff(speed[order], prepend=-1.0) > 10.0 * np.finfo(speed.dtype).eps * speed[order]]
         force = np.asarray(self.foundation_force)[order]
         inner = (force[1:-1] > force[:-2]) & (force[1:-1] >= force[2:])
         return order[np.flatnonzero(inner) + 1].tolist()

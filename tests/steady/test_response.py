@@ -422,6 +422,14 @@ def test_a_batch_is_its_scenes():
     np.testing.assert_allclose(many[1], speed(SPRING), rtol=1e-12)
 
 
+@pytest.mark.parametrize("stiffness", [153500.0, 153492.0])
+def test_equal_speeds_are_no_peaks(stiffness):
+    """Default speeds with pairs that differ by rounding (first stiffness), and so do their forces."""
+    machine = jv.planar_rotor(mass=12.0, stiffness=stiffness, damping="2 %")
+    exciter = jv.Exciter(drive=jv.ConstantSpeed("3000 rpm"), unbalance=2e-3)
+    assert len(jv.response(jv.Scene(machine, exciters=[exciter]), most="4000 rpm").peaks()) == 1
+
+
 def test_scenes_with_loads_are_refused():
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
