@@ -372,6 +372,7 @@ def test_a_small_angle_out_of_bounds_names_its_bounds():
 
 def test_equal_parts_of_equal_parts_are_refused():
     assert to_float("2 x 3 kg", "kg", "mass") == 6.0
+    assert to_float("2 x 9 kN", "N", "force") == 18e3
     with pytest.raises(jv.InputError, match="2 x 3 x 4 kg"):
         to_float("2 x 3 x 4 kg", "kg", "mass")
 

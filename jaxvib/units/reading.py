@@ -40,7 +40,7 @@ SEVERAL = r"\d{1,4}\s*[x×*]\s*"
 
 _SEVERAL = re.compile(rf"({SEVERAL})(\S.*)")
 
-ADDED = ("N/m", "N s/m", "kg", "kg m")
+ADDED = ("N/m", "N s/m", "kg", "kg m", "N")
 """Units of values that add if equal parts are side by side."""
 
 _COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*(?:[^\W\d_%°][^,;()]*)?")
