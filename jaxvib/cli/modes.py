@@ -121,6 +121,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
         ]
         if rows:
             lines.append("amplitudes and foundation force are zero to peak")
+        if any(row[2].startswith("no") for row in rows):
             lines.append("not stable: after a small disturbance the loads (balls, rollers, pendulums) leave this jam")
         lines += [text] if (text := modes_found.unresolved_text()) else []
         if tolerances:

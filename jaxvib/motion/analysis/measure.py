@@ -31,6 +31,9 @@ _POINTS_IN_STEP = 8
 """Number of points in each sampling step at which a kinked force is searched for extrema. A second search covers the distance
 to the next point on each side of the extremum. It divides each of these two distances into the same number of parts."""
 
+_MAX_SPREAD_OF_MEAN = 0.2
+"""Largest difference of the speeds of turning masses, relative to the largest speed, with which their mean is stated."""
+
 Field = Callable[[Array, State], State]
 """Equations of motion: function from a time and a state to the rates of the state."""
 
@@ -125,14 +128,18 @@ class AbstractMeasured(Readable):
     def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array]) -> str:
         """Return a line of text with the speeds of the turning masses, and the last rotor speed of each exciter with loads.
 
-        The turning mass of an exciter without loads is its rotor. `rotor_speeds`: an array (nt,), rad/s, for each exciter.
+        The mean speed is left out if the speeds differ much, for example because a motor stands still. The turning mass of an
+        exciter without loads is its rotor. `rotor_speeds`: an array (nt,), rad/s, for each exciter.
         """
         exciters = zip(scene.exciters, rotor_speeds, strict=True)
         rotors = [speeds[-1] for exciter, speeds in exciters if exciter.loads is not None]
         rotor = f", {'rotor' if len(rotors) == 1 else 'rotors'} at {speed_text(rotors, 6)}" if rotors else ""
         clockwise = np.any(np.asarray([exciter.direction for exciter in scene.exciters]) < 0)
         each = speed_text(self.load_speed, 6) + ("; negative: clockwise" if clockwise else "")
-        return f"{turning_masses(scene)} turn at {speed_text(self.omega, 6)} (each: {each}){rotor}"
+        magnitudes = np.abs(np.asarray(self.load_speed))
+        if np.ptp(magnitudes) <= _MAX_SPREAD_OF_MEAN * np.max(magnitudes):
+            each = f"{speed_text(self.omega, 6)} (each: {each})"
+        return f"{turning_masses(scene)} turn at {each}{rotor}"
 
 
 def turning_masses(scene: Scene) -> str:

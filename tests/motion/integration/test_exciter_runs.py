@@ -1,5 +1,7 @@
 """Runs of several exciters against equations written by hand and integrated by SciPy."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -58,6 +60,8 @@ def test_a_run_of_two_motors_obeys_the_equations_by_hand():
     speeds = ", ".join(f"{float(speed) * 30.0 / np.pi:.6g}" for speed in run.load_speed)
     assert f"(each: {speeds} rpm; negative: clockwise)\n" in run.summary() and "rotor" not in run.summary()
     assert run.load_speed[0] > 0.0 > run.load_speed[1]
+    stopped = dataclasses.replace(run, load_speed=jnp.asarray([100.0, -0.01]))  # the mean speed has no meaning
+    assert stopped.speeds_text(SCENE, run.window.rotor_speeds) == "exciters turn at 954.93, -0.095493 rpm; negative: clockwise"
 
 
 def test_ensembles_of_two_motors_obey_the_equations_by_hand():
