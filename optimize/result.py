@@ -203,7 +203,7 @@ class Synthesis(Result):
 
     def summary(self) -> str:
         """Return the design before, after and verified, the active limits and the influences as text."""
-        starts = f"{self.starts} starts chosen from {self.drawn} designs"
+        starts = f"{self.starts} starts from {self.drawn} designs"
         counted = f"{starts}, {self.converged} converged, {self.same} to the best machine"
         lines = [f"{objective_text(self.objective)}: {self.message}", counted]
         lines += [" ".join(line) for line in _align_columns(self.columns())]

@@ -24,7 +24,10 @@ from jaxvib.cli.output import csv_options, write_file
 from jaxvib.errors import InputError
 from jaxvib.machine.templates import SCREENS, TEMPLATES
 
-_START_HELP = "Initial state: rest (machine at rest, drive at its speed), jam (with --mode), or spin_up (smooth, from rest)."
+_START_HELP = (
+    "Initial state: rest (an ideal drive turns at its speed, a motor stands still), jam (with --mode), or spin_up (smooth, "
+    "from rest)."
+)
 
 _FILES = ("design", *(f"{kind.replace('_', '-')}-design" for kind in SCREENS), "identification", "measurement", "sweep")
 _MACHINES = tuple(kind.replace("_", "-") for kind in (*TEMPLATES, *SCREENS))

@@ -127,7 +127,7 @@ def _document(best: Synthesis) -> dict:
 def _text(best: Synthesis) -> str:
     from optimize.result import objective_text
 
-    starts = f"{best.starts} starts chosen from {best.drawn} designs"
+    starts = f"{best.starts} starts from {best.drawn} designs"
     counts = f"{starts}, {best.converged} converged, {best.same} to the best machine"
     heads, *rows = best.columns()
     quantities = table(objective_text(best.objective), heads, rows)

@@ -62,7 +62,7 @@ def test_rows_are_in_units_of_the_largest_value(searched):
     summary = dataclasses.replace(searched, table=table, unverified="not requested").summary().splitlines()
     assert (
         summary[0].startswith("least off by: the search converged")
-        and "2 starts chosen from 2 designs, 2 converged, 2 to" in summary[1]
+        and "2 starts from 2 designs, 2 converged, 2 to" in summary[1]
     )
     assert "  not verified: not requested" in summary
     assert summary[2].split() == ["before", "after", "exact"]  # without a column of blanks
