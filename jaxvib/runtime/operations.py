@@ -56,16 +56,19 @@ _IRRELEVANT_PARAMETERS = ("name", "debug_info", "source_info")
 """Parameters of operations that do not change results."""
 
 
-def program_text(program: ClosedJaxpr) -> list[str]:
+def program_text(program: ClosedJaxpr, decimals: int | None = None) -> list[str]:
     """Return a program as text with one operation in each line; the text is the same in every process.
 
     The text has the operations with their parameters, literals and constants, the operands of each, and the shapes and types of
     the results. Names, source lines and Python functions are left out.
 
+    **Arguments**: `decimals`: number of decimals to which constants are rounded, relative to the largest entry of an array;
+    None: exact. NumPy's linear algebra computes constants that differ by rounding errors between CPUs.
+
     >>> program_text(jax.make_jaxpr(lambda x: 2.0 * x)(np.float32(1.0)))
     ['arguments v0:float32[]', 'v1:float32[] = mul[...] ...2.0 v0', 'results v1']
     """
-    return list(_lines(program))
+    return list(_lines(program, decimals))
 
 
 def calls_python(program: ClosedJaxpr) -> bool:
@@ -89,32 +92,32 @@ def program_digest(program: ClosedJaxpr) -> str:
     return hashlib.sha256(json.dumps(program_text(program)).encode()).hexdigest()[:32]
 
 
-def _lines(closed: Any, depth: int = 0) -> Iterator[str]:
+def _lines(closed: Any, decimals: int | None, depth: int = 0) -> Iterator[str]:
     jaxpr, constants = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
     names: dict[object, str] = {}
 
     def named(atom: Any) -> str:
         if hasattr(atom, "val"):
-            return _text(atom.val)
+            return _text(atom.val, decimals)
         return names.setdefault(atom, f"v{len(names)}")
 
     indent = "  " * depth
     for variable, value in zip(jaxpr.constvars, constants, strict=False):
-        yield f"{indent}{named(variable)} = {_text(value)}"
+        yield f"{indent}{named(variable)} = {_text(value, decimals)}"
     yield f"{indent}arguments {' '.join(f'{named(v)}:{v.aval.str_short()}' for v in jaxpr.invars)}"
     for equation in jaxpr.eqns:
         inner: list[object] = []
         parameters = sorted((key, value) for key, value in equation.params.items() if key not in _IRRELEVANT_PARAMETERS)
-        shown = ", ".join(f"{key}={_text(value, inner)}" for key, value in parameters)
+        shown = ", ".join(f"{key}={_text(value, decimals, inner)}" for key, value in parameters)
         operands = " ".join(named(atom) for atom in equation.invars)
         results = " ".join(f"{named(v)}:{v.aval.str_short()}" for v in equation.outvars)
         yield f"{indent}{results} = {equation.primitive.name}[{shown}] {operands}"
         for each in inner:
-            yield from _lines(each, depth + 1)
+            yield from _lines(each, decimals, depth + 1)
     yield f"{indent}results {' '.join(named(atom) for atom in jaxpr.outvars)}"
 
 
-def _text(value: object, inner: list[object] | None = None) -> str:
+def _text(value: object, decimals: int | None, inner: list[object] | None = None) -> str:
     """Return a parameter or constant as text. Programs are appended to `inner`; functions and objects are named by type."""
     if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
         if inner is None:
@@ -125,15 +128,20 @@ def _text(value: object, inner: list[object] | None = None) -> str:
         return repr(value)
     if isinstance(value, (np.ndarray, np.generic, jax.Array)):
         array = np.asarray(value)
+        precision = decimals if array.dtype.kind in "fc" else None
         if array.size == 1:
-            return f"{array.dtype}:{array.item()!r}"
+            return f"{array.dtype}:{array.item()!r}" if precision is None else f"{array.dtype}:{array.item():.{precision}g}"
+        if precision is not None:
+            finite = np.where(np.isfinite(array), array, 0.0)
+            scale = np.max(np.abs(finite), initial=0.0) or 1.0
+            array = np.append(np.round(array / scale, precision) + 0.0, float(f"{scale:.{precision}g}"))  # no -0
         return f"{array.dtype}{list(array.shape)}:{hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:12]}"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_text(x, inner)}" for key, x in sorted(value.items(), key=str)) + "}"
+        return "{" + ", ".join(f"{key}: {_text(x, decimals, inner)}" for key, x in sorted(value.items(), key=str)) + "}"
     if isinstance(value, (tuple, list)):
-        return f"{type(value).__name__}({', '.join(_text(x, inner) for x in value)})"
+        return f"{type(value).__name__}({', '.join(_text(x, decimals, inner) for x in value)})"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = ", ".join(f"{f.name}={_text(getattr(value, f.name), inner)}" for f in dataclasses.fields(value))
+        fields = ", ".join(f"{f.name}={_text(getattr(value, f.name), decimals, inner)}" for f in dataclasses.fields(value))
         return f"{type(value).__name__}({fields})"
     return type(value).__name__
 

@@ -5,7 +5,8 @@
     python tests/helpers/programs/golden.py --show "two masses" energy    # print one program, for a diff between two revisions
 
 A digest covers the order of the operations, their parameters and literals, the operands of each, and the shapes and types of
-the results. It is the same in every process for one version of JAX. Names, source lines and Python functions are left out.
+the results. It is the same in every process and on every CPU for one version of JAX; therefore constants are rounded. Names,
+source lines and Python functions are left out.
 """
 
 from __future__ import annotations
@@ -34,6 +35,9 @@ from scenes import BALLS, ROTOR, TWO_MASS, loads, machines, published
 jax.config.update("jax_enable_x64", True)  # before the parts below are made
 
 RECORDED = pathlib.Path(__file__).parents[2] / "data" / "golden.json"
+
+_DECIMALS = 9
+"""Number of decimals of constants, relative to the largest entry of an array."""
 
 SPEED = jv.ConstantSpeed(120.0)
 
@@ -208,7 +212,7 @@ def program(scene: jv.Scene, question: Callable[[jv.Scene], Any]) -> list[str]:
         return [leaf for leaf in jax.tree.leaves(question(eqx.combine(values, rest))) if eqx.is_array(leaf)]
 
     try:
-        return program_text(jax.make_jaxpr(asked)(numbers))
+        return program_text(jax.make_jaxpr(asked)(numbers), _DECIMALS)
     except jv.InputError as error:
         return [f"refused: {error.field}"]
 
