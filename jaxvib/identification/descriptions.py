@@ -1,4 +1,4 @@
-"""Wrong descriptions of channels: a reversed direction, exchanged places, a wrong unit.
+"""Wrong descriptions of channels: a reversed direction, swapped places, a wrong unit.
 
 After a fit that does not explain the records, the readings are changed as other descriptions of their channels would change
 them. If a description fits better than the given one with the first values of the unknowns, and much better after a fit, it is
@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxvib.errors import quoted
-from jaxvib.identification.checks import FitStatus
 from jaxvib.identification.fit import minimize, project
 from jaxvib.identification.problem import Problem, channel_sizes, with_noise
 from jaxvib.identification.records.agreement import OTHER_UNITS
@@ -23,12 +22,12 @@ from jaxvib.identification.start import track_orders
 from jaxvib.numerics.noise import Noise
 from jaxvib.units.columns import unit_factor
 
-_BETTER, _BETTER_UNIT, _EXPLAINED = 0.5, 0.05, 0.25
+_MAX_COST, _MAX_COST_OF_UNIT, _MAX_COST_OF_MOTION = 0.5, 0.05, 0.25
 """Largest cost with another direction or place, and with another unit, relative to that with the given description, and largest
 cost relative to that without any motion, at which the description is named. The limit for units is low: readings with a wrong
 gain also fit better with a unit near it."""
 
-_EQUAL = 1e-3
+_EQUAL_COST = 1e-3
 """Relative difference of the costs of two descriptions up to which the records do not distinguish them."""
 
 
@@ -41,43 +40,35 @@ class _Description(NamedTuple):
     limit: float
 
 
-def description_notes(problem: Problem, status: FitStatus) -> list[str]:
-    """Return the sentence of `fitting_description` in a list, which is empty without one, and after a fit that explains the
-    records."""
-    is_explained = status in (FitStatus.found, FitStatus.undetermined)
-    sentence = None if is_explained else fitting_description(problem)
-    return [] if sentence is None else [sentence]
-
-
-def fitting_description(problem: Problem) -> str | None:
+def description_notes(problem: Problem) -> list[str]:
     """Return a sentence about the description of channels with which a machine fits the records much better than with the given
-    one; None without such a description, and for a nonlinear motion.
+    one; an empty list without such a description, and for a nonlinear motion.
 
     **Arguments**: the `problem` of a fit that does not explain the records.
     """
     if problem.linear is not None:
-        return None
+        return []
     given, others = _weighted(problem), list(_descriptions(problem))
     changed = [_weighted(_changed(problem, each)) for each in others]
     costs = np.array([_first_cost(each) for each in changed])
     if not others or np.min(costs) >= _first_cost(given):
-        return None
+        return []
     best, readings = int(np.argmin(costs)), sum(int(np.count_nonzero(mask)) for mask in problem.masks)
-    if _least_cost(changed[best]) > min(_EXPLAINED * readings, others[best].limit * _least_cost(given)):
-        return None
-    words = [each.words for each, cost in zip(others, costs, strict=True) if cost <= (1.0 + _EQUAL) * np.min(costs)]
-    return f"the model explains the records with {', or with '.join(words)}: correct the description of the channels"
+    if _least_cost(changed[best]) > min(_MAX_COST_OF_MOTION * readings, others[best].limit * _least_cost(given)):
+        return []
+    words = [each.words for each, cost in zip(others, costs, strict=True) if cost <= (1.0 + _EQUAL_COST) * np.min(costs)]
+    return [f"the model explains the records with {', or with '.join(words)}: correct the description of the channels"]
 
 
 def _descriptions(problem: Problem) -> Iterator[_Description]:
     """Yield the descriptions that differ from the given one in a direction, in two places, or in a unit."""
     channels = list({channel.name: channel for samples in problem.runs for channel in samples.channels}.values())
     for channel in channels:
-        yield _Description(f"a reversed sign of {_names([channel])}", {channel.name: (channel.name, -1.0)}, _BETTER)
+        yield _Description(f"a reversed sign of {_names([channel])}", {channel.name: (channel.name, -1.0)}, _MAX_COST)
     for one, other in itertools.combinations(channels, 2):
         if one.kind == other.kind:
             readings = {one.name: (other.name, 1.0), other.name: (one.name, 1.0)}
-            yield _Description(f"{_names([one, other])} swapped", readings, _BETTER)
+            yield _Description(f"{_names([one, other])} swapped", readings, _MAX_COST)
     alike: dict[tuple[str, str | None], list[Channel]] = {}
     for channel in channels:
         alike.setdefault((channel.kind, channel.unit), []).append(channel)
@@ -87,7 +78,7 @@ def _descriptions(problem: Problem) -> Iterator[_Description]:
             factor = (unit_factor(unit, UNITS[kind]) or 1.0) / (unit_factor(stated, UNITS[kind]) or 1.0)
             words = f"{factor:.4g} times the readings of {_names(group)} ({quoted(unit)} in place of {quoted(stated)})"
             if factor != 1.0:
-                yield _Description(words, {each.name: (each.name, factor) for each in group}, _BETTER_UNIT)
+                yield _Description(words, {each.name: (each.name, factor) for each in group}, _MAX_COST_OF_UNIT)
 
 
 def _names(channels: Sequence[Channel]) -> str:

@@ -300,7 +300,7 @@ def _interpret(scene: Scene, first: Problem, fitted: Fitted) -> MachineFit:
     """Return a fit of the problem `first` with intervals, directions, a status and notes."""
     problem, known = fitted.problem, information_of(fitted)
     status, p_value, notes = status_of(fitted, known)
-    notes = [*description_notes(first, status), *notes]
+    notes = ([] if status in (FitStatus.found, FitStatus.undetermined) else description_notes(first)) + list(notes)
     undetermined, by_gain = directions_of(known)
     fit_scene = fitted_scene(problem, fitted.x, fitted.linear)
     modes = propagate(

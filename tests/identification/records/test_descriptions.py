@@ -7,7 +7,7 @@ import pytest
 from run_ups_by_scipy import TRUTH, accelerations, record, scene_of
 
 import jaxvib as jv
-from jaxvib.identification.descriptions import fitting_description
+from jaxvib.identification.descriptions import description_notes
 from jaxvib.identification.problem import build_problem
 
 TIMES = np.arange(0.0, 16.0, 0.01)
@@ -37,8 +37,8 @@ def run_of(factors=(1.0, 1.0), descriptions=({}, {}), lost=()):
     return jv.MeasuredRun(channels, run.times, {**run.values, **readings}, run.clipped, {}, (), "run")
 
 
-def sentence_of(*runs, unknown=UNKNOWN):
-    return fitting_description(build_problem(first_values(), runs, unknown, {}))
+def notes_of(*runs, unknown=UNKNOWN):
+    return description_notes(build_problem(first_values(), runs, unknown, {}))
 
 
 @pytest.mark.parametrize(
@@ -63,9 +63,9 @@ def sentence_of(*runs, unknown=UNKNOWN):
 )
 def test_description_that_fits_is_named(runs, unknown, words):
     expected = f"the model explains the records with {words}: correct the description of the channels"
-    assert sentence_of(*runs, unknown=unknown) == expected
+    assert notes_of(*runs, unknown=unknown) == [expected]
 
 
 @pytest.mark.parametrize("factors", [(1.0, 1.0), (1.0, 0.5), (0.0, 0.0)], ids=["right", "wrong gain", "silent"])
 def test_other_faults_are_no_wrong_description(factors):
-    assert sentence_of(run_of(factors)) is None
+    assert notes_of(run_of(factors)) == []
