@@ -79,7 +79,7 @@ class Regime(Result):
       first load
     - `unbalance`: residual unbalance of loads and rotor in the frame of the rotor, relative to that of all loads at one angle;
       balanced below 0.02
-    - `weight` (count,): share of each load in the sum of their unbalances
+    - `load_unbalance` (count,): unbalance of each load relative to the sum of all
     - `imbalance`: static imbalance of the rotor relative to this sum, complex, in the frame of the rotor
     - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed`, rad/s
     - `mode`: estimated number of the jam mode; 0 if the loads are not jammed. Let natural frequency k be the last one below the
@@ -98,7 +98,7 @@ class Regime(Result):
     ripple: Array = eqx.field(metadata=in_unit("rad/s"))
     phase: Array = eqx.field(metadata=in_unit("rad", "load"))
     unbalance: Array = eqx.field(metadata=in_unit(""))
-    weight: Array = eqx.field(metadata=in_unit("", "load"))
+    load_unbalance: Array = eqx.field(metadata=in_unit("", "load"))
     imbalance: Array = eqx.field(metadata=in_unit(""))
     resonance: Array = eqx.field(metadata=in_unit(""))
     resonance_speed: Array = eqx.field(metadata=in_unit("rad/s"))
@@ -161,7 +161,7 @@ class Regime(Result):
         """
         from jaxvib.draw.results import phase_circles  # slow import
 
-        title, weight, imbalance = self.label, np.asarray(self.weight), 0.0
+        title, weight, imbalance = self.label, np.asarray(self.load_unbalance), 0.0
         if title in ("balanced", "unbalanced"):
             imbalance, share = complex(self.imbalance), float(self.unbalance)
             static = abs(np.sum(weight * np.exp(1j * np.asarray(self.phase))) + imbalance)
@@ -234,7 +234,7 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
 
     unbalances, imbalance = _unbalances(scene, turn)
     size = jnp.sum(jnp.abs(unbalances))
-    unbalance = _unbalance(scene, to_rotor, turn)
+    unbalance = _unbalance(scene, unbalances * jnp.exp(1j * to_rotor), imbalance, turn)
     name = RegimeName.where(is_steady, RegimeName.parted, RegimeName.unsettled)
     name = RegimeName.where(is_steady & has_one_speed & ~jnp.any(with_rotor), RegimeName.jammed, name)
     name = RegimeName.where(
@@ -256,7 +256,7 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
         ripple=jnp.where(jnp.all(is_known), jnp.max(jnp.max(rate, axis=0) - jnp.min(rate, axis=0)) / 2.0, jnp.nan),
         phase=jnp.where(all_with_rotor, to_rotor, to_first),
         unbalance=unbalance,
-        weight=unbalances / size,
+        load_unbalance=unbalances / size,
         imbalance=imbalance / size,
         resonance=nearest + 1,
         resonance_speed=natural[nearest],
@@ -304,15 +304,13 @@ def _unbalances(scene: Scene, turn: Array) -> tuple[Array, Array]:
     return jnp.broadcast_to(loads.mass * loads.arm(), (loads.count,)), imbalance
 
 
-def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
-    """Return the residual unbalance of rotor and loads at the angles `phase` to the rotor, relative to all loads at one angle.
+def _unbalance(scene: Scene, unbalances: Array, rotor_unbalance: Array, turn: Array) -> Array:
+    """Return the residual unbalance of the loads (count,) and the rotor, complex, relative to all loads at one angle.
 
     For a rotor that tilts, the moment about the point of the loads is included, relative to the levers of the loads, or to the
     radius of gyration of the rotor if the levers are 0.
     """
     mount, origin = scene.mount(), jnp.zeros_like(turn[0])
-    of_loads, rotor_unbalance = _unbalances(scene, turn)
-    unbalances = of_loads * jnp.exp(1j * phase)
     imbalances = [term.at(origin) for term in terms_of(scene.all_effects, RotorImbalance)]
     size = jnp.sum(jnp.abs(unbalances))
     residual = jnp.abs(jnp.sum(unbalances) + rotor_unbalance) / size
