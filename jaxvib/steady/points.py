@@ -264,8 +264,9 @@ class PathsOfPoints(eqx.Module):
 
         **Returns** `Deck`. **Raises** `InputError` for points that the machine does not have.
         """
-        is_list = isinstance(points, (list, tuple)) and not any(isinstance(x, (int, float, str)) for x in points)
-        if not (is_list or getattr(points, "ndim", 0) == 2) or len(points) == 0:
+        is_list = isinstance(points, (list, tuple))
+        are_pairs = is_list and all(isinstance(each, (list, tuple)) or getattr(each, "ndim", 0) == 1 for each in points)
+        if not (are_pairs or getattr(points, "ndim", 0) == 2) or len(points) == 0:
             raise InputError("points", f"is {quoted(points)}; it must be a list of points, [(x, y), ...]")
         places = jnp.stack([numbers(point, "m", f"points[{k}]", 2) for k, point in enumerate(points)])
         motion = self.harmonic()

@@ -285,10 +285,10 @@ def response(
     _require_one_no_load_speed(scene)
     n = len(scene.exciters)
     angles = jnp.zeros(n, scene.top_speed.dtype) if phases is None else numbers(phases, "rad", "phases", n)
-    top = scene.top_speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
+    top = None if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
     size = count(points, "points", low=2, each=1e3)
     if speeds is None:
-        w = _default_speeds(scene, top, size)
+        w = _default_speeds(scene, scene.top_speed * 4.0 / 3.0 if top is None else top, size)
     else:
         w = jnp.atleast_1d(numbers(speeds, "rad/s", "speeds", None, low=0.0))
     return outcome(_response(scene, w, angles), scene)
