@@ -29,9 +29,9 @@ _MAX_LINEAR_PERCENT = 10.0
 _MAX_EQUAL_DIFFERENCE = 1e-4
 """Relative difference of the objectives of two machines below which they count as equally good."""
 
-_ROUNDING_PERCENT = 1e-6
-"""Difference of the objectives of two machines, percent of the change by 1 % of the most influential parameter, below which
-they count as equally good: both objectives are then almost zero."""
+_ROUNDING_SHARE = 1e-8
+"""The same difference relative to the change that 1 % of the most influential parameter causes. It is the larger one if both
+objectives are almost zero."""
 
 _MIN_LIMIT_CHANGE = 1e-6
 """Smallest change of a limit, percent, for which the change of the objective is shown."""
@@ -203,14 +203,17 @@ class Synthesis(Result):
 
     def summary(self) -> str:
         """Return the design before, after and verified, the active limits and the influences as text."""
-        starts = f"{self.starts} starts from {self.drawn} designs"
-        counted = f"{starts}, {self.converged} converged, {self.same} to the best machine"
-        lines = [f"{objective_text(self.objective)}: {self.message}", counted]
+        lines = [f"{objective_text(self.objective)}: {self.message}", self.counts_text()]
         lines += [" ".join(line) for line in _align_columns(self.columns())]
         if self.unverified:
             lines.append(f"  not verified: {self.unverified}")
         lines += self.findings()
         return "\n".join(line.rstrip() for line in lines)
+
+    def counts_text(self) -> str:
+        """Return the numbers of starts, designs and equal results as text."""
+        starts = f"{self.starts} starts from {self.drawn} designs"
+        return f"{starts}, {self.converged} converged, {self.same} to the best machine"
 
     def columns(self) -> list[list[str]]:
         """Return the header of the table and its `rows`, without columns that are empty."""
@@ -252,9 +255,9 @@ class Synthesis(Result):
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
         for influence in ranked[:5]:
             lines.append(f"  1 % less / more {influence.what}: {change_text(sign * influence.less, sign * influence.more)}")
-        most = max((abs(change) for i in ranked[:1] for change in i[1:]), default=0.0) / 100.0 * max(abs(best), 1e-300)
-        close = max(_MAX_EQUAL_DIFFERENCE * abs(best), _ROUNDING_PERCENT / 100.0 * most)
-        equal = [m for m in self.machines if abs(m.value - best) <= close]
+        largest_percent = max((abs(change) for each in ranked[:1] for change in (each.less, each.more)), default=0.0)
+        tolerance = max(_MAX_EQUAL_DIFFERENCE, _ROUNDING_SHARE * largest_percent / 100.0) * max(abs(best), 1e-300)
+        equal = [m for m in self.machines if abs(m.value - best) <= tolerance]
         unit, factor = shown_unit(self.unit, abs(best))
         factor *= sign
         if len(equal) > 1 and len(equal) == len(self.machines):

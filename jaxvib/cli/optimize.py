@@ -127,11 +127,11 @@ def _document(best: Synthesis) -> dict:
 def _text(best: Synthesis) -> str:
     from optimize.result import objective_text
 
-    starts = f"{best.starts} starts from {best.drawn} designs"
-    counts = f"{starts}, {best.converged} converged, {best.same} to the best machine"
     heads, *rows = best.columns()
     quantities = table(objective_text(best.objective), heads, rows)
     verification = "verified by the full equations, integrated until the motion settled"
     if best.verified is None:
         verification = f"not verified: {best.unverified}"
-    return "\n".join([f"{best.message}\n{counts}", quantities, *(line.strip() for line in best.findings()), verification])
+    return "\n".join(
+        [f"{best.message}\n{best.counts_text()}", quantities, *(line.strip() for line in best.findings()), verification]
+    )

@@ -103,8 +103,9 @@ _FACTORS = {
 }
 """Factors of the most common units of engineering drawings. Other units are read by pint, whose import takes half a second."""
 
+_SIGN, _RAISED, _EXPONENT = r"(?:\^|\*\*)", "[⁰¹²³⁴-⁹]", r"[+-]?\d{1,2}(?:[./]\d{1,2})?"
 _POWER = re.compile(
-    r"(?:\^|\*\*)\s*(?:[+-]?\d{1,2}(?:\.\d{1,2})?|\([+-]?\d{1,2}(?:[./]\d{1,2})?\))(?![\d.e⁰¹²³⁴-⁹]|\s*(?:\^|\*\*))|[⁰¹²³⁴-⁹]{1,2}(?![⁰¹²³⁴-⁹^]|\*\*)"
+    rf"{_SIGN}\s*(?:{_EXPONENT}|\({_EXPONENT}\))(?![\d.e]|{_RAISED}|\s*{_SIGN})|{_RAISED}{{1,2}}(?!{_RAISED}|{_SIGN})"
 )
 """Power of at most two digits. pint would compute any other, such as 9**9**9, which takes minutes."""
 
@@ -217,7 +218,7 @@ def _parsed(unit: str) -> Any:
 
     if any(pattern.search(unit) for pattern, _ in _AMBIGUOUS):
         raise ValueError("a name with several meanings")
-    if len(unit) > _MAX_UNIT_CHARACTERS or re.search(r"\^|\*\*|[⁰¹²³⁴-⁹]", _POWER.sub("", unit)):
+    if len(unit) > _MAX_UNIT_CHARACTERS or re.search(f"{_SIGN}|{_RAISED}", _POWER.sub("", unit)):
         raise ValueError("a long text, or a large power")
     name = _PLAIN_POWER.sub(r"^\1", _SPELLINGS.get(unit, unit))
     return pint.get_application_registry().Unit(

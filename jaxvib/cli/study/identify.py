@@ -81,7 +81,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
 
     is_file = record.suffix.lower() == ".toml"
     if not is_file:
-        read_table(record, "time and angle of a pendulum")  # the first error is that of a wrong file
+        read_table(record, "time and angle of a pendulum")  # reports a wrong file before missing entries of the pendulum
     tables: Tables = read_toml(record) if is_file else {"record": {"file": record.name}}
     if not {"machine", "run", "channel"}.isdisjoint(tables):
         _identify_machine(tables, record.parent, output, [name for name, value in given.items() if value is not None])
