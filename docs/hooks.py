@@ -4,6 +4,7 @@ import ast
 import contextlib
 import html
 import pathlib
+import posixpath
 import re
 import tempfile
 
@@ -52,10 +53,7 @@ def on_config(config):
 def on_files(files, config):
     """Add the generated pages of the reference, the figures, and the pages of `INCLUDED`."""
     for page, source in INCLUDED.items():
-        text = (ROOT / source).read_text(encoding="utf-8")
-        text = text.replace("](jaxvib/ode/README.md)", "](engine.md)").replace("](jaxvib/runtime/README.md)", "](cache.md)")
-        text = text.replace("](docs/", "](")
-        files.append(File.generated(config, page, content=text))
+        files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
     for name, content in _figures().items():
         files.append(File.generated(config, f"made/{name}", content=content))
     for title, names in public_groups().items():
@@ -65,6 +63,18 @@ def on_files(files, config):
             parts.append(f"::: {home}\n    options:\n      heading: {package}.{name}\n      toc_label: {name}\n")
         files.append(File.generated(config, address(title), content="\n".join(parts)))
     return files
+
+
+def on_page_markdown(markdown, page, **_):
+    """Replace links between files of the project by links between pages."""
+    folder = posixpath.dirname(INCLUDED.get(page.file.src_uri, f"docs/{page.file.src_uri}"))
+    pages = {source: name for name, source in INCLUDED.items()}
+
+    def link(found):
+        path = posixpath.normpath(posixpath.join(folder, found[1]))
+        return f"]({pages.get(path, path.removeprefix('docs/'))}" if path in pages or path.startswith("docs/") else found[0]
+
+    return re.sub(r"\]\(([\w./-]+)", link, markdown)
 
 
 def _figures():
