@@ -218,6 +218,36 @@ def test_equal_springs_side_by_side_add(text):
 
 
 @pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("25 mm under 650 kg", 650.0 * 9.80665 / 0.025),
+        ("2.5 cm under 1.2 kN", 1200.0 / 0.025),
+        ("1e-2 m  under 3 kgf", 300.0 * 9.80665),
+    ],
+)
+def test_a_stiffness_may_be_a_deflection_under_a_load(text, expected):
+    assert to_float(text, "N/m", "machine.stiffness") == pytest.approx(expected, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "advice"),
+    [
+        ("25 mm", "'25 mm', a deflection; write '25 mm under 650 kg' with the mass (or force) that this spring carries"),
+        ("25 mm under 650", "'25 mm under 650', which needs a positive deflection and a positive mass or force, with units"),
+        ("25 under 650 kg", "'25 under 650 kg', which needs a positive deflection"),
+        ("0 mm under 650 kg", "'0 mm under 650 kg', which needs a positive deflection"),
+        ("25 mm under -3 N", "'25 mm under -3 N', which needs a positive deflection"),
+        ("4 x 25 mm under 650 kg", "write '25 mm under 650 kg' with the load of all together"),
+        ("2,5 mm under 650 kg", "'2,5 mm', with a comma; write '2.5 mm'"),
+        ("25 mm under 650 s", "'650 s', which is not in N"),
+    ],
+)
+def test_a_deflection_without_a_load_is_refused(text, advice):
+    with pytest.raises(jv.InputError, match=re.escape(advice)):
+        to_float(text, "N/m", "machine.stiffness")
+
+
+@pytest.mark.parametrize(
     "value",
     [
         True,

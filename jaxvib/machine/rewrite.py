@@ -18,6 +18,9 @@ _NUMBER_AND_UNIT = re.compile(rf"\s*((?:{SEVERAL})?)([+-]?(?:\d+\.?\d*|\.\d+)(?:
 _RELATIVE = re.compile(r"%|\bloss\b")
 """Pattern of a damping that is given as a ratio or a loss factor."""
 
+_UNDER = re.compile(r"\bunder\b")
+"""Pattern of a stiffness that is given as a deflection, which is inversely proportional to the stiffness."""
+
 _Path = tuple[str | int, ...]
 """Names of tables and indices of arrays of tables."""
 
@@ -141,7 +144,8 @@ def _with_unit(read: object, old: object, new: object) -> str:
     is_plain = written is None or bool(_RELATIVE.search(written[0])) or float(written[2]) == 0.0
     if written is None or is_plain or not isinstance(old, float) or old == 0.0:
         return f"{new:.{_DIGITS}g}"
-    return f'"{written[1]}{new * float(written[2]) / old:.{_DIGITS}g}{written[3]}"'
+    factor = old / new if _UNDER.search(written[3]) and new != 0.0 else new / old
+    return f'"{written[1]}{factor * float(written[2]):.{_DIGITS}g}{written[3]}"'
 
 
 def _is_close(one: object, other: object) -> bool:

@@ -27,9 +27,8 @@ from jaxvib.machine.scene import MAX_USUAL_SPEED, Exciter, Scene, read_unbalance
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.units import conditions_of_traced_values
-from jaxvib.units.columns import STANDARD_GRAVITY
 from jaxvib.units.known import is_known, when_known
-from jaxvib.units.reading import require_real
+from jaxvib.units.reading import STANDARD_GRAVITY, require_real
 
 _VALID_SCENES: weakref.WeakValueDictionary[tuple[int, np.dtype], Scene] = weakref.WeakValueDictionary()
 """Validated scenes by their `id` and the precision of their arrays. Scenes are immutable and therefore stay valid."""

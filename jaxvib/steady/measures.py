@@ -35,8 +35,8 @@ from jaxvib.steady.jams.phases import PhaseJam
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.points import at_positive_speed, ellipse_at, read_slope, require_amplitudes, rows_in_plane
 from jaxvib.units import Number, number, numbers
-from jaxvib.units.columns import STANDARD_GRAVITY
 from jaxvib.units.known import when_known
+from jaxvib.units.reading import STANDARD_GRAVITY
 
 ZONE_LIMITS = {
     ("large", "rigid"): (2.3e-3, 4.5e-3, 7.1e-3),

@@ -27,8 +27,8 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, known_number, number, numbers
-from jaxvib.units.columns import STANDARD_GRAVITY
 from jaxvib.units.known import require_if_known, when_known
+from jaxvib.units.reading import STANDARD_GRAVITY
 
 
 def _rounding(semi_axis: Array) -> float:

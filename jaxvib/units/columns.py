@@ -6,10 +6,7 @@ import re
 
 import numpy as np
 
-from jaxvib.units.reading import unit_ratio
-
-STANDARD_GRAVITY = 9.80665
-"""Acceleration 1 g, m/s^2."""
+from jaxvib.units.reading import STANDARD_GRAVITY, unit_ratio
 
 _SPELLINGS: dict[str, dict[str, float]] = {
     "s": {

@@ -43,6 +43,12 @@ _SEVERAL = re.compile(rf"({SEVERAL})(\S.*)")
 ADDED = ("N/m", "N s/m", "kg", "kg m", "N")
 """Units of values that add if equal parts are side by side."""
 
+STANDARD_GRAVITY = 9.80665
+"""Acceleration 1 g, m/s^2."""
+
+_UNDER = re.compile(r"(.+?)\s+under\s+(.+)")
+"""Pattern of a stiffness that is given as a deflection under a mass or a force, such as "25 mm under 650 kg"."""
+
 _COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*(?:[^\W\d_%°][^,;()]*)?")
 
 _THOUSANDS = re.compile(r"[+-]?\d{1,3},\d{3}(?!\d)")
@@ -130,7 +136,8 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
 
     Strings and pint quantities are converted. If `unit` contains an angle, a frequency in hertz counts as revolutions per
     second (pint alone would convert 25 Hz to 25 rad/s), "1500 1/min" is 1500 rpm, and 1/s without an angle raises an error.
-    Stiffnesses, dampings, masses and unbalances of several equal parts side by side are added: "4 x 50 N/mm".
+    Stiffnesses, dampings, masses and unbalances of several equal parts side by side are added: "4 x 50 N/mm". A stiffness may
+    be a deflection of the spring under a mass or a force: "25 mm under 650 kg".
 
     **Raises** `InputError` for a string that is not a number, an unknown unit, a unit of another dimension, and a value that
     is not a real number (`require_real`).
@@ -139,6 +146,8 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
     157.0796
     >>> round(to_float("25 Hz", "rad/s", "drive.speed"), 4)
     157.0796
+    >>> round(to_float("25 mm under 650 kg", "N/m", "machine.stiffness"))  # 650 * 9.80665 / 0.025
+    254973
     >>> to_float("3 kg", "N/m", "machine.stiffness")
     Traceback (most recent call last):
         ...
@@ -151,6 +160,9 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         except ValueError:
             pass
         text = value.strip()
+        under = _UNDER.fullmatch(text) if unit == "N/m" and len(text) < 100 else None
+        if under is not None:
+            return _stiffness_under(under[1], under[2], value, field)
         several = _SEVERAL.fullmatch(text) if unit in ADDED and len(text) < 100 else None
         if several is not None and _SEVERAL.fullmatch(several[2]) is None:
             return int(several[1].rstrip("x×* \t")) * to_float(several[2], unit, field)
@@ -173,6 +185,34 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         return _magnitude(value, unit, field, str(value))
     require_real(value, unit, field)
     return cast("float | Array | np.ndarray | np.number", value)
+
+
+def _stiffness_under(deflection: str, load: str, value: str, field: str) -> float:
+    """Return the stiffness, N/m, of a spring that deflects under a mass or a force.
+
+    **Raises** `InputError` for texts that are not such quantities or not positive, and for "4 x 25 mm under 650 kg", because it
+    does not state whether each spring carries the mass.
+    """
+    if _SEVERAL.fullmatch(deflection):
+        problem = f"is {quoted(value)}, which can mean the load of one spring or of all together"
+        without = re.sub(SEVERAL, "", value.strip(), count=1)
+        raise InputError(field, f"{problem}; write {quoted(without)} with the load of all together")
+    mass = _in_unit(load, "kg")
+    sag = to_float(deflection, "m", field)
+    force = to_float(load, "N", field) if mass is None else STANDARD_GRAVITY * mass
+    has_units = all(_TEXT.fullmatch(text) for text in (deflection, load))
+    if not (has_units and 0.0 < float(sag) < math.inf and 0.0 < float(force) < math.inf):
+        problem = "needs a positive deflection and a positive mass or force, with units"
+        raise InputError(field, f"is {quoted(value)}, which {problem}, such as '25 mm under 650 kg'")
+    return float(force) / float(sag)
+
+
+def _in_unit(text: str, unit: str) -> float | None:
+    """Return a text with a unit as a number in `unit`; None for a plain number and for another dimension."""
+    try:
+        return None if _TEXT.fullmatch(text.strip()) is None else float(to_float(text, unit, ""))
+    except InputError:
+        return None
 
 
 def require_real(value: object, unit: str, field: str) -> None:
@@ -198,6 +238,11 @@ def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
     for pattern, meanings in _AMBIGUOUS:
         if pattern.search(value):
             return InputError(field, f"is {quoted(value)}, which can mean {meanings}")
+    if unit == "N/m" and _in_unit(value, "m") is not None:
+        under = f"'{value.strip()} under 650 kg'"
+        return InputError(
+            field, f"is {quoted(value)}, a deflection; write {under} with the mass (or force) that this spring carries"
+        )
     as_force = _KILOGRAM.sub("kgf", value)
     if unit and as_force != value:
         try:

@@ -146,7 +146,8 @@ def one_mass(*, mass: Number, stiffness: Number, damping: Number) -> Platforms:
     **Arguments** (one number each, SI, or a string with a unit such as "40 N/mm")
 
     - `mass` M, kg, loads not included; typical: 50 to 5000
-    - `stiffness` k of the support, N/m; typical: 1e4 to 1e6
+    - `stiffness` k of the support, N/m; typical: 1e4 to 1e6. Also a static deflection with the mass or force that causes it,
+      "25 mm under 650 kg"
     - `damping` b of the support, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M). Also
       a ratio of it, "5 %", or a loss factor of rubber at a frequency of vibration, "loss factor 0.1 at 16 Hz": b = 0.1 k/omega
 

@@ -47,6 +47,13 @@ drive = { kind = "dc_motor", speed = "1500 rpm", stall_torque = 12.0, inertia = 
     assert 'unbalance = "0.3 kg m"  # was "0.2 kg m"' in text and 'stiffness = "800 N/mm"' in text
 
 
+def test_a_static_deflection_stays_a_deflection():
+    source = TEMPLATES["one_mass"].replace('"50 N/mm"', '"25 mm under 128 kg"')
+    scene = jv.scene_from_toml(source)
+    stiffer = eqx.tree_at(lambda s: s.machine.stiffness, scene, 1.25 * scene.machine.stiffness)
+    assert 'stiffness = "20 mm under 128 kg"  # was "25 mm under 128 kg"; of the support' in rewrite_scene(source, stiffer)
+
+
 @pytest.mark.parametrize(("name", "factors"), CHANGES)
 def test_changed_numbers_are_read_back(name, factors):
     scene = jv.scene_from_toml(TEMPLATES["two_mass"])
