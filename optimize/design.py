@@ -29,11 +29,11 @@ class Catalogue(NamedTuple):
     columns: Mapping[str, Sequence[float]]
 
     def chosen(self, scene: Scene) -> str:
-        """Return the text of the rows that a scene of the design contains."""
+        """Return a line of text that names the rows whose values a scene has, or the nearest rows."""
         parameter, values = next(iter(self.columns.items()))
-        found = np.asarray(find_number(scene, parameter, "choices").read(scene))
-        places = np.argmin(np.abs(np.subtract.outer(found, values)), axis=1)
-        return f"chosen {self.name}: {'; '.join(dict.fromkeys(self.rows[k] for k in places))}"
+        in_scene = np.asarray(find_number(scene, parameter, "choices").read(scene))
+        nearest = np.argmin(np.abs(np.subtract.outer(in_scene, values)), axis=1)
+        return f"chosen {self.name}: {'; '.join(dict.fromkeys(self.rows[k] for k in nearest))}"
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,13 @@ class Design:
     def notes(self) -> list[str]:
         """Return a warning if the task contains a throw angle although all exciters turn in one direction; otherwise an empty
         list."""
-        asked = (self.objective, *(held.quantity for held in self.space.held), *(demand.quantity for demand in self.subject_to))
+        quantities = (
+            self.objective,
+            *(held.quantity for held in self.space.held),
+            *(demand.quantity for demand in self.subject_to),
+        )
         directions = {exciter.direction for exciter in self.space.scene.exciters}
-        if len(directions) > 1 or not any(part.name == "throw_angle" for quantity in asked for part in walk(quantity)):
+        if len(directions) > 1 or not any(part.name == "throw_angle" for quantity in quantities for part in walk(quantity)):
             return []
         return [
             "all exciters turn in one direction, so that points of the body move on ellipses; a straight throw needs two "

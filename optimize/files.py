@@ -42,13 +42,13 @@ def load_design(path: str | Path) -> Design:
     **Arguments**: `path` of a TOML file with
 
     - `scene`: the scene file, relative to the design file
-    - `[recipe]`: the `name` of a function of `optimize.recipes`, and its arguments, in place of the next four tables and of
-      the objective
+    - `[recipe]`: the `name` of a function of `optimize.recipes` (except `retune`), and its arguments, in place of the next
+      four tables and of the objective
     - `[free]`: bounds for each parameter that may change
     - `[ties]`: parameters that follow others
     - `[choices]`: parameters whose values are chosen from a list, or from a catalogue: `file`, a CSV file relative to the
-      design file, and the name of its `column`. For rows of a catalogue, such as motors, the key is any name, and its value is
-      a table of `file` and `columns`, which maps parameters to names of columns
+      design file, and the name of its `column`. If whole rows are chosen, such as motors, the key is any name. Its value is
+      then a table of `file` and `columns`; `columns` maps parameters to names of columns
     - every `[[hold]]`: a quantity and the `value` that it keeps; default: its value in the scene
     - every `[[demand]]`: a quantity that is `at_most` or `at_least` a value
     - `[objective]`: the quantity to minimize, or to maximize with `maximize = true`
@@ -147,8 +147,11 @@ def _search_options(table: Tables) -> Tables:
 
 
 def _read_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Catalogue | None:
-    """Return the catalogue of a choice: a column of a CSV file (a table with `file` and, if necessary, `column`), or several
-    columns, whose rows belong together (a table with `file` and `columns`); None for values in the design file itself."""
+    """Return the catalogue of a choice, or None if the design file itself contains the values.
+
+    The catalogue is a column of a CSV file (`values` is a table with `file` and, if necessary, `column`), or several columns
+    whose rows belong together (a table with `file` and `columns`).
+    """
     if not isinstance(values, Mapping) or any("." in parameter for parameter in values):
         return None
     column_names = values.get("columns", {name: values.get("column")})
@@ -173,17 +176,17 @@ def _demands(table: object, section: str) -> list[Demand]:
     if isinstance(table, Mapping) and "equal_to" in table:
         raise InputError(f"{section}.equal_to", "is not a demand; a quantity keeps a value by [[hold]] with value = ...")
     names = ("at_most", "at_least")
-    small, more = quantity_from_table(table, section, names)
-    if not more:
+    for_at_most, limits = quantity_from_table(table, section, names)
+    if not limits:
         raise InputError(section, "has no limit; give at_most, at_least or both")
-    large, _ = quantity_from_table(table, section, names, is_large_good=True)
-    return [small < limit if name == "at_most" else large > limit for name, limit in more.items()]
+    for_at_least, _ = quantity_from_table(table, section, names, is_large_good=True)
+    return [for_at_most < limit if name == "at_most" else for_at_least > limit for name, limit in limits.items()]
 
 
 def quantity_from_table(
     table: object, section: str, more: tuple[str, ...], *, is_large_good: bool = False
 ) -> tuple[Quantity, Tables]:
-    """Return the quantity that a table in the `section` of a file describes, and the values of the table's fields in `more`.
+    """Return the quantity that a table in the `section` of a file describes, and the values of its fields named in `more`.
 
     The worst machine within tolerances has the largest value or, if `is_large_good` is True, the smallest value.
 

@@ -55,7 +55,7 @@ class Front(Result):
         return scene_from_toml(self.machines[k])
 
     def summary(self) -> str:
-        """Return a line of text for each machine, in the units of `plot`."""
+        """Return the names of the quantities, and a line of text for each machine, in the units of `plot`."""
         labels, columns = self._shown()
         return "\n".join(
             [" against ".join(labels), *("  " + "  ".join(f"{x:.5g}" for x in row) for row in zip(*columns, strict=True))]
@@ -92,8 +92,8 @@ def pareto(
 ) -> Front:
     """Return the trade-off of two quantities, which are both minimized.
 
-    - Each end of the front is the least value of one quantity and, among the machines that have this value, the least value of
-      the other quantity
+    - At each end of the front, one quantity has its least value. Of all machines with this value, the one with the least value
+      of the other quantity is returned
     - Between the ends, upper limits on the second quantity are spaced evenly. For each limit, the first quantity is minimized,
       then the second quantity among machines with this value of the first
     - Each point needs two searches; all searches share their compiled programs

@@ -47,7 +47,7 @@ def _platforms(scene: Scene, least: int) -> Platforms:
     return scene.machine
 
 
-def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[str, tuple[Number, Number]]:
+def _spring_bounds(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[str, tuple[Number, Number]]:
     """Return the bounds k/`range_` and k*`range_` of the stiffness k of each spring in the fields `kinds` of the machine."""
     bounds: dict[str, tuple[Number, Number]] = {}
     factor = _factor(range_)
@@ -101,7 +101,8 @@ def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
     **Arguments**: `scene`: platforms with loads; `mode`: number of the jam mode (default 3); `range_`: largest factor by which
     each spring may become stiffer or softer; typical: 2 to 10 (default 5).
 
-    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine with fewer than two
+    platforms.
 
     >>> import jaxvib as jv
     >>> from optimize.recipes import antiphase
@@ -114,13 +115,13 @@ def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
     Source: the antiphase paper, section 5.1.
     """
     machine = _platforms(scene, 2)
-    free = _springs(machine, range_, ("stiffness", "link_stiffness"))
+    free = _spring_bounds(machine, range_, ("stiffness", "link_stiffness"))
     space = DesignSpace(scene, free, [hold(jam_frequency(mode=mode)), hold(support_frequency_squared())])
     return Design(space, force_per_amplitude(mode=mode))
 
 
 def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
-    """Return the design task for an anti-resonance machine of three masses: the least ratio of middle and outer amplitude.
+    """Return the design task for an anti-resonance machine of three masses: least middle amplitude per outer amplitude.
 
     The springs of the links are free, and the frequency of the jam keeps its value. The outer amplitude is the amplitude of the
     displacement of platform 1 relative to platform 3. Without damping and without a link 1-3, a natural mode of the frequency w
@@ -129,12 +130,13 @@ def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
 
     **Arguments**: `scene`: at least three platforms with loads; `mode`: number of the jam mode; `range_`: as for `antiphase`.
 
-    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine with fewer than three
+    platforms.
 
     Source: Filimonikhin et al., cited in the antiphase paper as [21].
     """
     machine = _platforms(scene, 3)
-    free = _springs(machine, range_, ("link_stiffness",))
+    free = _spring_bounds(machine, range_, ("link_stiffness",))
     space = DesignSpace(scene, free, [hold(jam_frequency(mode=mode))])
     ratio = amplitude(mode=mode, of=2) / amplitude(mode=mode, of=(1, 3))
     return Design(space, ratio.named("middle amplitude per outer amplitude"))
@@ -145,13 +147,15 @@ def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: in
 
     For each spring, a search finds the best machine that differs in this spring only.
 
-    **Arguments**: `objective`: the quantity to minimize; `range_`: the factor by which a spring may differ; `starts` of each
-    search.
+    **Arguments**: `scene`: platforms with loads; `objective`: the quantity to minimize; `range_`: largest factor by which a
+    spring may become stiffer or softer; typical: 2 to 10 (default 3); `starts`: number of starts of each search; typical: 16
+    (the default).
 
-    **Returns** the springs' names with their results, the best first. **Raises** the errors of `synthesize`.
+    **Returns** the springs' names with their results, the best first. **Raises** `InputError` for a machine without platforms,
+    and the errors of `synthesize`.
     """
     machine = _platforms(scene, 1)
-    free = _springs(machine, range_, ("stiffness", "link_stiffness"))
+    free = _spring_bounds(machine, range_, ("stiffness", "link_stiffness"))
     results = []
     for name, bounds in free.items():
         best = synthesize(DesignSpace(scene, {name: bounds}), objective, starts=starts, verify=False)
@@ -160,15 +164,15 @@ def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: in
 
 
 def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[int, int] | None = None) -> Design:
-    """Return the design task for the lightest loads with which a platform vibrates with at least the amplitude `least`.
+    """Return the design task for the lightest loads that cause at least the amplitude `least` of a platform.
 
     The mass of the loads is free, from one tenth to ten times its value; the radius of the track keeps its value.
 
     **Arguments**: `scene`: platforms with equal loads; `least`: amplitude, m zero to peak or text, typical: 0.5 to 10 mm;
     `mode` and `of`: as for `amplitude`.
 
-    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine, and for loads
-    of different masses.
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine without platforms,
+    and for loads of different masses.
     """
     _platforms(scene, 1)
     mass = np.asarray(scene.loads.mass)
@@ -191,14 +195,14 @@ def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[
     relative to the present one; typical: 0.7 to 1 (default 0.9).
 
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` if `keep` is not greater than 0 and
-    at most 1.
+    at most 1, for a machine without platforms, and for a jam mode that does not exist at the rotor speed of the scene.
     """
     count(mode, "mode")
     share = number_in(keep, "", "keep")
     if not 0.0 < share <= 1.0:
         raise InputError("keep", f"is {quoted(keep)}; it must be greater than 0 and at most 1")
     machine = _platforms(scene, 1)
-    space = DesignSpace(scene, _springs(machine, 3.0, ("stiffness", "link_stiffness")))
+    space = DesignSpace(scene, _spring_bounds(machine, 3.0, ("stiffness", "link_stiffness")))
     amplitude_of_mode = amplitude(mode=mode, of=of)
     present = float(amplitude_of_mode(scene))
     if not present > 0.0:
@@ -224,12 +228,12 @@ def linear_screen(
 
     - `scene`: a body in a plane with at least two exciters; typical: two equal motors that turn in opposite directions
     - `points` of the deck, (x, y), m or text, from the centre of mass; typical: feed end and discharge end
-    - `angle` of throw from the horizontal, rad or text; typical: "40 deg" to "50 deg" (default 45). For a deck that descends in
-      the direction of x, give the throw angle relative to the deck minus the angle of descent
+    - `angle` of throw from the horizontal, rad or text; typical: "40 deg" to "50 deg" (default "45 deg"). For a deck that
+      descends in the direction of x, give the throw angle relative to the deck minus the angle of descent
     - `stroke`, m peak to peak; typical: 6 to 12 mm; default: that of the scene
     - `reach`: distance by which each coordinate of an exciter may change, m; typical: 0.1 to 0.5 (default 0.3)
 
-    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine.
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of another kind.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import SCREENS
@@ -237,7 +241,7 @@ def linear_screen(
     >>> linear_screen(jv.scene_from_toml(SCREENS["linear_screen"]), points=[(-1.5, 0.1), (1.5, 0.1)]).space.size
     5
     """
-    free, ties = _exciters(scene, 2, reach)
+    free, ties = _exciter_bounds(scene, 2, reach)
     middle = _middle(points)
     held = [hold(throw_angle(at=middle), _throw_angle(angle)), hold(throw_stroke(at=middle), _stroke(stroke))]
     return Design(DesignSpace(scene, free, held, ties=ties), motion_spread(points), {"starts": _STARTS})
@@ -253,9 +257,9 @@ def circular_screen(
 
     **Arguments**: `scene`: a body in a plane, typical: with one exciter; `points`, `stroke`, `reach` as for `linear_screen`.
 
-    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine.
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of another kind.
     """
-    free, ties = _exciters(scene, 1, reach)
+    free, ties = _exciter_bounds(scene, 1, reach)
     middle = _middle(points)
     space = DesignSpace(scene, free, [hold(throw_stroke(at=middle), _stroke(stroke))], ties=ties)
     return Design(space, motion_spread(points), {"starts": _STARTS}, (roundness(at=middle) > _LEAST_ROUNDNESS,))
@@ -280,13 +284,13 @@ def feeder(
     **Arguments**
 
     - `scene`, `points`, `stroke`, `reach` as for `linear_screen`
-    - `angle` of throw from the horizontal, rad or text; typical: "20 deg" to "35 deg" (default 25)
+    - `angle` of throw from the horizontal, rad or text; typical: "20 deg" to "35 deg" (default "25 deg")
     - `range_`: factor by which the stiffness of a support may differ; typical: 1.2 to 2 (default 1.5)
     - `spread`: largest spread of the motions over the points (`motion_spread`); typical: 0.05 to 0.2 (default 0.1)
 
-    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine.
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of another kind.
     """
-    free, ties = _exciters(scene, 2, reach)
+    free, ties = _exciter_bounds(scene, 2, reach)
     factor, largest_spread = _factor(range_), _positive(spread, "", "spread")
     for k, support in enumerate(scene.machine.supports):  # pyright: ignore[reportAttributeAccessIssue]
         for j, value in enumerate(np.asarray(support.stiffness).tolist()):
@@ -298,7 +302,7 @@ def feeder(
     return Design(space, force_per_throw(at=middle), {"starts": _STARTS}, (motion_spread(points) < largest_spread,))
 
 
-def _exciters(scene: Scene, least: int, reach: Number) -> tuple[dict[str, Bounds], dict[str, Source]]:
+def _exciter_bounds(scene: Scene, least: int, reach: Number) -> tuple[dict[str, Bounds], dict[str, Source]]:
     """Return bounds of the positions of all exciters and of the first unbalance, and ties of the other unbalances to it."""
     if not isinstance(scene, Scene) or scene.machine.places != "plane":
         raise InputError("scene", "needs a body in a plane for this recipe, for example plane_body(...)")

@@ -30,8 +30,8 @@ _MAX_EQUAL_DIFFERENCE = 1e-4
 """Relative difference of the objectives of two machines below which they count as equally good."""
 
 _ROUNDING_SHARE = 1e-8
-"""The same difference relative to the change that 1 % of the most influential parameter causes. It is the larger one if both
-objectives are almost zero."""
+"""Fraction of the change of the objective that 1 % of the most influential parameter causes. Two machines whose objectives
+differ by less count as equally good, too: if the objective is almost zero, the difference is a rounding error."""
 
 _MIN_LIMIT_CHANGE = 1e-6
 """Smallest change of a limit, percent, for which the change of the objective is shown."""
@@ -100,9 +100,10 @@ class Limit(NamedTuple):
     - `active`: True if it limits the design
     - `multiplier`: derivative of the objective with respect to a relative relaxation of the limit (for held quantities: a
       relative increase of the held value), in the unit of the objective
-    - `gain`: change of the objective, percent, if the limit is relaxed by 1 %, predicted from this derivative; negative for an
-      improvement. A prediction of more than a few percent is not reliable
+    - `gain`: change of the objective, percent, if the limit is relaxed by 1 % (a held value: increased), predicted from this
+      derivative; negative for an improvement. A prediction of more than a few percent is not reliable
     - `written`: unit in which the user wrote the limit, such as "mm"; "" for the default display unit
+    - `held`: True for a held quantity
     """
 
     what: str
@@ -114,6 +115,7 @@ class Limit(NamedTuple):
     multiplier: float
     gain: float
     written: str = ""
+    held: bool = False
 
     def value_text(self) -> str:
         """Return the value in the unit of the limit as text."""
@@ -165,7 +167,7 @@ class Synthesis(Result):
     - `verified`: `Outcome` of the best design from `run`, a time integration of the full equations. Both are None if the run
       was not requested or failed; `unverified` states the reason
     - `table` of `Row`: every free parameter and quantity before and after, by the exact motion and by time integration
-    - `limits` of `Limit`: demands, held quantities and active bounds, with the gain from a change of each
+    - `limits` of `Limit`: demands, held quantities and active bounds, each with the gain from a change of its limit
     - `influences` of `Influence`: the influence of each free parameter
     - `machines` of `Machine`: the distinct final designs, with the number of starts that ended at each
     - `kkt`: relative residual of the Karush-Kuhn-Tucker conditions at the best design
@@ -249,7 +251,8 @@ class Synthesis(Result):
             if limit.violation > 0.0:
                 lines.append(f"  not met: {limit.what}; {limit.shortfall()}")
             elif limit.active:
-                lines.append(f"  at its limit: {limit.what} ({values}); {_limit_influence(sign * limit.gain)}")
+                change = "increased" if limit.held else "relaxed"
+                lines.append(f"  at its limit: {limit.what} ({values}); {_limit_influence(sign * limit.gain, change)}")
             else:
                 lines.append(f"  met: {limit.what} ({values})")
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
@@ -300,18 +303,18 @@ def _align_columns(rows: Sequence[Sequence[str]]) -> list[list[str]]:
     ]
 
 
-def _limit_influence(gain: float) -> str:
-    """Return text on the change of the objective with a limit, from the `gain` for a change of the limit by 1 %.
+def _limit_influence(gain: float, change: str) -> str:
+    """Return text on the change of a limit and the change of the objective that it causes.
 
-    The change of the limit in the text is reduced until the objective changes by at most one tenth, for which the linear
-    prediction is valid.
+    **Arguments**: `gain`: change of the objective, percent, if the limit changes by 1 %; if it is more than 10 %, the text
+    states a smaller change of the limit, for which the linear prediction is valid; `change` of the limit, such as "relaxed".
     """
     share = 1.0
     while abs(gain) * share > _MAX_LINEAR_PERCENT:
         share /= 10.0
     if share < _MIN_LIMIT_CHANGE:
         return "the objective is almost zero relative to its slope"
-    return f"changed by {share:g} %: about {gain * share + 0.0:+.3g} % of the objective"
+    return f"{change} by {share:g} %: about {gain * share + 0.0:+.3g} % of the objective"
 
 
 def objective_text(objective: str) -> str:

@@ -31,7 +31,7 @@ from jaxvib.steady.regimes.working import working_regime
 from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.exciters import RegimeQuantity, working_amplitude, working_speed
-from optimize.quantities.jams import amplitude, between, force_per_amplitude, foundation_force, jam_frequency
+from optimize.quantities.jams import amplitude, force_per_amplitude, foundation_force, jam_frequency, resolve_pair
 from optimize.quantities.quantity import Demand, Pair, Quantity, Tier, walk
 from optimize.result import Limit, Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
 from optimize.search.find import Options, Searcher, SearchResult, choose, require_searcher
@@ -96,8 +96,8 @@ def synthesize(
     - `rate`: first step of the descent, relative to the range of a free parameter; typical: 0.01 to 0.1 (default 0.05)
     - `polishing`: steps of sequential quadratic programming; typical: 12 (the default)
     - `searcher`: method before the polishing: "gradients", Adam from the starts; or "cma", CMA-ES for objectives with many
-      local minima (extra `cma`). CMA-ES uses no derivatives; it computes `starts` x `iterations` designs, and the few best of
-      them are polished
+      local minima (extra `cma`). CMA-ES uses no derivatives; it computes `starts` x `iterations` designs, and at most 8 of the
+      best ones are polished
     - `begin`: a `Synthesis` of this space; its final designs replace the random starts
     - `verify`: True to compute the exact motion of the best design. If it is stable, the full equations are integrated until
       the motion has settled, and the quantities are measured. The run starts near the exact motion: loads deviate by up to
@@ -135,27 +135,27 @@ def synthesize(
     report = partial(_report, progress, _SEARCH_SHARE if verify else 0.9)
     if begin is not None:
         options = dataclasses.replace(options, begin=_designs_to_continue(space, begin), starts=len(begin.designs))
-    given = space
+    initial_space = space
     space, problem, result = _search(space, objective, demands, options, report)
     neighbour_scenes = scenes_of(problem, neighbours(problem, result))
     scene = validate_scene(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], neighbour_scenes)))
-    status, unfinished, searched = _searched(result, space)
+    status, why_unverified, searched = _describe_searches(result, space)
     motion = _motion_of(space, objective, demands)
     named = _named_quantities(space, scene, objective, demands, motion)
     demand_sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
-    reports = _values_of_all((*(q for _, q in named), objective, *demand_sides), given.scene, neighbour_scenes, problem)
+    reports = _values_of_all((*(q for _, q in named), objective, *demand_sides), initial_space.scene, neighbour_scenes, problem)
     limits = limits_of(problem, demands, result, reports[1, len(named) + 1 :].reshape(-1, 2))
     if throw and status is SynthesisStatus.contradictory:
         raise _unmet(limits)
     report("integrating the best machine" if verify else "computing quantities", 0.9)
-    verify = verify and not unfinished
-    run, unverified = (None, unfinished) if unfinished else _run(scene, motion, verify)
+    verify = verify and not why_unverified
+    run, unverified = (None, why_unverified) if why_unverified else _run(scene, motion, verify)
     report("computing the exact motion", 0.99)
     other_tiers = _other_tiers(scene, [q for _, q in named], verify, run, motion)
-    rows = _table(given, scene, named, reports[:2, : len(named)], other_tiers)
+    rows = _table(initial_space, scene, named, reports[:2, : len(named)], other_tiers)
     n = len(_standard_rows(scene, motion, objective.of))
-    before, after = (_outcome(space, s, reports[k, :n]) for k, s in enumerate((given.scene, scene)))
-    verified = None if run is None else _by_run(space, run, motion, objective.of)
+    before, after = (_outcome(space, s, reports[k, :n]) for k, s in enumerate((initial_space.scene, scene)))
+    verified = None if run is None else _outcome_of_run(space, run, motion, objective.of)
     report("done", 1.0)
     return Synthesis(
         status=status,
@@ -175,14 +175,14 @@ def synthesize(
     )
 
 
-def _report(progress: Progress | None, searching: float, what: str, share: float) -> None:
+def _report(progress: Progress | None, search_share: float, what: str, share: float) -> None:
     """Report the finished share of the whole time.
 
-    **Arguments**: `searching`: share of the search in the whole time; `what`: name of the present step; `share`: 0 to 0.9
+    **Arguments**: `search_share`: share of the search in the whole time; `what`: name of the present step; `share`: 0 to 0.9
     during the search, 0.9 to 1 after it.
     """
     if progress is not None:
-        shown = share * searching / 0.9 if share <= 0.9 else searching + (share - 0.9) / 0.1 * (1.0 - searching)
+        shown = share * search_share / 0.9 if share <= 0.9 else search_share + (share - 0.9) / 0.1 * (1.0 - search_share)
         call_user(progress, "progress", what, shown)
 
 
@@ -192,21 +192,21 @@ def _unmet(limits: tuple[Limit, ...]) -> ComputationError:
     return failure(SynthesisStatus.contradictory, hint)
 
 
-def _searched(result: SearchResult, space: DesignSpace) -> tuple[SynthesisStatus, str, dict[str, Any]]:
+def _describe_searches(result: SearchResult, space: DesignSpace) -> tuple[SynthesisStatus, str, dict[str, Any]]:
     """Return the status of a search, the reason why its best machine is not verified ("" for none), and the fields of
     `Synthesis` that describe the searches."""
     best, z = result.best, result.designs(space)
     is_feasible = result.violation < 10.0 * FEASIBILITY_TOLERANCE
     done = is_feasible & (result.remaining_decrease < _CONVERGED_DECREASE)
     if result.interrupted:
-        status, unfinished = SynthesisStatus.interrupted, "the search was interrupted"
+        status, why_unverified = SynthesisStatus.interrupted, "the search was interrupted"
     elif not is_feasible[best]:
-        status, unfinished = SynthesisStatus.contradictory, "the machine does not meet all demands"
+        status, why_unverified = SynthesisStatus.contradictory, "the machine does not meet all demands"
     else:
-        status, unfinished = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged, ""
+        status, why_unverified = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged, ""
     return (
         status,
-        unfinished,
+        why_unverified,
         {
             "starts": len(z),
             "drawn": result.drawn,
@@ -239,7 +239,7 @@ def _validate_demands(space: DesignSpace, objective: Quantity, subject_to: Deman
             hint = "; for ==, use hold(quantity, value) in the DesignSpace" if isinstance(demand, bool) else ""
             raise InputError("subject_to", f"has {quoted(demand)}; write demands such as amplitude(mode=3) > '2 mm'{hint}")
     require_double(space.scene, "a search")
-    between(space.scene, objective.of)
+    resolve_pair(space.scene, objective.of)
     if space.scene.is_plain and not space.scene.drive.constant:
         raise InputError("drive", f"is {quoted(space.scene.drive.kind)}; a search needs a constant speed; use ConstantSpeed")
     return demands
@@ -439,7 +439,7 @@ def _table(
 
 
 class _SettledEvaluation(Evaluation):
-    """Results of a scene in which each run of a jam mode has settled in this mode."""
+    """Evaluation of a scene whose runs of jam modes have settled in their modes."""
 
     def jam_run(self, mode: int) -> Run:
         """Return the settled run of a jam mode. **Raises** `ComputationError` for an unstable mode."""
@@ -454,8 +454,8 @@ class _SettledEvaluation(Evaluation):
 def _other_tiers(
     scene: Scene, quantities: Sequence[Quantity], verify: bool, run: Run | None, motion: _Motion
 ) -> tuple[list[float], list[float]]:
-    """Return the values of the quantities by the exact motion and by settled runs; `run` is the settled run of `motion`. The
-    value is NaN for a quantity that the tier cannot compute, and for the run of a mode that is unstable."""
+    """Return the values of the quantities by the exact motion and by settled runs; `run` is the settled run of `motion`. A
+    value is NaN if the tier cannot compute the quantity, and a value by runs is NaN if its mode is unstable."""
 
     def value(quantity: Quantity, evaluation: Evaluation, tier: Tier) -> float:
         at_tier = quantity.at_tier(tier)
@@ -483,7 +483,7 @@ def _outcome(space: DesignSpace, scene: Scene, values: np.ndarray) -> Outcome:
     return Outcome(space.parameters(scene), math.isfinite(omega), omega, tuple(rest[:nd]), *rest[nd:])
 
 
-def _by_run(space: DesignSpace, run: Run, motion: _Motion, of: Pair) -> Outcome:
+def _outcome_of_run(space: DesignSpace, run: Run, motion: _Motion, of: Pair) -> Outcome:
     evaluation = Evaluation(run.scene)
     assert motion is not None
     evaluation.keep_run(motion, run)

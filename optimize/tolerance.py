@@ -26,7 +26,7 @@ _SHORT_NAMES = {
     "drag": re.compile(r"(exciters\[\d+\]\.)?loads\.drag"),
     "unbalance": re.compile(r"exciters\[\d+\]\.unbalance"),
 }
-"""Patterns of parameter names, by the short name that stands for them."""
+"""Pattern of the names of the parameters for which each short name stands."""
 
 _PERCENT = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*%")
 _RANGE = re.compile(r"(.+?)\.\.(.+)")
@@ -130,17 +130,17 @@ def _value(quantity: Quantity, scene: Scene) -> float:
 class Tolerances(NamedTuple):
     """Tolerances of a scene.
 
-    **Attributes**: `errors`: names of parameters with their relative tolerances; `ranges` of parameters.
+    **Attributes**: `relative`: names of parameters with their relative tolerances; `ranges` of parameters.
     """
 
-    errors: tuple[tuple[str, float], ...]
+    relative: tuple[tuple[str, float], ...]
     ranges: tuple[_NumberRange, ...]
 
 
 def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
     """Return tolerances from texts, see `tolerance_ranges`. **Raises** `InputError` for a text of another form, an unknown
     name, or a parameter that is named twice."""
-    errors: list[tuple[str, float]] = []
+    relative: list[tuple[str, float]] = []
     ranges: list[_NumberRange] = []
     present = numbers_of(scene)
     for text in tolerances:
@@ -157,22 +157,22 @@ def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
                 raise InputError("tolerances", f"is {quoted(text)}; the tolerance must be greater than 0 % and less than 100 %")
             pattern = _SHORT_NAMES.get(name)
             matching = [parameter for parameter in present if pattern is not None and pattern.fullmatch(parameter)]
-            errors += [(parameter, size) for parameter in matching or [find_number(scene, name, "tolerances").name]]
+            relative += [(parameter, size) for parameter in matching or [find_number(scene, name, "tolerances").name]]
         elif ends := _RANGE.fullmatch(value):
             ranges.append(_range(scene, name, ends[1], ends[2]))
         else:
             raise InputError("tolerances", f"is {quoted(text)}; write NAME=PERCENT or NAME=LOW..HIGH, such as stiffness=5%")
     # Material is added to a mass, which may have a tolerance of its own.
     changed = (each.number for each in ranges if not each.is_added)
-    require_single_tolerances([*(find_number(scene, name, "tolerances") for name, _ in errors), *changed])
-    return Tolerances(tuple(errors), tuple(ranges))
+    require_single_tolerances([*(find_number(scene, name, "tolerances") for name, _ in relative), *changed])
+    return Tolerances(tuple(relative), tuple(ranges))
 
 
 def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) -> Iterator[Scene]:
     """Yield copies of the scene whose parameters have random deviations."""
-    errors, ranges = read_tolerances(scene, tolerances)
+    relative, ranges = read_tolerances(scene, tolerances)
     random = np.random.default_rng((count(seed, "seed", low=0), 1))  # other random numbers than those of `Sampled`
-    batch = Sampled(errors, samples, seed).scenes(scene) if errors else None
+    batch = Sampled(relative, samples, seed).scenes(scene) if relative else None
     fractions = [random.permutation((np.arange(samples) + 0.5) / samples) for _ in ranges]
     for k in range(samples):
         machine = scene if batch is None else jax.tree.map(lambda leaf, k=k: leaf[k], batch)

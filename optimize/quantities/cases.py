@@ -49,9 +49,9 @@ def require_single_tolerances(numbers: Iterable[NamedNumber]) -> None:
 
 @dataclass(frozen=True)
 class Sampled:
-    """Case of many scenes whose parameters have random relative errors. The seed fixes the samples."""
+    """Case of many scenes whose parameters deviate within relative `tolerances`. The seed determines the samples."""
 
-    errors: tuple[tuple[str, float], ...]
+    tolerances: tuple[tuple[str, float], ...]
     samples: int
     seed: int
 
@@ -60,18 +60,19 @@ class Sampled:
     def factors(self, scene: Scene) -> list[tuple[NamedNumber, np.ndarray]]:
         """Return the factors (samples, entries) of each parameter, with normally distributed deviations from 1.
 
-        The deviations are limited to three standard deviations. The factors are a Latin hypercube: the samples of each entry
-        cover its distribution evenly, in an order that is independent of the other entries.
+        The deviations are limited to three standard deviations, and a factor is at least 0.05. The factors are a Latin
+        hypercube: the samples of each entry cover its distribution evenly, in an order that is independent of the other
+        entries.
         """
         random, out = np.random.default_rng(self.seed), []
         normal = NormalDist()
-        for name, error in self.errors:
+        for name, tolerance in self.tolerances:
             entry = find_number(scene, name, "tolerance")
             shares = (np.arange(self.samples) + 0.5) / self.samples
             deviations = np.clip([normal.inv_cdf(float(share)) for share in shares], -3.0, 3.0)
             deviation = np.stack([random.permutation(deviations) for _ in range(entry.size)], axis=1)
             # The tolerance is two standard deviations: 95 of 100 machines are within it.
-            out.append((entry, np.maximum(1.0 + 0.5 * error * deviation, 0.05)))
+            out.append((entry, np.maximum(1.0 + 0.5 * tolerance * deviation, 0.05)))
         require_single_tolerances([entry for entry, _ in out])
         return out
 
@@ -222,9 +223,9 @@ def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: in
     **Arguments**
 
     - `quantity` of each machine
-    - `tolerances`: a mapping from the name of a parameter or array of the scene to a relative tolerance (0.05: 5 %), which is
-      two standard deviations: 95 of 100 machines are within it. Each entry of an array has an independent, normally distributed
-      error, limited to one and a half tolerances; typical: 0.01 to 0.1 for masses and springs, 0.3 to 0.5 for damping
+    - `tolerances`: a mapping from the name of a parameter or array of the scene to a relative tolerance (0.05: 5 %); typical:
+      0.01 to 0.1 for masses and springs, 0.3 to 0.5 for damping. A tolerance is two standard deviations: 95 of 100 machines are
+      within it. Each entry of an array has an independent, normally distributed error, limited to one and a half tolerances
     - `samples`: number of random machines; typical: 16 to 256 (default 64). The computing time is proportional to this number
     - `seed` of the random machines (a Latin hypercube)
 

@@ -44,7 +44,8 @@ _LARGEST_MARGIN = 1e3
 """Value of the margin of equal motors, which is infinite; a search needs a finite one."""
 
 _PEAK_STEPS, _PEAK_REACH = 8, 0.1
-"""Number of steps of the search for the speed of the largest torque at a resonance, and largest distance from the resonance."""
+"""Number of steps of the search for the speed of the largest torque at a resonance, and largest relative distance of this speed
+from the resonance."""
 
 _MAX_PASSED_RESONANCE = 0.95
 """Largest natural frequency, relative to the least no-load speed of the motors, that counts as a resonance that a run-up
@@ -150,7 +151,7 @@ def conveying_speed(
     **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; `slope` of the deck, rad or text; typical: "-15 deg" to 0 (the
     default).
 
-    **Returns** `Quantity`; typical: 0.1 to 0.5. **Raises** `InputError` for `at` that is not a point.
+    **Returns** `Quantity`; typical: 0.1 to 0.5 m/s. **Raises** `InputError` for `at` that is not a point.
 
     >>> from optimize import conveying_speed
     >>> (conveying_speed(at=(0.0, 0.1)) > "0.25 m/s").words

@@ -33,10 +33,11 @@ __all__ = [
 ]
 
 
-def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
-    """Return the platform, or the pair of platforms, whose amplitude is computed; of other machines the number of a coordinate.
+def resolve_pair(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
+    """Return the platform or the pair of platforms `of`, with its default in place of None.
 
-    This is `of`; for None it is platform 1 relative to platform 2, or the only platform, or the first coordinate.
+    The default is platform 1 relative to platform 2, or the only platform. For a machine without platforms, the numbers are
+    those of coordinates, and the default is the first one.
 
     **Raises** `InputError` for a platform that the machine does not have.
     """
@@ -49,7 +50,7 @@ def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
         return platforms[0]
     if whole and len(platforms) == 2 and platforms[0] != platforms[1]:
         return platforms[0], platforms[1]
-    raise InputError("of", f"is {quoted(of)}; give a platform or a pair of different platforms of 1 to {n}")
+    raise InputError("of", f"is {quoted(of)}; give a platform from 1 to {n}, or a pair of different platforms")
 
 
 def jam_quantity(
@@ -97,7 +98,7 @@ def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity
 
     - `mode`: number of the jam mode, 1 to 2 nd + 1; typical: 1, 3, 5, which are stable for light loads
     - `of`: a platform, or a pair of them for a relative amplitude; typical: 1 to 3; default: platform 1 relative to 2, or the
-      only one. Of a machine without platforms, the number of a coordinate that is a displacement (default: 1, which is
+      only one. For a machine without platforms: the number of a coordinate that is a displacement (default: 1, which is
       horizontal)
     - `tier`: "leading" (light loads, by algebra; the default), "exact" (the exact periodic motion), or "time" (the full
       equations, integrated from the jam for 60 periods of the lowest natural frequency); typical computing times for a machine:
@@ -115,7 +116,7 @@ def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity
 
 
 def jam_amplitude(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
-    chosen = between(evaluation.scene, of)
+    chosen = resolve_pair(evaluation.scene, of)
     structure = evaluation.scene.machine.structure()
     for number in np.ravel(chosen):
         if structure.units[number - 1] != "m":
@@ -159,7 +160,7 @@ def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") ->
 
 
 def _phase(evaluation: Evaluation, tier: Tier, mode: int, of: tuple[int, int]) -> Array:
-    between(evaluation.scene, of)  # raises an error for platforms that the scene does not have
+    resolve_pair(evaluation.scene, of)  # raises an error for platforms that the scene does not have
     i, j = of
     if tier == "leading":
         first = evaluation.jam(mode).displacement
@@ -315,7 +316,7 @@ def _margins(evaluation: Evaluation, sign: float, tier: Tier, mode: int) -> Arra
 
 @validated
 def largest_multiplier(*, mode: int) -> Quantity:
-    """Return the largest modulus of the non-trivial Floquet multipliers of the exact motion, which is stable if it is below 1.
+    """Return the largest modulus of the non-trivial Floquet multipliers of the exact motion; the motion is stable below 1.
 
     **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5.
 

@@ -23,7 +23,7 @@ from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.user_inputs import count_required_arguments, number_in, same_unit
 
 Pair = int | tuple[int, int] | None
-"""Platform of an amplitude, or pair of platforms of a relative amplitude; None: see `between`."""
+"""Platform of an amplitude, or pair of platforms of a relative amplitude; None: see `resolve_pair`."""
 
 Tier: TypeAlias = Literal["leading", "exact", "time"]
 """Method by which a quantity is computed: leading order of light loads, the exact periodic motion, or time integration."""

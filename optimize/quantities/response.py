@@ -269,8 +269,8 @@ def _fold_distances(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
     scene = evaluation.scene
     require_unbalances(scene)
     if len(scene.exciters) > 1 or scene.exciter.drive.ideal:
-        has_text = f"{len(scene.exciters)} exciters" if len(scene.exciters) > 1 else "an ideal drive"
-        raise InputError("scene", f"has {has_text}; folds of the response exist for one exciter with a motor")
+        problem = f"has {len(scene.exciters)} exciters" if len(scene.exciters) > 1 else "has an ideal drive"
+        raise InputError("scene", f"{problem}; folds of the response exist for one exciter with a motor")
     operating, folds = operation_of(unbalanced_model(scene, jnp.zeros(1, scene.top_speed.dtype)))
     working = jnp.max(jnp.where(operating.exists, operating.speed, -jnp.inf))
     speeds = jnp.where(folds.exists, folds.speed, 0.0)

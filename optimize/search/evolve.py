@@ -20,8 +20,8 @@ _VIOLATION_PENALTY = 10.0
 """Penalty of a demand or held quantity that is violated by 100 %, in units of the median objective of the first designs."""
 
 _DESIGNS_PER_BATCH = 8
-"""Number of designs in a batch. It is small because populations are small, and because usually only a few designs of a
-population need a search for their jams on the whole branch."""
+"""Number of designs in a batch. Populations are small, and usually only a few of their designs need a search on the whole
+branch."""
 
 _MAX_STORED_DESIGNS = 200
 """Number of the latest designs whose jams are stored."""
@@ -116,12 +116,12 @@ def evolve(problem: Problem, evaluations: int, seed: int, report: Callable[[floa
     merits, designs, history = np.zeros(0), np.zeros((0, problem.space.size)), []
     size, drawn, existing, run, interrupted = np.nan, 0, 0, 0, False
     # The package fails for a single free parameter; therefore a second one without effect is added.
-    searched = max(problem.space.size, 2)
-    population = 4 + int(3 * np.log(searched))
+    dimension = max(problem.space.size, 2)
+    population = 4 + int(3 * np.log(dimension))
     random = np.random.default_rng(seed)
     try:
         while drawn < evaluations:
-            begin = random.uniform(size=searched)
+            begin = random.uniform(size=dimension)
             options = {"bounds": [0, 1], "seed": 1 + seed + run, "verbose": -9, "popsize": population << run}
             strategy = cma.CMAEvolutionStrategy(begin, 0.3, options)
             while not strategy.stop() and drawn < evaluations:

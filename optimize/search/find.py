@@ -99,10 +99,10 @@ def find(problem: Problem, options: Options, report: Progress) -> SearchResult |
     """
     simplified = None if options.begin is not None else problem.simplified()
     if simplified is None:
-        return _find(problem, options, report)
-    first = _find(simplified, options, lambda what, share: report(what, 0.5 * share))
+        return _search_from_starts(problem, options, report)
+    first = _search_from_starts(simplified, options, lambda what, share: report(what, 0.5 * share))
     if first is None:
-        return _find(problem, options, report)
+        return _search_from_starts(problem, options, report)
     if first.interrupted:
         begin, options = _best_distinct(first)[:1], replace(options, iterations=0, polishing=0)
     elif _has_tolerances(problem):
@@ -113,7 +113,7 @@ def find(problem: Problem, options: Options, report: Progress) -> SearchResult |
     narrow = _in_small_batches(problem, problem.space)
     if len(begin) == 0:
         begin = first.point.z[:_STARTS_PER_BOUND]
-    result = _find(narrow, replace(options, begin=begin), lambda what, share: report(what, 0.5 + 0.5 * share))
+    result = _search_from_starts(narrow, replace(options, begin=begin), lambda what, share: report(what, 0.5 + 0.5 * share))
     if result is None:
         return None
     interrupted = first.interrupted or result.interrupted
@@ -121,8 +121,7 @@ def find(problem: Problem, options: Options, report: Progress) -> SearchResult |
 
 
 def _in_small_batches(problem: Problem, space: DesignSpace) -> Problem:
-    """Return the problem for the design space `space`, with batches of `_STARTS_PER_BOUND` designs, because few designs are
-    evaluated."""
+    """Return the problem for the design space `space`, with small batches, because few designs are evaluated."""
     return replace(problem, space=space, batch_size=_STARTS_PER_BOUND)
 
 
@@ -132,7 +131,7 @@ def _has_tolerances(problem: Problem) -> bool:
     return any(isinstance(part, Robust) for q in quantities for part in walk(q))
 
 
-def _find(problem: Problem, options: Options, report: Progress) -> SearchResult | None:
+def _search_from_starts(problem: Problem, options: Options, report: Progress) -> SearchResult | None:
     """Search from random starts, or from the designs `begin`.
 
     **Returns** None if the objective does not exist for any design. An interrupt (KeyboardInterrupt) ends the search with its
@@ -325,8 +324,8 @@ def _best_distinct(result: SearchResult) -> np.ndarray:
 def _solve_in_bounds(
     problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.ndarray, polishing: int
 ) -> SearchResult | None:
-    """Solve the problem within the bounds `low` and `high` by `polishing` steps from designs with these `numbers` (s, d),
-    SI."""
+    """Polish the designs with the free parameters `numbers` (s, d), SI, in `polishing` steps within the bounds `low` and
+    `high`."""
     space = problem.space.within(low, high)
     narrow = _in_small_batches(problem, space)
     z = np.asarray(space.shares(np.clip(numbers, low, high)))

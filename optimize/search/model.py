@@ -129,10 +129,10 @@ def curvatures(
     hessian = constraints + np.einsum("sp,sipd->sid", shares / size[:, None], second[:, :, weights.shape[1] : -1])
     usable = np.all(np.isfinite(hessian), axis=(1, 2), keepdims=True)
     hessian = np.where(usable, hessian, np.eye(d))
-    counts = np.ones(weights.shape, bool)
-    counts[:, m:] = weights[:, m:] > 1e-12
+    is_active = np.ones(weights.shape, bool)
+    is_active[:, m:] = weights[:, m:] > 1e-12
     free = 1.0 - (((point.z <= 0.0) | (point.z >= 1.0)) * 1.0)
-    rows = np.where(np.isfinite(point.slopes), point.slopes, 0.0)[:, 1:] * counts[:, :, None]
+    rows = np.where(np.isfinite(point.slopes), point.slopes, 0.0)[:, 1:] * is_active[:, :, None]
     if problem.parts > 1:  # pieces that are equal at a kink stay equal along it
         rows = np.concatenate([rows, kink_residuals(point, shares, size)[1]], axis=1)
     rows = rows * free[:, None, :]

@@ -106,11 +106,11 @@ def restore(
         finite = point.exists()
         slopes = np.where(finite[:, None, None], point.slopes, 0.0)[:, 1:]
         values = np.where(finite[:, None], point.values, 0.0)[:, 1:]
-        counts = np.ones(values.shape, bool)
-        counts[:, m:] = values[:, m:] > 0.0
+        is_used = np.ones(values.shape, bool)
+        is_used[:, m:] = values[:, m:] > 0.0
         if demanded is not None:
-            counts[:, m:] |= demanded
-        slopes, values = slopes * counts[:, :, None], values * counts
+            is_used[:, m:] |= demanded
+        slopes, values = slopes * is_used[:, :, None], values * is_used
         if shares is not None:
             gap, piece_gradients = kink_residuals(point, shares, np.maximum(np.abs(point.values[:, 0]), 1e-300))
             slopes, values = np.concatenate([slopes, piece_gradients], axis=1), np.concatenate([values, gap], axis=1)
@@ -383,29 +383,29 @@ def optimality(problem: Problem, point: Point) -> Optimality:
     s = len(point.z)
     slopes = np.where(np.isfinite(point.slopes), point.slopes, 0.0)
     rows, slope = slopes[:, 1:], slopes[:, 0]
-    counts = np.ones((s, m + mi), bool)
-    counts[:, m:] = point.values[:, 1 + m :] > -ACTIVE_DISTANCE
+    is_active = np.ones((s, m + mi), bool)
+    is_active[:, m:] = point.values[:, 1 + m :] > -ACTIVE_DISTANCE
     if problem.parts > 1:
         slope, piece_gradients, meets = at_kink(point, ACTIVE_DISTANCE)
-        rows, counts = np.concatenate([rows, piece_gradients], axis=1), np.concatenate([counts, meets], axis=1)
+        rows, is_active = np.concatenate([rows, piece_gradients], axis=1), np.concatenate([is_active, meets], axis=1)
     at_low, at_high = point.z <= ACTIVE_DISTANCE, point.z >= 1.0 - ACTIVE_DISTANCE
     fixed = np.asarray(problem.space.low == problem.space.high)[None, :] & np.ones((s, 1), bool)
     free = ~(at_low | at_high | fixed)
-    dual = np.zeros(counts.shape)
+    dual = np.zeros(is_active.shape)
     rest = slope
-    for _ in range(3 + counts.shape[1] - m):
-        part = rows * counts[:, :, None] * free[:, None, :]
+    for _ in range(3 + is_active.shape[1] - m):
+        part = rows * is_active[:, :, None] * free[:, None, :]
         gram = part @ transposed(part)
         ridge = np.finfo(float).eps * (1e-300 + np.trace(gram, axis1=1, axis2=2)) + 1e-300
         right = -np.einsum("smd,sd->sm", part, slope * free)
-        dual = np.linalg.solve(gram + ridge[:, None, None] * np.eye(counts.shape[1]), right[..., None])[..., 0] * counts
+        dual = np.linalg.solve(gram + ridge[:, None, None] * np.eye(is_active.shape[1]), right[..., None])[..., 0] * is_active
         rest = slope + np.einsum("sm,smd->sd", dual, rows)
-        still_active = counts.copy()
+        still_active = is_active.copy()
         still_active[:, m:] &= dual[:, m:] >= 0.0
         inward = (at_low & (rest < 0.0)) | (at_high & (rest > 0.0))
-        if np.array_equal(still_active, counts) and not np.any(inward & ~free & ~fixed):
+        if np.array_equal(still_active, is_active) and not np.any(inward & ~free & ~fixed):
             break
-        counts, free = still_active, free | (inward & ~fixed)
+        is_active, free = still_active, free | (inward & ~fixed)
     bounds = np.where(free | fixed, 0.0, -rest)
     size = np.maximum(np.abs(slope).max(axis=1), np.abs(point.values[:, 0]))
     residual = np.max(np.abs(np.where(fixed, 0.0, rest + bounds)), axis=1) / np.maximum(size, 1e-300)

@@ -45,7 +45,7 @@ def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult,
         violation = 0.0 if size <= 10.0 * FEASIBILITY_TOLERANCE else size if np.isfinite(size) else np.inf
         value = float(at * (1.0 + deviation))
         multiplier = float(-dual * np.sign(at))
-        rows.append(Limit(what, held.quantity.unit, value, at, float(violation), True, multiplier, gain(multiplier)))
+        rows.append(Limit(what, held.quantity.unit, value, at, float(violation), True, multiplier, gain(multiplier), held=True))
     for k, demand in enumerate(demands):
         excess, dual, scale = values[1 + held_count + k], duals.demands[best, k], float(problem.scales[k])
         violation = 0.0 if excess <= 10.0 * FEASIBILITY_TOLERANCE else excess if np.isfinite(excess) else np.inf

@@ -189,7 +189,7 @@ def space_of(free, held=()):
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), 3.0), "must be a Quantity"),
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), foundation_force(mode=9)), "numbered 1 to 5"),
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), amplitude(mode=3, of=(1, 1))), "pair of different platforms"),
-        (lambda: synthesize(space_of({"loads.drag": (1, 2)}), amplitude(mode=3, of=4)), "of 1 to 2"),
+        (lambda: synthesize(space_of({"loads.drag": (1, 2)}), amplitude(mode=3, of=4)), "from 1 to 2"),
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), foundation_force(mode=3), starts=0), "starts is 0"),
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), foundation_force(mode=3), rate=2.0), "rate is 2.0"),
     ],

@@ -35,7 +35,7 @@ def test_results_are_shown_in_practical_units(searched):
     machines = (Machine(3, 2e4, (1.0,)), Machine(1, 3e4, (2.0,)))
     shown = dataclasses.replace(searched, limits=limits, influences=influences, machines=machines)
     said = shown.findings()
-    assert said[0] == "  at its limit: first at most 2 mm (2 mm); changed by 1 %: about -0.5 % of the objective"
+    assert said[0] == "  at its limit: first at most 2 mm (2 mm); relaxed by 1 %: about -0.5 % of the objective"
     assert said[1] == "  not met: second at most 3 mm; at best 3.3 mm, 10 % off"
     assert said[2] == "  met: third at most 4 mm (1 mm)"
     assert said[3] == "  1 % less / more last: -1.5 % / +9 % of the objective"
@@ -43,7 +43,7 @@ def test_results_are_shown_in_practical_units(searched):
     assert said[8] == "  2 different machines: 3 x 20, 1 x 30 kN"
     greatest = dataclasses.replace(shown, objective="negative pull", machines=(Machine(3, -2e4, (1.0,)), machines[0]))
     assert greatest.findings()[-1] == "  2 different machines: 3 x 20, 3 x -20 kN"
-    assert greatest.findings()[0].endswith("changed by 1 %: about +0.5 % of the objective")  # of the pull itself
+    assert greatest.findings()[0].endswith("relaxed by 1 %: about +0.5 % of the objective")  # of the pull itself
     assert greatest.findings()[3] == "  1 % less / more last: +1.5 % / -9 % of the objective"
     one = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=machines[:1]).findings()
     assert one == ["  1 % less / more x: +400 kN / -0.2 kN"]  # 2000 % of 2e4 N: of almost nothing a share tells nothing
@@ -97,16 +97,19 @@ def test_shortfalls_are_shown_in_practical_units():
 @pytest.mark.parametrize(
     ("gain", "says"),
     [
-        (-10.0, "changed by 1 %: about -10 % of the objective"),
-        (10.1, "changed by 0.1 %: about +1.01 % of the objective"),
-        (-2833.0, "changed by 0.001 %: about -2.83 % of the objective"),  # not -1360 N of a force of 48 N
+        (-10.0, "relaxed by 1 %: about -10 % of the objective"),
+        (10.1, "relaxed by 0.1 %: about +1.01 % of the objective"),
+        (-2833.0, "relaxed by 0.001 %: about -2.83 % of the objective"),  # not -1360 N of a force of 48 N
         (1e12, "the objective is almost zero relative to its slope"),
-        (0.0, "changed by 1 %: about +0 % of the objective"),
+        (0.0, "relaxed by 1 %: about +0 % of the objective"),
     ],
 )
 def test_predictions_are_limited_to_small_changes(searched, gain, says):
-    (line,) = dataclasses.replace(searched, limits=(limit("a", 1.0, 1.0, gain=gain),), influences=(), machines=()).findings()
+    demand = limit("a", 1.0, 1.0, gain=gain)
+    shown = dataclasses.replace(searched, limits=(demand, demand._replace(held=True)), influences=(), machines=())
+    line, held_line = shown.findings()
     assert line == f"  at its limit: a (1 m); {says}"
+    assert held_line == line.replace("relaxed", "increased")
 
 
 def test_figures_show_the_results(searched, monkeypatch):
@@ -131,13 +134,13 @@ def test_figures_show_the_results(searched, monkeypatch):
 @pytest.mark.parametrize(
     ("gain", "text"),
     [
-        (0.5, "changed by 1 %: about +0.5 % of the objective"),
-        (-25.0, "changed by 0.1 %: about -2.5 % of the objective"),
+        (0.5, "relaxed by 1 %: about +0.5 % of the objective"),
+        (-25.0, "relaxed by 0.1 %: about -2.5 % of the objective"),
         (1e9, "the objective is almost zero relative to its slope"),
     ],
 )
 def test_influence_of_a_limit_is_stated_for_a_small_change(gain, text):
-    assert _limit_influence(gain) == text
+    assert _limit_influence(gain, "relaxed") == text
 
 
 def test_machines_of_one_value_are_equally_good(searched):

@@ -12,7 +12,7 @@ import jaxvib as jv
 from optimize import amplitude, fold_margin, foundation_force, phase, total
 from optimize.quantities import evaluation as answers_module
 from optimize.quantities.evaluation import Evaluation, TargetRecorder, speed_of_target
-from optimize.quantities.jams import between
+from optimize.quantities.jams import resolve_pair
 from optimize.quantities.user_inputs import count_required_arguments, same_unit
 
 SCENE = scene("two_mass")
@@ -103,14 +103,14 @@ def test_modes_are_numbered():
 
 @pytest.mark.parametrize(("of", "found"), [(None, (1, 2)), (2, 2), ([1, 2], (1, 2)), ((2, 1), (2, 1)), ((1,), 1)])
 def test_default_platforms_of_an_amplitude(of, found):
-    assert between(SCENE, of) == found
-    assert between(scene("one_mass")) == 1
+    assert resolve_pair(SCENE, of) == found
+    assert resolve_pair(scene("one_mass")) == 1
 
 
 @pytest.mark.parametrize("of", [0, 3, True, 1.0, (1, 1), (1, 3), (1, 2, 1), ()])
 def test_unknown_platforms_of_an_amplitude_are_refused(of):
-    with pytest.raises(jv.InputError, match="a pair of different platforms of 1 to 2"):
-        between(SCENE, of)
+    with pytest.raises(jv.InputError, match="a platform from 1 to 2, or a pair of different platforms"):
+        resolve_pair(SCENE, of)
 
 
 def test_amplitudes_and_forces_of_each_tier():

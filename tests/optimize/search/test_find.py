@@ -201,7 +201,11 @@ def test_second_search_starts_from_the_best_of_the_first(tolerances, polishing, 
         return results[problem]
 
     problem = SimpleNamespace(simplified=lambda: "simple", space=SimpleNamespace(size=2))
-    for name, part in (("_find", search), ("_in_small_batches", lambda *_: "small"), ("_has_tolerances", lambda _: tolerances)):
+    for name, part in (
+        ("_search_from_starts", search),
+        ("_in_small_batches", lambda *_: "small"),
+        ("_has_tolerances", lambda _: tolerances),
+    ):
         monkeypatch.setattr(find_module, name, part)
     found = find(problem, dataclasses.replace(OPTIONS, polishing=polishing), lambda what, share: told.append(share))
     (one, first), (other, second) = asked

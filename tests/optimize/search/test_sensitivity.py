@@ -31,7 +31,7 @@ def test_limits_have_the_gain_from_their_change():
     found = ended([[0.5, 0.5]], [[-5.0, 1e-3, 0.0, -0.5, 2.5]], [2.0], [3.0, 9.0, 0.5])
     sides = np.array([[4.0, 4.0], [4.0, 8.0], [7.0, 2.0]])
     held, first, room, broken = limits_of(problem, demands, found, sides)
-    assert held.what == "sum held at 7" and held.active and held.limit == 7.0
+    assert held.what == "sum held at 7" and held.held and held.active and held.limit == 7.0
     np.testing.assert_allclose(
         [held.value, held.violation, held.multiplier, held.gain], [7.007, 1e-3, -2.0, -2.0 / 5.0], rtol=1e-12
     )
