@@ -279,7 +279,7 @@ def test_design_files_equal_designs_in_python(tmp_path, monkeypatch):
     (tmp_path / "design.toml").write_text(DESIGN)
     design = load_design(tmp_path / "design.toml")
     assert design.objective.operation == "neg" and design.objective.parts[0].statistic == "expected"
-    assert design.objective.parts[0].case.samples == 8 and design.objective.parts[0].case.errors == (("machine.mass", 0.1),)
+    assert design.objective.parts[0].case.samples == 8 and design.objective.parts[0].case.tolerances == (("machine.mass", 0.1),)
     assert [(d.sense, d.constant) for d in design.subject_to] == [("at most", 1e3), ("at least", 5.0)]
     assert float(design.space.held[0].value) == 8e4  # what it is in the scene
     np.testing.assert_allclose(design.space.at(jnp.array([0.5, 0.0])).machine.stiffness, [5e4, 2.5e4])
