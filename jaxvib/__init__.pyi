@@ -61,8 +61,9 @@ from jaxvib.equations.forces import foundation_moment as foundation_moment, norm
 
 # Measures of a vibration
 from jaxvib.steady.measures import vibration_measures as vibration_measures, Vibration as Vibration
-from jaxvib.steady.measures import VibrationMeasures as VibrationMeasures, vibration_zone as vibration_zone
+from jaxvib.steady.measures import VibrationMeasures as VibrationMeasures
 from jaxvib.steady.measures import conveying_speed as conveying_speed
+from jaxvib.steady.zone import vibration_zone as vibration_zone
 
 # Motion of points
 from jaxvib.steady.points import ellipse_of as ellipse_of, Ellipse as Ellipse, Deck as Deck

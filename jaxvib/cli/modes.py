@@ -179,6 +179,15 @@ def _left_out(scene: jv.Scene) -> list[str]:
     return ["amplitudes and forces are those of the loads only:", f"  {adds}"] if named else []
 
 
+def _force_lines(scene: jv.Scene) -> list[str]:
+    """Return lines about the foundation force of a table."""
+    from jaxvib.motion.analysis.measure import ROOT_SUM_SQUARE  # slow import, which --help does not need
+
+    if len(scene.machine.structure().foundation_directions) == 1:
+        return ["foundation force: zero to peak"]
+    return [f"foundation force: zero to peak, {ROOT_SUM_SQUARE}", "  (sqrt(2) times a force that rotates)"]
+
+
 def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     """Print the jams of light loads at any phases."""
     import jax  # slow imports, which --help does not need
@@ -236,7 +245,8 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
             if measures_of_jam is not None
         ]
         drags = _drag_lines(scene, limits)
-        return "\n".join([conclusion, table(title, head, rows), *measure_texts, *drags, *_left_out(scene)])
+        lines = [conclusion, table(title, head, rows), *_force_lines(scene), *measure_texts, *drags, *_left_out(scene)]
+        return "\n".join(lines)
 
     output.done(document, text, "modes", result)
 

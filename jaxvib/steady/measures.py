@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -17,10 +17,10 @@ from jaxvib.display import GRAVITIES, quantity_text
 from jaxvib.equations.jammed_bodies import friction_on_light_loads
 from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model, peak_force, rotating_direction
 from jaxvib.equations.torque_balance import resultant_of
-from jaxvib.errors import InputError, quoted, require_one_of
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import BodyPoint, Place, on_body, read_place
 from jaxvib.machine.effects.base import has_term
-from jaxvib.machine.effects.terms import ContactFriction
+from jaxvib.machine.effects.terms import ContactFriction, GravityField
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.plane_body import PlaneNetwork
 from jaxvib.machine.structures.platforms import Platforms
@@ -34,19 +34,10 @@ from jaxvib.steady.jams.jam import Jam
 from jaxvib.steady.jams.phases import PhaseJam
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.points import at_positive_speed, ellipse_at, read_slope, require_amplitudes, rows_in_plane
-from jaxvib.units import Number, number, numbers
+from jaxvib.steady.zone import vibration_zone
+from jaxvib.units import Number, number
 from jaxvib.units.known import when_known
 from jaxvib.units.reading import STANDARD_GRAVITY
-
-ZONE_LIMITS = {
-    ("large", "rigid"): (2.3e-3, 4.5e-3, 7.1e-3),
-    ("large", "flexible"): (3.5e-3, 7.1e-3, 11.0e-3),
-    ("medium", "rigid"): (1.4e-3, 2.8e-3, 4.5e-3),
-    ("medium", "flexible"): (2.3e-3, 4.5e-3, 7.1e-3),
-}
-"""Boundaries A/B, B/C and C/D of the zones of ISO 20816-3, m/s RMS, for machines of 300 kW to 50 MW ("large") and of 15 to
-300 kW ("medium"), on rigid and on flexible supports, as practitioners quote them. The text of the standard was not available
-for a comparison, and public pages contradict each other."""
 
 _MIN_SLIP = 1e-4
 """Slip n - Omega, relative to n, below which the torque is computed from the dissipation of the carrier. At this slip the
@@ -63,6 +54,12 @@ _MAX_ACCELERATION, _MAX_THROW_NUMBER = 8.0, 8.0
 """Acceleration, g, and throw number above which `VibrationMeasures.notes` doubts a vibration: values usual in practice are 3 to
 6 g, and up to 7 g for fine sieving and dewatering."""
 
+_WEAK_THROW_NUMBER = 1.5
+"""Throw number below which texts add that material hardly leaves the deck: the lowest one usual for feeders."""
+
+_MAX_SHOWN_SHARE = 10.0
+"""Transmissibility above which texts state a multiple in place of percent."""
+
 
 def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
     """Return the amplitude of the acceleration, in g, of a sine of `amplitude`, m zero to peak, and `speed`, rad/s."""
@@ -72,49 +69,6 @@ def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
 def rms_velocity_of(amplitude: Array, speed: Array | float) -> Array:
     """Return the root mean square of the velocity, m/s, of a sine of `amplitude`, m zero to peak, and `speed`, rad/s."""
     return speed * amplitude / np.sqrt(2.0)
-
-
-@validated
-def vibration_zone(
-    velocity: Number,
-    *,
-    machine: Literal["medium", "large"] = "medium",
-    supports: Literal["rigid", "flexible"] = "flexible",
-    limits: Sequence[Number] | None = None,
-) -> str:
-    """Return the zone A, B, C or D of ISO 20816-3 of a vibration.
-
-    A: new machines; B: allowed for long operation; C: allowed for a limited time; D: can cause damage. The standard applies to
-    parts that must not vibrate, such as motors, frames and foundations. It does not apply to decks, which must vibrate; their
-    velocities are usually in zone D.
-
-    **Arguments**
-
-    - `velocity`: root mean square, m/s or text; typical: "1 mm/s" to "10 mm/s"
-    - `machine`: "medium" for 15 to 300 kW (the default), or "large" for 300 kW to 50 MW
-    - `supports`: "flexible" (the default) or "rigid"
-    - `limits` A/B, B/C, C/D, m/s, ascending, from your copy of the standard or from a contract, in place of the built-in ones;
-      typical: ["2.3 mm/s", "4.5 mm/s", "7.1 mm/s"]
-
-    The built-in limits are values usual in practice. They were not compared with the text of the standard: use `limits` if
-    a contract depends on them.
-
-    **Returns** a letter. **Raises** `InputError` for a negative velocity, another name, and limits that do not ascend.
-
-    >>> vibration_zone("3 mm/s"), vibration_zone("3 mm/s", supports="rigid")
-    ('B', 'C')
-    >>> vibration_zone("3 mm/s", limits=["3.5 mm/s", "7.1 mm/s", "11 mm/s"])
-    'A'
-
-    Source: ISO 20816-3 defines the zones.
-    """
-    size = float(number(velocity, "m/s", "velocity", low=0.0))
-    require_one_of(machine, ("medium", "large"), "machine")
-    require_one_of(supports, ("rigid", "flexible"), "supports")
-    ends = ZONE_LIMITS[machine, supports] if limits is None else np.asarray(numbers(limits, "m/s", "limits", 3, low=0.0))
-    if np.any(np.diff(ends) < 0.0):
-        raise InputError("limits", f"are {', '.join(f'{each:g}' for each in ends)} m/s; they must ascend")
-    return "ABCD"[int(np.searchsorted(ends, size))]
 
 
 class Vibration(NamedTuple):
@@ -151,7 +105,8 @@ class VibrationMeasures(Readable):
     - `stroke` (nt,), m peak to peak; typical: 2 to 20 mm
     - `acceleration` (nt,), amplitude in g; typical: 2 to 6 for screens
     - `velocity` (nt,), m/s root mean square; typical: 50 to 300 mm/s
-    - `exciter_force`, N zero to peak: resultant of the centrifugal forces
+    - `exciter_force`, N zero to peak: resultant of the centrifugal forces; for forces in two directions the root of the sum of
+      the squares of both peaks, that is sqrt(2) times a force that rotates
     - `transmissibility`: foundation force divided by `exciter_force`; inf if the centrifugal forces cancel, NaN if one of the
       two forces is unknown
     - `foundation_load` (directions,), N zero to peak: force on the foundation in each direction, across and up for a body in a
@@ -159,7 +114,8 @@ class VibrationMeasures(Readable):
     - `static_deflection` (nt,), m: downward displacement of each coordinate (of x: to the left) under the weight of machine
       and loads, 0 for a platform that no support carries; typical: 5 to 30 mm for screens
     - `static_load` (ns,), N: weight that each support carries, negative if the support pulls the foundation up. It and
-      `static_deflection` are NaN if the supports cannot carry the weight, or if the directions of coordinates are unknown
+      `static_deflection` are NaN if the supports cannot carry the weight, if the directions of coordinates are unknown, and for
+      a rotor without the effect `Gravity`, whose axis may be vertical
     - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on a support.
       They are NaN, as is `foundation_load` in two directions, for a scene with supports that are effects (`CubicSupport`,
       `Stop`, `FrictionSupport`), and for matrices without a foundation
@@ -199,8 +155,16 @@ class VibrationMeasures(Readable):
         """Share of the exciter's force that does not reach the foundation, 1 - transmissibility; it may be negative."""
         return 1.0 - self.transmissibility
 
+    @property
+    def _is_rotor(self) -> bool:
+        """True for machines that move in two directions and have no deck: rotors."""
+        return self.point is None and len(self.directions) > 1
+
     def notes(self) -> list[str]:
-        """Return a sentence for an acceleration above 8 g, and for a throw number above 8, which usual screens do not reach."""
+        """Return a sentence for an acceleration above 8 g, and for a throw number above 8, which usual screens do not reach;
+        none for a rotor."""
+        if self._is_rotor:
+            return []
         accelerations, throws = (self.acceleration, self.point_acceleration), (self.throw_number,)
         fastest, highest = (
             max((float(x) for value in values if value is not None for x in np.ravel(value) if np.isfinite(x)), default=0.0)
@@ -222,12 +186,12 @@ class VibrationMeasures(Readable):
     def summary(self) -> str:
         """Return the measures as text, one line for each coordinate, each support, the isolation, each shaft and each point.
 
-        The zone of ISO 20816-3 is not shown for a body in a plane: it is usually a deck, whose zone is D.
+        The zone of ISO 20816-3 is shown for rotors only: the standard does not apply to platforms and decks that must vibrate.
         """
-        of, zones = ("", True) if self.point is None else (" of the centre of mass", False)
+        of = "" if self.point is None else " of the centre of mass"
         lines = [
             f"{name}{of}: stroke {quantity_text(self.stroke[k], 'm', 4)} peak to peak, {float(self.acceleration[k]):.3g} g, "
-            f"{1e3 * float(self.velocity[k]):.4g} mm/s RMS{_zone_text(float(self.velocity[k])) if zones else ''}"
+            f"{1e3 * float(self.velocity[k]):.4g} mm/s RMS{_zone_text(float(self.velocity[k])) if self._is_rotor else ''}"
             for k, name in enumerate(self.coordinates)
             if not float(self.stroke[k]) < _NEGLIGIBLE * float(np.max(self.stroke))
         ]
@@ -245,18 +209,30 @@ class VibrationMeasures(Readable):
             loads = zip(self.foundation_load, self.directions, strict=True)
             forces = ", ".join(f"{quantity_text(force, 'N', 4)} {name}" for force, name in loads)
             lines.append(f"foundation: {forces} (dynamic)")
-        ratio, owner = float(self.transmissibility), "exciter's" if len(self.torque) == 1 else "exciters'"
-        if ratio < _LARGEST_TRANSMISSIBILITY:
-            passed = f"of the {owner} {quantity_text(self.exciter_force, 'N', 4)}, {100.0 * ratio:.3g} % reach the foundation"
-            lines.append(passed + (f" (isolation {100.0 * (1.0 - ratio):.3g} %)" if ratio < 1.0 else ""))
-        elif float(self.exciter_force) == 0.0:
-            lines.append("the forces of the exciters cancel: there is no transmissibility")
+        lines += self._transmissibility_text()
         shafts = [
             f"mean torque {float(t):.4g} N m, mean power {float(p):.4g} W" for t, p in zip(self.torque, self.power, strict=True)
         ]
         number = [""] if len(shafts) == 1 else [f" of exciter {k + 1}" for k in range(len(shafts))]
         lines += [f"shaft{k}: {text}" for k, text in zip(number, shafts, strict=True) if "nan" not in text]
         return "\n".join([*lines, *self._throw_text()])
+
+    def _transmissibility_text(self) -> list[str]:
+        ratio, force = float(self.transmissibility), float(self.exciter_force)
+        if force == 0.0:
+            return ["the forces of the exciters cancel: there is no transmissibility"]
+        if not ratio < _LARGEST_TRANSMISSIBILITY:
+            return []
+        if len(self.torque) > 1:
+            name = f"exciters' {quantity_text(force, 'N', 4)}"
+        elif len(self.directions) > 1:  # the peak in each direction is that of the rotating force
+            name = f"exciter's rotating {quantity_text(force / np.sqrt(2.0), 'N', 4)}"
+        else:
+            name = f"exciter's {quantity_text(force, 'N', 4)}"
+        if ratio > _MAX_SHOWN_SHARE:
+            return [f"the foundation receives {ratio:.3g} times the {name}"]
+        isolation = f" (isolation {100.0 * (1.0 - ratio):.3g} %)" if ratio < 1.0 else ""
+        return [f"of the {name}, {100.0 * ratio:.3g} % reach the foundation{isolation}"]
 
     def _throw_text(self) -> list[str]:
         names = ("point_stroke", "point_acceleration", "throw_angle", "throw_number", "conveying_speed")
@@ -272,9 +248,15 @@ class VibrationMeasures(Readable):
             lines += [
                 f"point ({', '.join(f'{float(x):.4g}' for x in place)}) m: stroke {quantity_text(stroke, 'm', 4)} peak to peak "
                 f"at {quantity_text(angle, 'rad', 4)}, {acceleration:.3g} g,",
-                f"  throw number {throw:.3g}, {conveys}",
+                f"  throw number {throw:.3g}{_weak_throw_text(throw)}, {conveys}",
             ]
         return lines
+
+
+def _weak_throw_text(throw: float) -> str:
+    if throw < 1.0:
+        return " (below 1: material does not leave the deck)"
+    return " (material hardly leaves the deck; feeders have 1.5 to 3.3)" if throw < _WEAK_THROW_NUMBER else ""
 
 
 def _zone_text(velocity: float) -> str:
@@ -318,7 +300,7 @@ def vibration_measures(
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0),
     ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
     >>> print(vibration_measures(scene, jv.jam_modes(scene).select(1)).summary())
-    y1: stroke 17.11 mm peak to peak, 0.638 g, 163.6 mm/s RMS (zone D)
+    y1: stroke 17.11 mm peak to peak, 0.638 g, 163.6 mm/s RMS
     static deflection, down: y1 12.5 mm
     support 1: 500.1 N static, 349.1 N dynamic
     of the exciter's 73.14 N, 477 % reach the foundation
@@ -392,7 +374,8 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
     carrier = model.carrier
     lengths = np.flatnonzero(np.asarray(carrier.units) == "m")
     amplitude, (displacement, w) = motion.amplitude[lengths], at_positive_speed(motion.displacement, motion.speed)
-    sag = weight_deflection(model)
+    has_weight = scene.machine.places != "shaft" or has_term(scene.effects, GravityField)
+    sag = weight_deflection(model) if has_weight else None
     static, dynamic, side = support_loads(model, w, displacement, sag)
     forced = motion.exciter_force != 0.0  # True for NaN
     force = model.known_force(motion.foundation_force)

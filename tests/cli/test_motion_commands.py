@@ -297,7 +297,7 @@ def test_response_lists_operating_points_peaks_and_folds(typed, tmp_path):
     (tmp_path / "table.toml").write_text(UNBALANCED)
     code, out, err = typed("response", "table.toml", "--points", "300", "--csv", "curve.csv")
     assert (code, err) == (0, "") and max(map(len, out.splitlines())) <= 80
-    assert out.count("(zone D)") == 2 and "jump to, rpm" in out
+    assert "zone" not in out and "jump to, rpm" in out
     document = json.loads(typed("response", "table.toml", "--points", "300", "--json")[1])
     found = jv.response(jv.load_scene(tmp_path / "table.toml"), points=300)
     speeds = [each["speed"] for each in document["operating_points"]]

@@ -255,6 +255,8 @@ def test_bearings_of_a_rotor_carry_weight_and_whirl():
     scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(300.0), unbalance=1e-3, at=0.1)])
     motion = jv.response(scene).operating.vibration()
     measures = jv.vibration_measures(scene, motion)
+    assert np.all(np.isnan(measures.static_load)) and "static" not in measures.summary()  # the axis may be vertical
+    measures = jv.vibration_measures(dataclasses.replace(scene, effects=(jv.Gravity(),)), motion)
     y, z, theta, psi = np.asarray(motion.displacement)
     for j, place in enumerate((0.165, -0.155)):
         across = ((6e5, 5e5)[j] + 300j * (400.0, 300.0)[j]) * (y + place * theta)
@@ -269,6 +271,18 @@ def test_no_transmissibility_is_shown_for_balanced_loads(jam):
     measures = jv.vibration_measures(*jam)
     balanced = dataclasses.replace(measures, transmissibility=jnp.asarray(3.5e5))
     assert "reach the foundation" in measures.summary() and "reach the foundation" not in balanced.summary()
+
+
+def test_texts_of_rotors_state_the_rotating_force():
+    drive = jv.ConstantSpeed(40.0)
+    rotor = jv.Scene(jv.planar_rotor(mass=50.0, stiffness=4e4, damping=0.0), exciters=[jv.Exciter(drive=drive, unbalance=0.1)])
+    near = jv.vibration_measures(rotor, jv.response(rotor, speeds=[29.0]).vibration())
+    circle = 0.1 * 29.0**2  # N, not sqrt(2) times as much
+    ratio = 4e4 / (4e4 - 50.0 * 29.0**2)
+    assert f"the foundation receives {abs(ratio):.3g} times the exciter's rotating {circle:.4g} N" in near.summary()
+    assert "zone D" in near.summary() and near.notes() == [] and max(near.acceleration) > 1.0
+    far = jv.vibration_measures(rotor, jv.response(rotor, speeds=[40.0]).vibration())
+    assert "of the exciter's rotating 160 N, 100 % reach the foundation" in far.summary()
 
 
 def test_an_exact_jam_has_the_measures_of_its_period(jam):
@@ -337,8 +351,16 @@ def test_an_averaged_motor_has_the_torque_of_its_speed():
     np.testing.assert_allclose(measures.power, lost, rtol=1e-3)  # the tolerance of a step is 1e-4
 
 
-@pytest.mark.parametrize(("unbalance", "notes"), [(0.6, []), (1.9, ["the acceleration is 9.", "the throw number is 9."])])
-def test_accelerations_above_8_g_have_notes(unbalance, notes):
+@pytest.mark.parametrize(
+    ("unbalance", "notes", "throw"),
+    [
+        (0.15, [], "0.773 (below 1: material does not leave the deck), conveys 0.000 m/s"),
+        (0.25, [], "1.29 (material hardly leaves the deck; feeders have 1.5 to 3.3), "),
+        (0.6, [], "3.09, conveys"),
+        (1.9, ["the acceleration is 9.", "the throw number is 9."], "9.79, flights longer"),
+    ],
+)
+def test_unusual_accelerations_and_throws_have_notes(unbalance, notes, throw):
     springs = [jv.support(at=(x, 0.0), stiffness=(1e4, 1e4), damping=(50.0, 50.0)) for x in (-1.0, 1.0)]
     body = jv.plane_body(mass=200.0, inertia=100.0, supports=springs)
     scene = jv.Scene(body, exciters=[jv.Exciter(drive=jv.ConstantSpeed(100.0), unbalance=unbalance, at=(0.0, 0.0))])
@@ -346,6 +368,7 @@ def test_accelerations_above_8_g_have_notes(unbalance, notes):
     y = unbalance * 1e4 / abs(2e4 - 200.0 * 1e4 + 1e4j)  # closed form
     np.testing.assert_allclose(measures.throw_number, 1e4 * y / G, rtol=1e-9)
     assert [each[: len(start)] for each, start in zip(measures.notes(), notes, strict=True)] == notes
+    assert f"throw number {throw}" in measures.summary()
 
 
 EXCITER = jv.Exciter(drive=jv.ConstantSpeed(40.0), unbalance=0.1)

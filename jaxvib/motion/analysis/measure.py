@@ -27,6 +27,9 @@ MIN_CHANGE_SCALE = 1e-4
 """Smallest scale for relative changes, in units of the unbalance radius S/M for amplitudes and of S n^2 for forces. It is
 needed because the amplitude and the force of a balanced rotor are almost zero."""
 
+ROOT_SUM_SQUARE = "root sum square of both directions"
+"""Text on a foundation force of two directions: the root of the sum of the squares of both peaks."""
+
 _POINTS_IN_STEP = 8
 """Number of points in each sampling step at which a kinked force is searched for extrema. A second search covers the distance
 to the next point on each side of the extremum. It divides each of these two distances into the same number of parts."""
@@ -123,7 +126,8 @@ class AbstractMeasured(Readable):
         named = zip(structure.coordinates, self.amplitude, structure.units, strict=True)
         amplitude = ", ".join(f"{name} {quantity_text(a, unit, 4)}" for name, a, unit in named)
         force = quantity_text(self.foundation_force, "N", 4) if scene.machine.has_foundation else "unknown"
-        return f"amplitude, zero to peak: {amplitude}; foundation force {force}"
+        kind = f" ({ROOT_SUM_SQUARE})" if scene.machine.has_foundation and len(structure.foundation_directions) > 1 else ""
+        return f"amplitude, zero to peak: {amplitude}; foundation force {force}{kind}"
 
     def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array]) -> str:
         """Return a line of text with the speeds of the turning masses, and the last rotor speed of each exciter with loads.
