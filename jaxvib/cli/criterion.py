@@ -93,7 +93,7 @@ def _ends(span: Sequence[float | None], scale: float) -> list[str]:
     nargs=2,
     type=SPEED_TYPE,
     metavar="LOW HIGH",
-    help="Two rotor speeds, such as '300 rpm' '1500 rpm'; between them find all speeds at which each arrangement is stable.",
+    help="Also find the stable ranges of each arrangement between two rotor speeds, such as '300 rpm' '1500 rpm'.",
 )
 @click.option("--points", type=int, default=200, show_default=True, help="Number of speeds for --between.")
 @WITHOUT

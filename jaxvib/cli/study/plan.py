@@ -21,9 +21,9 @@ def plan(identification: Path, fit: Path | None, output: Output) -> None:
     per minute of test.
 
     The file names the runs recorded so far, as for `identify`, and has a table [[candidate]] for each run that could be
-    recorded next: a ramp, a dwell or a coast-down, other places of sensors, or changed parameters of the machine, such as an
-    added mass. With the table [limits], the speed of the best candidate over time is optimized for the smallest expected
-    errors."""
+    recorded next: a run-up, a run at constant speed or a coast-down, other places of sensors, or changed parameters of the
+    machine, such as an added mass. With the table [limits], the speed of the best candidate over time is optimized for the
+    smallest expected errors."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.display import speed_text

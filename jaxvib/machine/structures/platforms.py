@@ -26,7 +26,7 @@ class Platforms(Machine):
 
     **Attributes** (n platforms, L links); typical values: see `two_mass`
 
-    - `mass` (n,), kg, of the platforms; the exciter's platform includes the body of the exciter, not its loads
+    - `mass` (n,), kg, of the platforms; the exciter's platform includes the exciter without its loads
     - `stiffness` (n,), N/m, and `damping` (n,), N s/m, of the supports
     - `link_stiffness` (L,), N/m, and `link_damping` (L,), N s/m
     - `links`: the pair of platforms that each link joins, numbered from 1
