@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns
 from jaxvib.results.result import Result
@@ -64,6 +65,12 @@ def outcome(
     refused = enumeration_of(result.status).refused  # pyright: ignore[reportAttributeAccessIssue]
     status = jax.tree.map(lambda own, other: jnp.where(allowed, own, other), result.status, refused)
     return eqx.tree_at(lambda result: result.status, without_numbers(allowed, result), status)
+
+
+def require_index(index: int, size: int, entries: str) -> None:
+    """**Raises** `InputError` unless `index` is the number, from 0, of one of `size` entries."""
+    if not 0 <= index < size:
+        raise InputError("index", f"is {quoted(index)}; there are {size} {entries}, counted from 0")
 
 
 def entry(batch: Result, kind: type[SomeResult], index: int) -> SomeResult:

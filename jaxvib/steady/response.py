@@ -29,7 +29,7 @@ from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Pieces, branch_pieces, branch_root, grid_near_poles, resampled_grid, scanned_speed
 from jaxvib.steady.measures import Vibration, acceleration_of, rms_velocity_of
-from jaxvib.steady.outcome import REFUSED, outcome
+from jaxvib.steady.outcome import REFUSED, outcome, require_index
 from jaxvib.steady.regimes.local import regime_growth
 from jaxvib.steady.regimes.synchronous import require_one_speed
 from jaxvib.units import Number, Numbers, count, number, numbers
@@ -96,8 +96,7 @@ class AbstractResponse(Readable):
 
         **Raises** `InputError` if there are fewer speeds.
         """
-        if not 0 <= index < (speeds := self.speed.shape[0]):
-            raise InputError("index", f"is {index}; there are {speeds} speeds, counted from 0")
+        require_index(index, self.speed.shape[0], "speeds")
         return Vibration(*(getattr(self, name)[index] for name in Vibration._fields))
 
 

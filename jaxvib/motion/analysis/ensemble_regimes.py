@@ -15,7 +15,6 @@ from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.state import State
-from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drives.controlled import SwitchedOff
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.scene_field import mass_names
@@ -26,6 +25,7 @@ from jaxvib.results.readable import Readable
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phases import degrees
+from jaxvib.steady.outcome import require_index
 
 MAX_RELATIVE_ROTATION = 0.5
 """Largest difference, rad, between the angles through which masses of one speed turn in the last quarter of a run. The value
@@ -162,8 +162,7 @@ class EnsembleRegimes(Result):
 
         **Raises** `InputError` if there are fewer regimes.
         """
-        if not 0 <= index < self.runs.size:
-            raise InputError("index", f"is {quoted(index)}; there are {self.runs.size} regimes, counted from 0")
+        require_index(index, self.runs.size, "regimes")
         group, parts = self.group[index], []
         for number in dict.fromkeys(group.tolist()):
             members = np.flatnonzero(group == number)

@@ -12,6 +12,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
+from jaxvib.equations.torque_balance import TorqueBalance, balance_residuals
 from jaxvib.numerics.linalg import solve_definite
 from jaxvib.ode.scalar_programs import fenced
 from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, scalarized_program, scalars_of
@@ -81,6 +82,15 @@ def damped_newton(
     numbers = iter(_iterate(lambda *now: fenced(program, [*now, *constants]), scalars_of(begin), iterations))
     arrays = [jnp.stack([next(numbers) for _ in range(leaf.size)]).reshape(leaf.shape) for leaf in leaves]
     return jax.tree.unflatten(structure, arrays)[:2]
+
+
+def solve_torques(start: Array, balance: TorqueBalance, iterations: int = 40, *, on_scalars: bool = False) -> Array:
+    """Return the unknowns of a torque balance with the smallest residuals, see `damped_newton` and `unknowns_of`."""
+
+    def residuals(x: Array, balance: TorqueBalance) -> tuple[Array, None]:
+        return balance_residuals(x, balance), None
+
+    return damped_newton(residuals, start, balance, iterations, on_scalars=on_scalars)[0]
 
 
 def _on_arrays(step: Callable[[_State, Args], _State], begin: _State, args: Args) -> Callable[..., Sequence[Array]]:

@@ -14,7 +14,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text
 from jaxvib.equations.averaged import averaged_growth, decays
 from jaxvib.equations.torque_balance import TorqueBalance, assemble_for_search, assemble_torque_balance, response_of
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import validate_scene
@@ -34,7 +34,7 @@ from jaxvib.steady.jams.phase_starts import (
     solved_clusters,
 )
 from jaxvib.steady.jams.phases import AbstractPhaseJam, PhaseJam, PhaseStatus, jam_from, loads_with_drag, phase_jam
-from jaxvib.steady.outcome import entry
+from jaxvib.steady.outcome import entry, require_index
 from jaxvib.units import count, random_numbers
 
 _SHOWN_DRAG_FACTOR = 30.0
@@ -68,9 +68,7 @@ class PhaseJams(AbstractPhaseJam):
     @validated
     def select(self, index: int) -> PhaseJam:
         """Return the jam with an `index`, counted from 0. **Raises** `InputError` if there are fewer jams."""
-        n = self.omega.shape[0]
-        if not 0 <= index < n:
-            raise InputError("index", f"is {quoted(index)}; there are {n} jams, counted from 0")
+        require_index(index, self.omega.shape[0], "jams")
         return entry(self, PhaseJam, index)
 
     @validated

@@ -34,7 +34,7 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import sentence, status_name
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.newton import damped_newton
+from jaxvib.steady.jams.newton import solve_torques
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.units import number, numbers
 
@@ -168,14 +168,10 @@ def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_scal
 
     `on_scalars`: compile the equations as operations on single numbers, see `damped_newton`.
     """
-
-    def residuals(x: Array, given: TorqueBalance) -> tuple[Array, None]:
-        return balance_residuals(x, given), None
-
     frozen = jax.lax.stop_gradient(balance)
     start = jax.lax.stop_gradient(unknowns_of(balance, omega, phase))
     on_scalars = on_scalars and balance.model.modal is None  # a sum over many modes has too many operations
-    x, _ = damped_newton(residuals, start, frozen, on_scalars=on_scalars)
+    x = solve_torques(start, frozen, on_scalars=on_scalars)
     # One more Newton step: its derivative with respect to the scene is that of the implicit function theorem.
     x = x - eliminate(jax.jacfwd(balance_residuals)(x, frozen), balance_residuals(x, balance))
     w, angles = motion_of(balance, x)

@@ -10,6 +10,7 @@ of the mount.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -67,21 +68,15 @@ class Floquet(NamedTuple):
 
 
 def decay_error(needed: int | Array, steps: int | Array, turn: float, *, implicit: bool) -> Array:
-    """Return a bound of the relative growth or decay of an undamped oscillation of the carrier over the span of the grid.
-
-    **Arguments**: the `needed` number of integration steps, see `steps_for`, from which the phase of the fastest oscillation
-    follows; the number of `steps` that are taken; the span as an angle `turn`, rad.
-    """
+    """Return a bound of the relative growth or decay of an undamped oscillation of the carrier over the span `turn`, rad, of
+    the grid, if the number of `steps` differs from the `needed` number of `steps_for`."""
     phase = ((radau.PHASE if implicit else _PHASE_PER_STEP) * needed - 2.0 * turn) / jnp.asarray(steps)
     return radau.decay_error(phase, steps) if implicit else _GROWTH_ERROR * phase**10 * steps
 
 
 def multiplier_error(trivial: Array, decay_error: Array) -> Array:
-    """Return the error of the moduli of multipliers near 1: the largest of three known errors.
-
-    They are the error of the `trivial` multiplier, which is exactly 1, that of an undamped oscillation of the carrier by the
-    integration, and rounding.
-    """
+    """Return the error of the moduli of multipliers near 1: the largest of the error of the `trivial` multiplier, which is
+    exactly 1, the decay of an undamped oscillation by the integration, and rounding."""
     rounding = _ROUNDING_ERRORS * float(jnp.finfo(trivial.dtype).eps)
     return jnp.maximum(jnp.abs(trivial - 1.0), jnp.maximum(decay_error, rounding))
 
@@ -103,11 +98,10 @@ def _damping_rate(model: JammedBodies) -> Array:
 def _drag_rate(model: JammedBodies, omega: Array, speed: Array) -> Array:
     """Return the fastest rate of decay by drag and friction of the loads at load speeds `omega`, 1/s.
 
-    The motion of the carrier reduces the inertia of a body of loads. The rate is
-
         max_g(-T_rate / I)_g / (1 - mu sum_g S_g^2 / I_g),      mu the largest eigenvalue of B M^-1 B^T
 
-    T_rate is the derivative of the torque on a body with respect to its speed.
+    The denominator is the share of the inertia of a body that the motion of the carrier leaves; T_rate is the derivative of its
+    torque with respect to its speed.
     """
     linear, mount = model.linear, model.linear.mount
     still = jnp.zeros((len(mount.axes), 1), linear.mass.dtype)
@@ -317,7 +311,8 @@ def floquet(
     if has_relative_motion:
         fields, sizes = (*fields, equations.relative_motion), (*sizes, 1)
     transition = _implicit_transition if implicit else _explicit_transition
-    whole, *relative = transition(equations, grid, harmonics, fields, sizes, h, steps, max_steps)
+    integrate = functools.partial(_integrate, equations, grid, harmonics, h, steps, max_steps)
+    whole, *relative = transition(equations, fields, sizes, h, integrate)
     flip: Any = np.tile(np.concatenate([np.full(nd, -1.0 if model.half_turn else 1.0), np.ones(count)]), 2)
     trivial, rest = jax.vmap(deflate, in_axes=-1)(flip[:, None, None] * whole, equations.along_orbit(grid, harmonics))
     roots = _eigenvalues(rest).T
@@ -328,16 +323,13 @@ def floquet(
 _Field: TypeAlias = Callable[[_Coefficients, Array, Array], Array]
 """Second derivatives (n, ..., P) of some coordinates, from their values and first derivatives."""
 
+_Step: TypeAlias = Callable[[_Coefficients, tuple[Array, ...]], tuple[Array, ...]]
+_Integrate: TypeAlias = Callable[[np.ndarray, Sequence[int], _Step], tuple[Array, ...]]
+"""`_integrate` with all arguments but the last three."""
+
 
 def _explicit_transition(
-    equations: _Disturbances,
-    grid: Grid,
-    harmonics: Harmonics,
-    fields: Sequence[_Field],
-    sizes: Sequence[int],
-    h: Array,
-    steps: int | Array,
-    max_steps: int | None,
+    equations: _Disturbances, fields: Sequence[_Field], sizes: Sequence[int], h: Array, integrate: _Integrate
 ) -> tuple[Array, ...]:
     """Return transition matrices (2 n, 2 n, P) over the span of the grid, one for each field, by explicit steps of length
     `h`."""
@@ -361,19 +353,11 @@ def _explicit_transition(
         rates, _ = jax.lax.scan(stage, rates, (jnp.arange(len(_NODES)), rows, at))
         return tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
 
-    begin = lambda: tuple(_units(2 * size, equations) for size in sizes)  # noqa: E731
-    return _integrate(equations, grid, harmonics, _NODES, h, steps, max_steps, begin, step)
+    return integrate(_NODES, sizes, step)
 
 
 def _implicit_transition(
-    equations: _Disturbances,
-    grid: Grid,
-    harmonics: Harmonics,
-    fields: Sequence[_Field],
-    sizes: Sequence[int],
-    h: Array,
-    steps: int | Array,
-    max_steps: int | None,
+    equations: _Disturbances, fields: Sequence[_Field], sizes: Sequence[int], h: Array, integrate: _Integrate
 ) -> tuple[Array, ...]:
     """Return the transition matrices of `_explicit_transition`, by implicit steps."""
     # One solve for all equations, because its program is as large as the rest of the step.
@@ -389,8 +373,7 @@ def _implicit_transition(
         over = jax.vmap(lambda a: radau.transition(a, h), in_axes=-1, out_axes=-1)(each)
         return (jnp.einsum("abp,bcp->acp", over, state[0]),)
 
-    begin = lambda: (_units(2 * total, equations),)  # noqa: E731
-    (end,) = _integrate(equations, grid, harmonics, radau.NODES, h, steps, max_steps, begin, step)
+    (end,) = integrate(radau.NODES, (total,), step)
     both = end.reshape(2, total, 2, total, orbits)
     parts = np.split(np.arange(total), np.cumsum(sizes)[:-1])
     return tuple(both[:, k][:, :, :, k].reshape(2 * k.size, 2 * k.size, orbits) for k in parts)
@@ -400,14 +383,14 @@ def _integrate(
     equations: _Disturbances,
     grid: Grid,
     harmonics: Harmonics,
-    nodes: np.ndarray,
     h: Array,
     steps: int | Array,
     max_steps: int | None,
-    begin: Callable[[], tuple[Array, ...]],
-    step: Callable[[_Coefficients, tuple[Array, ...]], tuple[Array, ...]],
+    nodes: np.ndarray,
+    sizes: Sequence[int],
+    step: _Step,
 ) -> tuple[Array, ...]:
-    """Return the state after `steps` steps from `begin`, each with the coefficients at its `nodes`."""
+    """Return the state after `steps` steps from unit matrices of 2 `sizes`, each with the coefficients at its `nodes`."""
     places = jnp.asarray(nodes, dtype=equations.omega.dtype)
     # exp(i k theta) is updated by a product in each step, because sines and cosines at every node took a quarter of the time.
     every = np.arange(max(grid.deviation_orders[-1], grid.orders[-1]) + 1)
@@ -419,7 +402,8 @@ def _integrate(
         at = _Coefficients(*(jnp.moveaxis(part, -2, 0) for part in found))
         return turned * turning, step(at, state)
 
-    return repeat(whole_step, steps, (jnp.ones_like(turning), begin()), max_steps)[1]
+    begin = jnp.ones_like(turning), tuple(_units(2 * size, equations) for size in sizes)
+    return repeat(whole_step, steps, begin, max_steps)[1]
 
 
 def _units(size: int, equations: _Disturbances) -> Array:

@@ -29,9 +29,7 @@ from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.regimes.search import MAX_COMPLETE, all_regimes
 from jaxvib.steady.regimes.synchronous import (
-    RegimeSearchStatus,
     RegimeStatus,
     SynchronousRegimes,
     fields_of_balance,
@@ -69,10 +67,7 @@ def collected_regimes(scene: Scene) -> SynchronousRegimes:
     scene = validate_scene(scene)
     require_rotating_masses(scene)
     require_one_speed(scene)
-    balance = assemble_for_search(_with_collected_loads(scene))
-    is_complete = balance.unbalance.size <= MAX_COMPLETE or balance.is_prescribed.all()
-    search = RegimeSearchStatus.done if is_complete else RegimeSearchStatus.sampled
-    return regimes_from(scene, *all_regimes(balance), search=search, near=_collected_near)
+    return regimes_from(scene, assemble_for_search(_with_collected_loads(scene)), _collected_near)
 
 
 def has_equal_loads(scene: Scene, exciter: int) -> bool:
@@ -95,14 +90,13 @@ def _with_collected_loads(scene: Scene) -> Scene:
     several = [k for k, count in enumerate(_loads_per_mass(scene)) if count > 1]
     if not several:
         return scene
-    single = [_one_load(cast(Loads, scene.exciters[k].loads)) for k in several]
+
+    def one_load(loads: Loads) -> Loads:
+        names = [name for name in ("mass", "drag", "inertia") if getattr(loads, name, None) is not None]
+        return dataclasses.replace(loads, count=1, **{name: loads.count * getattr(loads, name) for name in names})
+
+    single = [one_load(cast(Loads, scene.exciters[k].loads)) for k in several]
     return eqx.tree_at(lambda s: [s.exciters[k].loads for k in several], scene, single)
-
-
-def _one_load(loads: Loads) -> Loads:
-    """Return one load with the mass, the moment of inertia and the drag of all loads."""
-    names = [name for name in ("mass", "drag", "inertia") if getattr(loads, name, None) is not None]
-    return dataclasses.replace(loads, count=1, **{name: loads.count * getattr(loads, name) for name in names})
 
 
 @cached
@@ -111,10 +105,7 @@ def _collected_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]
 
 
 def _fields_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
-    """Return the fields, except `scene`, of the regime that is found from a start with the phases of the collected masses.
-
-    The fields are those of all loads.
-    """
+    """Return the fields of `fields_near` for all loads, from a start with the phases of the collected masses."""
     count = np.asarray(_loads_per_mass(scene))
     plain = assemble_torque_balance(_with_collected_loads(scene))
     parts = {field.name: getattr(plain, field.name) for field in dataclasses.fields(TorqueBalance)}

@@ -28,7 +28,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.averaged import require_rotating_masses
 from jaxvib.equations.torque_balance import assemble_for_search, assemble_torque_balance, influence_of, mass_owners
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import validate_scene, weight_notes
@@ -38,6 +38,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import status_name
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.outcome import require_index
 from jaxvib.steady.regimes.search import exchanges_in
 from jaxvib.steady.regimes.symmetry import Exchange
 from jaxvib.steady.regimes.synchronous import (
@@ -96,9 +97,7 @@ class RegimePartitions(Result):
 
         **Raises** `InputError` if there are fewer motions.
         """
-        n = self.speed.shape[0]
-        if not 0 <= index < n:
-            raise InputError("index", f"is {quoted(index)}; there are {n} motions, counted from 0")
+        require_index(index, self.speed.shape[0], "motions")
         regimes = []
         for number in range(int(np.max(self.group[index])) + 1):
             masses = np.flatnonzero(self.group[index] == number)
@@ -173,7 +172,11 @@ def regime_partitions(scene: Scene, *, stable: bool = True) -> RegimePartitions:
     subsets = [each for size in range(1, count + 1) for each in itertools.combinations(range(count), size)]
     regimes = {subset: _members(scene, subset, stable=stable) for subset in subsets if _can_share(scene, owners[list(subset)])}
     motions = [_motion(parts, count) for parts in _products(tuple(range(count)), regimes)]
-    rows = _Rows(*map(np.array, zip(*motions, strict=True))) if motions else _no_rows(count)
+    if motions:
+        rows = _Rows(*map(np.array, zip(*motions, strict=True)))
+    else:
+        none = np.zeros((0, count))
+        rows = _Rows(none.astype(int), none, none, none, none.astype(bool), np.zeros(0), np.zeros(0, bool))
     interaction = in_chunks(_MOTIONS_PER_PROGRAM, _interactions, rows.speed, rows.group, shared=(scene,))
     kept = np.flatnonzero(interaction <= _LARGEST_INTERACTION)
     kept = kept[np.lexsort((np.max(rows.group[kept], axis=1, initial=0), ~rows.stable[kept]))]
@@ -201,11 +204,6 @@ class _Rows(NamedTuple):
     family: np.ndarray
     growth: np.ndarray
     stable: np.ndarray
-
-
-def _no_rows(masses: int) -> _Rows:
-    empty = np.zeros((0, masses))
-    return _Rows(empty.astype(int), empty, empty, empty, empty.astype(bool), np.zeros(0), np.zeros(0, bool))
 
 
 def _can_share(scene: Scene, owners: np.ndarray) -> bool:

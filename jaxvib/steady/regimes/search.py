@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.torque_balance import TorqueBalance, balance_residuals, influence_of, motion_of, unknowns_of
 from jaxvib.numerics.linalg import eliminate
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.newton import damped_newton
+from jaxvib.steady.jams.newton import solve_torques
 from jaxvib.steady.regimes.local import slopes_of, vibration_scale
 from jaxvib.steady.regimes.symmetry import Exchange, distinct_regimes, exchanges_of
 
@@ -66,8 +67,8 @@ def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
     sets, speeds = sets_of_phases(balance.is_prescribed, speed.dtype), _speeds(balance)
     known = np.zeros(0, speed.dtype), np.zeros((0, count), speed.dtype), np.zeros(0, int)
     for _ in range(_MAX_ROUNDS):
-        solved = _solutions(balance, *_starts(balance, speeds, sets))
-        omega, phases, neutral = (np.concatenate(pair) for pair in zip(known, solved, strict=True))
+        *solved, good = in_chunks(_STARTS_PER_PROGRAM, _solved, *_starts(balance, speeds, sets), shared=(balance,))
+        omega, phases, neutral = (np.concatenate([old, new[good]]) for old, new in zip(known, solved, strict=True))
         before = known[0].size
         kept = _one_of_each_family(omega, neutral, tolerance[0])
         kept = kept[distinct_regimes(omega[kept], phases[kept], exchanges, tolerance, int(np.sum(kept < before)))]
@@ -121,12 +122,6 @@ def _total_torques(phases: Array, balance: TorqueBalance, speeds: Array) -> Arra
     return jnp.sum(torque, axis=1)[None, :] + braking * (speeds**4 / 2.0)[None, :]
 
 
-@cached
-def _resonances(balance: TorqueBalance) -> Array:
-    """Return the natural frequencies (nd,), rad/s."""
-    return balance.model.modes()[0]
-
-
 def _speeds(balance: TorqueBalance) -> np.ndarray:
     """Return speeds up to the largest working speed, dense near resonances and near the working speeds of the drives.
 
@@ -136,7 +131,7 @@ def _speeds(balance: TorqueBalance) -> np.ndarray:
     """
     drives = np.array([float(drive.speed) for drive in balance.averaged.drives])
     top = drives.max()
-    resonances = np.asarray(_resonances(balance), float)
+    resonances = np.asarray(estimated_frequencies(balance.model.scene), float)
     centres = np.concatenate([drives, resonances[(resonances > 0.0) & (resonances < 1.2 * top)]])
     distance = np.concatenate([[0.0], np.geomspace(1e-7, 0.3, _NEAR_SPEEDS)])
     near = [w * (1.0 + side * distance) for w in centres for side in (-1.0, 1.0)]
@@ -212,13 +207,6 @@ def _related(phases: np.ndarray, prescribed: np.ndarray) -> np.ndarray:
     return np.where(prescribed, 0.0, np.concatenate([*swapped, *turned])).astype(phases.dtype)
 
 
-def _solutions(balance: TorqueBalance, omega: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return speeds, phases and numbers of neutral directions of the solutions to which starts lead: speeds (n,), phases (n,
-    count)."""
-    omega, phases, neutral, good = in_chunks(_STARTS_PER_PROGRAM, _solved, omega, phases, shared=(balance,))
-    return omega[good], phases[good], neutral[good]
-
-
 @cached
 def _solved(omega: Array, phases: Array, balance: TorqueBalance) -> tuple[Array, Array, Array, Array]:
     """Return `solve_near` for starts: speeds (n,) and phases (n, count)."""
@@ -228,7 +216,7 @@ def _solved(omega: Array, phases: Array, balance: TorqueBalance) -> tuple[Array,
 def solve_near(omega: Array, phase: Array, balance: TorqueBalance) -> tuple[Array, Array, Array, Array]:
     """Return speed, phases, number of neutral directions, and True if the start leads to a solution."""
     start = relaxed(unknowns_of(balance, omega, phase), balance)
-    x, _ = damped_newton(lambda x, given: (balance_residuals(x, given), None), start, balance, _ITERATIONS, on_scalars=False)
+    x = solve_torques(start, balance, _ITERATIONS)
     w, angles = motion_of(balance, x)
     good = is_balanced(balance, x)
     neutral = slopes_of(jnp.where(good, x, start), balance).neutral
@@ -265,8 +253,7 @@ def relaxed(x: Array, balance: TorqueBalance) -> Array:
 
 
 def is_balanced(balance: TorqueBalance, x: Array) -> Array:
-    """Return True if the unknowns solve the balance; residuals are compared with the largest vibrational torques at their
-    speed."""
+    """Return True if the unknowns solve the balance up to rounding of the largest vibrational torques at their speed."""
     free = np.flatnonzero(~balance.is_prescribed)
     w, _ = motion_of(balance, x)
     eps = jnp.finfo(x.dtype).eps

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, overload
 
 import equinox as eqx
@@ -42,10 +43,10 @@ from jaxvib.results.status import status_name, status_names
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.newton import damped_newton
+from jaxvib.steady.jams.newton import solve_torques
 from jaxvib.steady.jams.phases import degrees
 from jaxvib.steady.measures import Vibration
-from jaxvib.steady.outcome import REFUSED, outcome
+from jaxvib.steady.outcome import REFUSED, outcome, require_index
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.steady.regimes.local import (
     Slopes,
@@ -226,9 +227,7 @@ class SynchronousRegimes(AbstractSynchronousRegime):
     @validated
     def select(self, index: int) -> SynchronousRegime:
         """Return the regime with an `index`, counted from 0. **Raises** `InputError` if there are fewer regimes."""
-        n = self.speed.shape[0]
-        if not 0 <= index < n:
-            raise InputError("index", f"is {quoted(index)}; there are {n} regimes, counted from 0")
+        require_index(index, self.speed.shape[0], "regimes")
         fields = {name: getattr(self, name) for name in SynchronousRegime.__dataclass_fields__ if name != "scene"}
         return SynchronousRegime(**jax.tree.map(lambda leaf: leaf[index], fields), scene=self.scene)
 
@@ -375,33 +374,22 @@ def synchronous_regimes(
         speed, phases = number(near[0], "rad/s", "near[0]", low=0.0, open_low=True), numbers(near[1], "rad", "near[1]", count)
         return outcome(_regime_near(scene, speed, phases, group), scene)
     balance = assemble_for_search(scene, group)
-    search = RegimeSearchStatus.sampled if count > MAX_COMPLETE and not balance.is_prescribed.all() else RegimeSearchStatus.done
-    return regimes_from(scene, *all_regimes(balance), group, search=search)
+    return regimes_from(scene, balance, partial(_regimes_near, group=group))
 
 
 def regimes_from(
-    scene: Scene,
-    omega: np.ndarray,
-    phases: np.ndarray,
-    group: tuple[int, ...] | None = None,
-    *,
-    search: RegimeSearchStatus,
-    near: Callable[[Scene, Array, Array], dict[str, Any]] | None = None,
+    scene: Scene, balance: TorqueBalance, near: Callable[[Scene, Array, Array], dict[str, Any]]
 ) -> SynchronousRegimes:
-    """Return the regimes that Newton's method finds from starts, the stable ones first.
+    """Return all regimes of a torque balance, the stable ones first.
 
-    **Arguments**: `omega` (n,), rad/s, and `phases` (n, mass), rad, of the starts; `group`: numbers of the masses, None for
-    all; `search`: status of the search; `near`: function of the scene and of the starts that returns the fields of the regimes;
-    default: Newton's method for all masses.
+    **Arguments**: `near`: function that returns the fields of the regimes near speeds (n,), rad/s, and phases (n, mass), rad.
     """
-    if near is None:
-        fields = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: _regimes_near(scene, w, a, group), omega, phases)
-    else:
-        fields = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: near(scene, w, a), omega, phases)
+    fields = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: near(scene, w, a), *all_regimes(balance))
     order = np.flatnonzero(status_names(fields["status"]) != "not_converged")
     order = order[np.lexsort((-fields["speed"][order], ~fields["stable"][order]))]
-    is_empty = order.size == 0 and status_name(search) == "done"
-    search = RegimeSearchStatus.none if is_empty else search
+    is_complete = balance.unbalance.size <= MAX_COMPLETE or balance.is_prescribed.all()
+    all_found = RegimeSearchStatus.done if order.size else RegimeSearchStatus.none
+    search = all_found if is_complete else RegimeSearchStatus.sampled
     return SynchronousRegimes(**on_device(jax.tree.map(lambda leaf: leaf[order], fields)), scene=scene, search=search)
 
 
@@ -428,11 +416,11 @@ def _regime_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ..
 def fields_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ...] | None) -> dict[str, Any]:
     """Return the fields, except `scene`, of the regime that is found from a start, for a group of masses (None: all)."""
     balance = assemble_torque_balance(scene)
-    if group is not None:
-        fields = fields_of_balance(balance_of_group(balance, group), omega, phases)
-        can_start = fields["can_start"][np.unique(mass_owners(scene)[list(group)])]
-        return {**fields, "masses": jnp.asarray(group), "can_start": can_start}
-    return fields_of_balance(balance, omega, phases)
+    if group is None:
+        return fields_of_balance(balance, omega, phases)
+    fields = fields_of_balance(balance_of_group(balance, group), omega, phases)
+    can_start = fields["can_start"][np.unique(mass_owners(scene)[list(group)])]
+    return {**fields, "masses": jnp.asarray(group), "can_start": can_start}
 
 
 def fields_of_balance(balance: TorqueBalance, omega: Array, phases: Array) -> dict[str, Any]:
@@ -441,7 +429,7 @@ def fields_of_balance(balance: TorqueBalance, omega: Array, phases: Array) -> di
     x = jax.lax.stop_gradient(unknowns_of(frozen, omega, phases))
     if x.size == 0:
         return fields_at(balance, x, None)
-    x, _ = damped_newton(lambda x, given: (balance_residuals(x, given), None), x, frozen, on_scalars=False)
+    x = solve_torques(x, frozen)
     return fields_at(balance, x, slopes_of(x, frozen))
 
 

@@ -12,7 +12,6 @@ from jaxvib.equations.averaged import decays, require_rotating_masses
 from jaxvib.equations.torque_balance import (
     TorqueBalance,
     assemble_torque_balance,
-    balance_residuals,
     influence_of,
     motion_of,
     unknowns_of,
@@ -21,7 +20,7 @@ from jaxvib.errors import InputError, within
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.newton import damped_newton
+from jaxvib.steady.jams.newton import solve_torques
 from jaxvib.steady.outcome import outcome, without_numbers
 from jaxvib.steady.regimes.local import Slopes, regime_growth, slopes_of
 from jaxvib.steady.regimes.search import is_balanced, relaxed, sets_of_phases
@@ -112,9 +111,7 @@ def _stable_solution(balance: TorqueBalance) -> tuple[Array, Slopes | None, Arra
     def solve(omega: Array, phase: Array) -> tuple[Array, Array, Array]:
         """Return the unknowns, the speed (0 without a solution) and Blekhman's function."""
         start = relaxed(unknowns_of(balance, omega, phase), balance)
-        x, _ = damped_newton(
-            lambda x, given: (balance_residuals(x, given), None), start, balance, _ITERATIONS, on_scalars=False
-        )
+        x = solve_torques(start, balance, _ITERATIONS)
         w, angles = motion_of(balance, x)
         return x, jnp.where(is_balanced(balance, x), w, 0.0), _potential(balance, w, angles)
 
