@@ -195,10 +195,7 @@ class UnbalancedModel(ExcitedModel):
         return jnp.where(total > least, total, least)
 
     def required_torque(self, omega: Array, displacement: Array) -> Array:
-        """Return the mean torque -V that each rotor needs against the vibration, (count,) N m.
-
-        **Arguments**: `omega`: rotor speed, rad/s; `displacement` (nd,): complex amplitudes.
-        """
+        """Return the mean torque -V that each rotor needs against the vibration with amplitudes `displacement` (nd,), N m."""
         forward = omega**2 * (self.balance.direction.conj() @ displacement)
         return mean_torque(self.balance.unbalance, jnp.conj(self.phasors) * forward)
 
@@ -430,15 +427,8 @@ def response_of(balance: TorqueBalance, omega: Array, rate: Array | None = None)
 def torques_at(unbalance: Array, influence: Array, omega: Array, phasors: Array) -> Array:
     """Return the mean torques V (count,), N m, of the vibration on masses that turn at `omega`, rad/s.
 
-        V_j = (w^4/2) S_j sum_k S_k Im[exp(i (a_k - a_j)) H_jk],     H_jk = e_j^H B_j D(w)^-1 B_k^T e_k,     S = m R
-        D(w) = K - w^2 (M + sum_j m_j B_j^T B_j) + i w (C + n G)
-
-    w is `omega`. B_j (directions of the mount, nd) maps the carrier's coordinates to the displacement of the point that carries
-    mass j, and e_j = (1, -i sigma_j) contains an entry for each of these directions (for platforms, which move up only,
-    e_j = -i sigma_j). M, C, K and G are the matrices of the carrier, and n is the rotor speed.
-
-    **Arguments**: `unbalance` S (count,), kg m; `influence` H (count, count), m/N, see `influence_of`; `phasors` exp(i a)
-    (count,) of the phases a.
+    **Arguments**, with the symbols above: `unbalance` S (count,), kg m; `influence` H (count, count), m/N, see `influence_of`;
+    `phasors` exp(i alpha) (count,).
 
     Source: Artyunin 2013, the pendulums' equation of (1), averaged over a turn.
     """

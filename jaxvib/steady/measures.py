@@ -431,10 +431,7 @@ def require_platforms(scene: Scene, what: str) -> Platforms:
 
 
 def shaft_torque(model: JammedModel, omega: Array, displacement: Array) -> Array:
-    """Return the mean torque, N m, with which light loads in a jam brake the rotor.
-
-    **Arguments**: the load speed `omega`, rad/s, and the complex amplitudes `displacement` (nd,) of the coordinates, m.
-    """
+    """Return the mean torque, N m, with which light loads in a jam brake the rotor, from load speed and amplitudes."""
     scene, loads = model.scene, model.loads
     n = scene.drive.speed
     torque = loads.drag_sum() * (n - omega)
@@ -450,8 +447,8 @@ def shaft_torque(model: JammedModel, omega: Array, displacement: Array) -> Array
 def support_loads(model: LinearModel, omega: Array, displacement: Array, sag: Array | None) -> tuple[Array, Array, Array]:
     """Return the static, the vertical dynamic and the horizontal dynamic force on each support, (ns,) N each.
 
-    `sag`: the `weight_deflection`. Dynamic forces are zero to peak, NaN for a scene with supports that are effects. The static
-    force is NaN if the supports cannot carry the weight, and if the directions of the coordinates are unknown.
+    Dynamic forces are zero to peak, NaN for a scene with supports that are effects. The static force is NaN if `sag`, the
+    `weight_deflection`, is NaN or None.
     """
     machine = model.scene.machine
     stiffness, damping = machine.support_rows()

@@ -41,19 +41,11 @@ def outcome(
     failures: Collection[str] = (),
     hint: Callable[[str], str] = lambda _: "",
 ) -> SomeResult:
-    """Return the result of a computation, or raise an error if its status is known and denotes a failure.
+    """Return the result of a computation, with the status `refused` and NaN in place of numbers if a traced parameter of its
+    `scene` has a value that is not allowed, or if its `end` time, s, is not positive.
 
-    **Arguments**
-
-    - `scene` of the computation, and `end`, the time up to which it was computed, s; None if the result does not depend on it
-    - `throw`: True to raise an error if the name of a known status is among the `failures`
-    - `hint`: function from the name of a status to the text that is appended to its message
-
-    **Returns** the result. Under a JAX transformation it has the status `refused` and NaN in place of numbers if a parameter
-    of the scene has a value that the constructor of its part would reject, such as a negative stiffness, or if `end` is not
-    positive.
-
-    **Raises** `ComputationError` for a status among the `failures` if `throw` is True.
+    **Raises** `ComputationError` if `throw` is True and the name of a known status is among the `failures`; `hint`: function
+    from this name to the text that is appended to the message.
     """
     is_positive = unknown_is_positive(end)
     if throw and is_known(result.status) and (name := status_name(result.status)) in failures:

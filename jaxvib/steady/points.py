@@ -127,11 +127,7 @@ def require_amplitudes(amplitude: Array | complex) -> None:
     """**Raises** `InputError` for anything other than two finite amplitudes."""
     if jnp.shape(amplitude) != (2,):
         raise InputError("amplitude", f"has the shape {jnp.shape(amplitude)}; give two amplitudes, horizontal and up")
-    when_known(_require_finite, amplitude)
-
-
-def _require_finite(amplitude: np.ndarray) -> None:
-    if not np.all(np.isfinite(amplitude)):
+    if when_known(lambda known: not np.all(np.isfinite(known)), amplitude):
         raise InputError("amplitude", f"is {quoted(amplitude)}; finite numbers are needed")
 
 
@@ -215,16 +211,9 @@ class Deck(Result):
 
 
 class Harmonic(NamedTuple):
-    """Vibration of all coordinates at one speed, q = Re(Y e^{i w t}).
-
-    **Attributes**
-
-    - `machine` that moves
-    - `speed` w, rad/s
-    - `amplitude` Y (nd,), complex
-    - `rest` (nd, nd): mean of r r^T, where r is the part of the motion about its mean that the harmonic does not contain; None
-      if there is no such part
-    """
+    """Vibration q = Re(Y e^{i w t}) of all coordinates of a `machine` at the `speed` w, rad/s, with the `amplitude` Y (nd,),
+    complex. `rest` (nd, nd): mean of r r^T, where r is the part of the motion about its mean that the harmonic does not
+    contain; None if there is no such part."""
 
     machine: Machine
     speed: Array

@@ -319,7 +319,6 @@ def _require_one_no_load_speed(scene: Scene) -> None:
 
 @cached
 def _common_torques(scene: Scene) -> tuple[Array, Array]:
-    """Return a grid of speeds, rad/s, and the sum of the torques of all motors, N m."""
     drives = tuple(exciter.drive.at_working_speed() for exciter in scene.exciters)
     return common_speeds(drives), common_torques(drives)
 
@@ -438,11 +437,8 @@ def _scanned_gap(model: UnbalancedModel, omega: Array) -> Array:
 
 
 def _landing_speeds(model: UnbalancedModel, pieces: Pieces) -> Array:
-    """Return the speed to which the rotor jumps from each fold, (2 nd,) rad/s.
-
-    It is the nearest speed on a rising piece with the same share of the torque, above a maximum or below a minimum. It is NaN
-    if there is no such speed.
-    """
+    """Return the speed to which the rotor jumps from each fold, (2 nd,) rad/s: the nearest one on a rising piece with the same
+    share of the torque, above a maximum or below a minimum; NaN if there is none."""
     number = np.arange(pieces.low.shape[0])
     rising = (number % 2 == 0) & (pieces.high > pieces.low)
 

@@ -252,18 +252,15 @@ def _coupling_size(dtype: np.dtype) -> float:
 
 
 def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array) -> tuple[Array, Array]:
-    """Return the kind of each natural motion, and the relative error of its eigenvalue.
+    """Return the kind of each natural motion, and the relative error of its eigenvalue, from the `matrices` M, C (gyroscopic
+    terms included) and K (nd, nd), the `values` s (k,) and the `shapes` x (nd, k).
 
         (s^2 M + s C + K) x = 0,      m s^2 + c s + k = 0 with m = x^H M x, c = x^H C x, k = x^H K x
 
     The kind is - Re(2 s + c/m). Of the two real roots of an overdamped motion, it is negative at the slower one, at which
-    damping balances the spring, and positive at the faster one, at which damping stops the mass. Its sign (the sign
-    characteristic in the theory of Hermitian matrix polynomials) distinguishes slow from fast roots even if a slow root of one
-    motion is larger than a fast root of another motion.
-
+    damping balances the spring, and positive at the faster one, at which damping stops the mass (the sign characteristic in
+    the theory of Hermitian matrix polynomials), even if a slow root of one motion is larger than a fast root of another motion.
     The error is the step of Newton's method for the scalar equation, plus the rounding of its terms.
-
-    **Arguments**: M, C (gyroscopic terms included) and K (nd, nd); `values` s (k,); `shapes` x (nd, k).
     """
     sizes = jnp.abs(shapes)
     m, c, k = (jnp.sum(shapes.conj() * (matrix @ shapes), axis=0) for matrix in matrices)
@@ -325,12 +322,8 @@ def _two_directions(scene: Scene) -> LinearModel:
     model = linear_model(scene)
     carrier = model.carrier
     if model.mount.axes != (0, 1):
-        raise InputError(
-            "machine.kind",
-            f"is {quoted(scene.machine.kind)}, which moves only up and down: for its resonances use "
-            "`jam_modes` (`jaxvib modes`); "
-            "whirl needs a rotor such as rotor(...)",
-        )
+        advice = "for its resonances use `jam_modes` (`jaxvib modes`); whirl needs a rotor such as rotor(...)"
+        raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}, which moves only up and down: {advice}")
     when_known(_require_springs, carrier.stiffness)
     return model if scene.exciter.direction == 1 else _mirrored(model)
 
@@ -347,11 +340,11 @@ def _mirrored(model: LinearModel) -> LinearModel:
 def _require_springs(stiffness: np.ndarray) -> None:
     """**Raises** `InputError` if a motion of the rotor has no spring."""
     if not _has_all_springs(stiffness):
-        single = stiffness.dtype.itemsize < 8
-        problem = "leaves a motion of the rotor without a spring" + (", within single precision" if single else "")
-        raise InputError(
-            "machine.stiffness", f"{problem}; every motion needs one{', or use double precision' if single else ''}"
+        within, advice = (
+            (", within single precision", ", or use double precision") if stiffness.dtype.itemsize < 8 else ("", "")
         )
+        problem = f"leaves a motion of the rotor without a spring{within}; every motion needs one{advice}"
+        raise InputError("machine.stiffness", problem)
 
 
 def _has_all_springs(stiffness: np.ndarray) -> bool:

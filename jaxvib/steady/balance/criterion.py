@@ -206,10 +206,8 @@ def _gathering(resonances: Array, additional: Array) -> Array:
 def criterion_table(result: Criterion) -> dict[str, Any]:
     """Return the result of the criterion as plain lists and numbers for JSON, with speeds in rad/s.
 
-    **Returns** a dict: `status` a sentence; `resonances`, `additional` lists of speeds without damping, `damped_resonances`,
-    `damped_additional` with damping; `balancing`, `gathering` lists of [from, to] with damping, `undamped_balancing`,
-    `undamped_gathering` without. `to` is None if the interval has no end. Intervals that touch are joined; empty ones are
-    omitted.
+    `status` is a sentence; the other entries are the fields of `Criterion` and its `speeds`. Intervals are [from, to], without
+    an end if `to` is None. Intervals that touch are joined; empty ones are omitted.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=1e6, damping=30.0)

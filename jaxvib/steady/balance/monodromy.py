@@ -64,9 +64,8 @@ def monodromy(scene: Scene, angles: Array, steps: int | Array) -> Array:
     q are the coordinates of the machine and dphi the deviations of the load angles; R is the mean radius of the loads, and n
     the rotor speed. P and Q are the coefficients of the linearized equations.
 
-    **Arguments**: `angles` (N,) rad of the loads in the rotor's frame; `steps` of `radau.transition`, a Python number (then
-    reverse derivatives exist) or a scalar array. The function works under `jit`, `vmap` and `grad`. The caller ensures that
-    the loads cancel each other and the imbalance of the rotor.
+    **Arguments**: `angles` (N,) rad of the loads in the rotor's frame, at which they cancel each other and the imbalance of the
+    rotor; `steps` of `radau.transition`, a Python number (then reverse derivatives exist) or a scalar array.
     """
     scene = at_constant_speed(scene)
     field = vector_field(scene)

@@ -118,9 +118,7 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
     F is the complex amplitude of a force on the mount, and B maps the coordinates to the displacement of the mount. The masses
     of the loads move with the mount; a gyroscopic matrix G is taken at the rotor speed w.
 
-    **Arguments**: `scene`; `omega`.
-
-    **Returns** a complex array (p, p) for a mount with p directions. Its values are not finite at an undamped resonance.
+    The result (p, p), for a mount with p directions, is complex, and not finite at an undamped resonance.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
@@ -133,8 +131,7 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
     model = linear_model(scene)
     port = model.mount.rows[0]
     stiffness = model.dynamic_stiffness(jnp.asarray(omega, dtype=port.dtype))
-    columns = [small_solve(stiffness, row.astype(stiffness.dtype)) for row in port]
-    return port @ jnp.stack(columns, axis=1)
+    return port @ small_solve(stiffness, port.T.astype(stiffness.dtype))
 
 
 def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
@@ -154,13 +151,10 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     matrix in brackets and y = D^-1 b. A damper between the exciter's platform and the foundation changes none of these speeds,
     because it adds only to the imaginary part of 1/A.
 
-    **Returns** `CharacteristicSpeeds`; every speed has exact derivatives with respect to every parameter of the scene,
-    forward and reverse, finite for equal resonances and for links without stiffness (0 for a resonance at speed 0).
-    Two sign changes closer to each other than 1e-11 of the highest resonance count as none. `vmap` over scenes evaluates many
-    machines.
+    The derivatives of the speeds are finite for equal resonances and for links without stiffness (0 for a resonance at speed
+    0). Two sign changes closer to each other than 1e-11 of the highest resonance count as none.
 
-    **Raises** `InputError` if no coordinate moves the mount, a spring is so much stiffer than the others that a resonance is
-    lost in rounding errors, a gyroscopic carrier has a motion without a spring, or loads have different stations.
+    **Raises** `InputError` for machines that `criterion` refuses.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,

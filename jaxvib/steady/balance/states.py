@@ -298,7 +298,6 @@ def _imbalances(scene: Scene) -> tuple[complex, complex, np.ndarray]:
 
 @cached
 def _distances(scene: Scene) -> Array:
-    """Return the distance of each load from the centre of mass along the axis, (N,) m."""
     return scene.mount().distances(scene.loads.count)
 
 
@@ -330,27 +329,15 @@ def _planes(scene: Scene) -> list[_Plane]:
 def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int | None = None) -> BalancedStability:
     """Return the exact stability of the motion in which the loads turn with the rotor and cancel each other and its imbalance.
 
-    The full equations are linearized about this motion; their coefficients are periodic with the turn of the rotor. No
-    approximation is made for heavy loads or weak drag, unlike the criterion.
+    No approximation is made for heavy loads or weak drag, unlike the criterion.
 
-    **Arguments**
+    **Arguments**: `angles` (N,), rad, in the rotor's frame, at which the loads cancel each other and the imbalances (default:
+    the first of `balanced_states`); `steps` of Radau's method of order 11 over one turn, which is valid for any drag of the
+    loads and any damping of the carrier (typical: 24 to 200; default: as many as the natural frequencies need).
 
-    - `scene`; its effects must not disturb the balanced motion
-    - `angles` (N,), rad, in the rotor's frame, at which the loads cancel each other and the imbalances of the scene; default:
-      the first of `balanced_states`
-    - `steps` of Radau's method of order 11 over one turn; the default resolves the carrier's natural frequencies; typical: 24
-      to 200. The time is proportional to this number. The method is valid for any drag of the loads and any damping of the
-      carrier
-
-    **Returns** `BalancedStability`.
-
-    **Raises** `ComputationError` with the status of `balanced_states` if the loads cannot cancel, and `InputError` for
-
-    - angles at which the loads do not cancel
-    - a machine that can drift
-    - effects that disturb the balanced motion (gravity)
-    - a rotor so slow that the steps of a turn cannot resolve the vibration of a weakly damped carrier
-    - the scenes that `balanced_states` does not accept
+    **Raises** `ComputationError` with the status of `balanced_states` if the loads cannot cancel, and `InputError` for angles
+    at which they do not cancel, a machine that can drift, effects that disturb the balanced motion (gravity), a rotor that is
+    too slow, see `validate_steps`, and the scenes that `balanced_states` does not accept.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -376,15 +363,8 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
 
 
 def balanced_growth(scene: Scene, speeds: Numbers, angles: ArrayLike | None = None, *, steps: int | None = None) -> np.ndarray:
-    """Return the growth rate of deviations from the balanced motion at many rotor speeds, 1/s: stable if negative.
-
-    **Arguments**
-
-    - `scene`; its own speed is not used
-    - `speeds`, rad/s, an array of any shape; or a list of numbers or of strings with a unit
-    - `angles` and `steps`: as for `balanced_stability`
-
-    **Returns** an array of the shape of `speeds`. **Raises** the errors of `balanced_stability`.
+    """Return the growth rates, 1/s, of deviations from the balanced motion at rotor `speeds` of any shape, rad/s; the speed of
+    the scene is not used. Other arguments and errors are those of `balanced_stability`.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -418,15 +398,8 @@ def decay_over_turn(speeds: np.ndarray, growth: np.ndarray) -> np.ndarray:
 def balanced_intervals(
     scene: Scene, low: Number, high: Number, angles: ArrayLike | None = None, *, points: int = 200, steps: int | None = None
 ) -> SpeedIntervals:
-    """Return the intervals [from, to] of rotor speed between `low` and `high` (rad/s) in which the balanced motion is exactly
-    stable.
-
-    The intervals are searched for on `points` speeds (typical: 200, the default), and their ends are refined by bisection to
-    1e-7 of the speed. An interval narrower than the spacing of the points can be missed. The intervals of the criterion,
-    over all speeds, are `criterion(scene).balancing`. `angles` and `steps`: as for `balanced_stability`.
-
-    **Returns** a list of pairs, rad/s, which is printed in the unit of `display_units`. **Raises** the errors of
-    `balanced_stability`, and `InputError` for an empty range.
+    """Return the intervals of `BalancedStates.intervals` for loads at `angles`. **Raises** the errors of `balanced_stability`,
+    and `InputError` for an empty range.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -453,11 +426,8 @@ def stability_changes(
     rtol: float = 1e-7,
     steps: int | None = None,
 ) -> np.ndarray:
-    """Return the speeds at which the balanced motion changes its stability, ascending.
-
-    `stable`: True for each of `speeds` at which the motion is stable. A change between two of them is refined by bisection to
-    the relative accuracy `rtol`.
-    """
+    """Return the speeds at which the balanced motion changes its stability, ascending: changes between neighbouring entries of
+    `stable` at `speeds`, refined by bisection to the relative accuracy `rtol`."""
     (change,) = np.nonzero(stable[1:] != stable[:-1])
     left, right = speeds[change], speeds[change + 1]
     while left.size and np.max((right - left) / right) > rtol:

@@ -27,11 +27,7 @@ class _Branch(Protocol):
 
 
 def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], stability_text: str) -> str:
-    """Return text with the ranges of a branch and its special points.
-
-    **Arguments**: `marks`: special points (kind, load speed, rotor speed); `stability_text`: how stability is
-    determined.
-    """
+    """Return text with the ranges of a branch and its special points, for arguments as in `plot_branch`."""
     omega, stable = np.asarray(branch.omega), np.asarray(branch.stable)
     ends = speed_text([np.fmin.reduce(omega), np.fmax.reduce(omega)], 6, " to ")
     lines = [
@@ -52,11 +48,8 @@ MARKS = {
 
 
 def modes_of(omega: np.ndarray, rotor_speed: np.ndarray, resonances: np.ndarray) -> np.ndarray:
-    """Return the number of the jam mode of each point of a branch, from the folds between its points.
-
-    **Arguments**: load speed `omega` of the points, rad/s, ascending; their `rotor_speed`, rad/s, NaN if no orbit converged;
-    `resonances`, rad/s.
-    """
+    """Return the number of the jam mode of each point of a branch, from the folds between its points: `omega`, rad/s,
+    ascending, and `rotor_speed`, rad/s, NaN if no orbit converged."""
     solved = np.isfinite(rotor_speed)
     _, ends, numbers = sampled_modes(omega[solved], rotor_speed[solved], resonances)
     return numbers[np.searchsorted(np.append(omega[solved], np.inf)[ends], omega, side="right")]
@@ -74,21 +67,11 @@ def plot_branch(
     modes: np.ndarray | None = None,
     resonances: np.ndarray | None = None,
 ) -> Drawn:
-    """Plot load speed, amplitudes (zero to peak) and foundation force over the rotor speed.
+    """Plot a branch, see `Branches.plot`. **Raises** `InputError` for `most` below all rotor speeds of the branch.
 
-    Stable parts are solid lines, unstable parts dashed lines.
-
-    **Arguments**
-
-    - `marks`: special points (kind, load speed, rotor speed)
-    - `unit` of the speeds on the axes; `most`: the greatest rotor speed shown, rad/s (default: 4/3 of the scene's rotor speed)
-    - `stability_text`: text on how stability is determined
-    - `show`: names of the panels; `linear`: True for linear axes of amplitudes and force; `ax`: axes to draw onto
-    - `modes`: number of the jam mode at each point, default: from the folds between the points
-    - `resonances` (nd,) rad/s, default: computed here
-
-    **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or panel, and for `most` below
-    all rotor speeds of the branch.
+    **Arguments**: `marks`: special points (kind, load speed, rotor speed); `stability_text`: text on how stability is
+    determined; `modes`: number of the jam mode at each point, default: from the folds between the points; `resonances` (nd,)
+    rad/s, default: computed here.
     """
     from jaxvib.draw.charts import branch_diagram  # slow import
 

@@ -191,11 +191,8 @@ def branch_root(
     high: Array,
     ends: tuple[Array, Array],
 ) -> Array:
-    """Return the load speed between `low` and `high` at which a function of the branch is 0, with exact derivatives.
-
-    **Arguments**: `exact`: the function from the matrices; `scanned`: the same function in modal form; `ends`: its values at
-    both ends.
-    """
+    """Return the load speed between `low` and `high` at which a function of the branch is 0, with exact derivatives: `exact`
+    from the matrices, `scanned` in modal form, with the values `ends` at both ends."""
     f = partial(exact, model)
     if model.modal is None:
         return bracketed_root(f, low, high, ends)

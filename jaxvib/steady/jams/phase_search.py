@@ -228,7 +228,6 @@ def _distinct(
 
 @cached
 def _jams_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
-    """Return `jam_from` for many speeds and phases."""
     return eqx.filter_vmap(jam_from, in_axes=(None, 0, 0))(scene, omega, phase)
 
 
@@ -239,13 +238,11 @@ def _contains_jam(branch: PhaseBranch, place: int, growth: Array) -> bool:
 
 
 def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
-    """Follow the phase pattern of `jam` over load speeds `omega` (n,) rad/s, ascending, below the rotor speed.
+    """Follow the phase pattern of `jam` over load speeds `omega` (n,) rad/s, see `PhaseJams.follow`.
 
     The drag is computed directly from the load speed; therefore folds need no continuation. Two jams of the pattern merge at an
     extremum of the drag factor over `omega`. If a pattern ends, the next phases may belong to another pattern; the phases then
     jump.
-
-    **Returns** `PhaseBranch`. **Raises** `InputError` for speeds that do not ascend or are not between 0 and the rotor's.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)

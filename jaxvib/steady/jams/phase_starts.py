@@ -72,7 +72,6 @@ def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generato
 
 @cached
 def _solve_balances(balance: TorqueBalance, omega: Array, phase: Array) -> tuple[Array, Array]:
-    """Return `solve_balance` from many speeds and phases."""
     return jax.vmap(lambda w, a: solve_balance(balance, w, a, on_scalars=True))(omega, phase)
 
 
@@ -171,11 +170,8 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
 
 
 def solved_phases(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, AtSpeed, np.ndarray, np.ndarray, np.ndarray]:
-    """Solve for the phases of jams at all load speeds, from `phases` (sets, count) and regular sets.
-
-    **Returns** the load speeds, their data, and for each solution the index of its speed, the multiple of the drag, and the
-    phases.
-    """
+    """Return load speeds, their data, and, solved from `phases` (sets, count) and regular sets, for each jam the index of its
+    speed, the multiple of the drag, and the phases."""
     speeds, phases = load_speeds(balance), np.concatenate([phases, _regular_phases(balance)])
     at_speeds = _data_at_speeds(balance, speeds)
     row = np.repeat(np.arange(speeds.size), len(phases))
@@ -185,11 +181,7 @@ def solved_phases(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarra
 
 def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return indices of the first occurrence of each distinct row of integers (n, m), ascending, and for each row the number
-    of its distinct row, (n,).
-
-    Rows are compared by one hash each, which is much faster than a comparison of all entries; the probability that two of 1e5
-    rows share a hash is 3e-10.
-    """
+    of its distinct row, (n,). Fast comparison by hashes; the probability that two of 1e5 rows share a hash is 3e-10."""
     hashes = rows.astype(int) @ np.random.default_rng(0).integers(2**63, size=rows.shape[1])
     order = np.argsort(hashes)
     begins = np.diff(hashes[order], prepend=hashes[order[:1]] - 1) != 0
@@ -200,11 +192,8 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class AtSpeed(eqx.Module):
-    """Data of the search for phases at a load speed.
-
-    **Attributes**, with a leading axis for several speeds: `omega` rad/s; `influence` (count, count), see `influence_of`;
-    `most`: upper bound of the multiple of the drag that a load can need.
-    """
+    """Data of the search for phases at a load speed `omega`, rad/s: `influence` (count, count), see `influence_of`, and the
+    upper bound `most` of the multiple of the drag that a load can need. Several speeds have a leading axis."""
 
     omega: Array
     influence: Array

@@ -130,14 +130,9 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 
     is solved for w and all phases a but the first. b_j is the drag of load j, R_j its radius, n the rotor speed, and T_j the
     mean torque of the vibration on the load (`torques_at`). Stability is determined by the growth rate of small disturbances of
-    the averaged motion, q = Re(z(t) exp(i w t)), in which the angle of each load is free. The averaged equations are
-    autonomous, of dimension 4 nd + 2 count; no motion is assumed to be quasi-static. For isotropic supports averaging is exact.
+    the averaged equations (`averaged_growth`), in which the angle of each load is free; for isotropic supports they are exact.
 
-    **Returns** `PhaseJam`; it works under `vmap` over starts and scenes. Derivatives of all results except stability follow
-    from the implicit function theorem. An imbalance of the rotor is not included in amplitudes and forces, see `phase_jams`.
-
-    **Raises** `InputError` for loads without drag, a number of phases that differs from the number of loads, drives without a
-    prescribed speed, and effects that this function does not include.
+    **Raises** `InputError` as `phase_jams`, and for a number of phases that differs from the number of loads.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
@@ -164,10 +159,7 @@ def loads_with_drag(scene: Scene) -> CircularLoads:
 
 def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_scalars: bool = False) -> tuple[Array, Array]:
     """Solve the torque balance for the load speed and the phases (count,) by Newton's method, differentiable with respect to
-    the balance.
-
-    `on_scalars`: compile the equations as operations on single numbers, see `damped_newton`.
-    """
+    the balance; `on_scalars`: see `damped_newton`."""
     frozen = jax.lax.stop_gradient(balance)
     start = jax.lax.stop_gradient(unknowns_of(balance, omega, phase))
     on_scalars = on_scalars and balance.model.modal is None  # a sum over many modes has too many operations
@@ -222,13 +214,11 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 
 
 def growth_of_free_loads(scene: Scene, omega: Array, rotor_speed: Array | None = None) -> np.ndarray:
-    """Return the growth of small disturbances of jams of coincident loads, (n,) 1/s, with each load free to move separately.
+    """Return the `growth` (n,), 1/s, of jams of coincident loads with load speeds `omega` and the given rotor speeds (default:
+    that of the scene), rad/s, with each load free to move separately.
 
-    **Arguments**: `omega` (n,) rad/s of the jams of light coincident loads; `rotor_speed` (n,) rad/s of each jam, default: that
-    of the scene.
-
-    **Returns** the `growth` of `PhaseJam` for each; NaN if there is no such jam nearby, if `omega` is NaN, or if the loads
-    have a `ball_radius` or dry friction, which this function does not include.
+    It is NaN if there is no such jam nearby, if `omega` is NaN, or for loads with a `ball_radius` or dry friction, which are
+    not included.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)

@@ -171,10 +171,7 @@ class Orbit(Result):
 
 
 def judgement_of(multiplier: Array, error: Array, stable: Array) -> str:
-    """Return "stable", "unstable" or "stability unknown" for the largest `multiplier` of a motion.
-
-    It is unknown without a multiplier, and if the multiplier differs from 1 by less than its `error`.
-    """
+    """Return "stable", "unstable", or, for a `multiplier` that is NaN or within its `error` of 1, "stability unknown"."""
     if np.isnan(multiplier) or abs(multiplier - 1.0) <= error:
         return "stability unknown"
     return "stable" if stable else "unstable"
@@ -188,11 +185,8 @@ def plot_period(
     force: Array,
     ax: Onto,
 ) -> Drawn:
-    """Plot a period of a motion over the angle Omega t from its harmonics.
-
-    `named`: names and units of the coordinates; `deviation`: orders and harmonics of the bodies' deviations, the title of their
-    panel, the label of each body (completed by its number) if there are several, and the label of a single body.
-    """
+    """Plot a period over the angle Omega t from harmonics; `named`: names and units of the coordinates; `deviation`: orders and
+    harmonics of the bodies' deviations, the title of their panel, and labels of each of several bodies and of a single body."""
     from jaxvib.draw.results import signals_chart  # slow imports
     from jaxvib.draw.style import length_unit
 
@@ -355,10 +349,7 @@ def _status(met: Array, separates: Array, flat: Array, resolved: Array, accurate
 def differentiable_fields(
     model: JammedBodies, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
 ) -> dict[str, Array]:
-    """Return fields of one orbit from its known motion, with derivatives.
-
-    The fields are equal to those of `orbits` for the same arguments, or 0 if those are NaN.
-    """
+    """Return fields of `orbits` for one known motion, with derivatives; 0 in place of NaN."""
     grid, exists = grid_of(points, model.half_turn), ~jnp.isnan(orbit.omega)
     x = jnp.where(exists, orbit.omega if given == "rotor_speed" else orbit.rotor_speed, start)
     deviation = synthesized(jnp.where(exists, orbit.deviation_harmonics, 0.0), deviation_synthesis(grid))
@@ -410,8 +401,8 @@ def _motion_quantities(
 def _least_contact_torque(model: JammedBodies, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
     """Return the smallest mean torque over a period, N m, with which a load pushes the next one, for loads side by side.
 
-    Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, and the loads up to j need the sum of these. The criterion is
-    the mean, because no vibration of a jam presses the loads together at every instant.
+    Load j needs  m R e'(phi_j).a - torque_j  from its neighbours. The criterion is the mean, because no vibration of a jam
+    presses the loads together at every instant.
     """
     loads = model.loads
     if loads.ball_radius is None or loads.count == 1:
@@ -428,11 +419,8 @@ _PEAK_SEARCH_PARTS = 16
 
 
 def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array:
-    """Return the maximum, (16,), of the signal with harmonics (K,) in each part of the period, including its ends.
-
-    With `half`, the signal is repeated with the opposite sign after half a period, and the result is the maximum of its
-    magnitude in each of 16 parts of half a period.
-    """
+    """Return the maximum, (16,), of the signal with harmonics (K,) in each part of the period, including its ends; with `half`,
+    for a signal that changes its sign after half a period, the maximum of its magnitude in parts of half a period."""
     each, width = max(16, int(orders[-1]) // 4), 2.0 * np.pi / _PEAK_SEARCH_PARTS
     if half:
         each, width = each // 2, width / 2.0

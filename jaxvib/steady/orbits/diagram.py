@@ -131,15 +131,7 @@ def exact_branches(
     - of prod (1 + s_i), of either set: loss of symmetry if the motion has the half-turn symmetry, otherwise period doubling
     - of prod (1 - s_i) of the second set: loss of symmetry
 
-    **Arguments**
-
-    - `points`: number of points along Omega, denser near the resonances
-    - `least`: lowest load speed, rad/s or text; default: a fifth of the lowest resonance, or a fifth of the rotor speed if the
-      rotor speed is below this resonance
-    - `most`: highest load speed, rad/s or text; default: 4/3 of the rotor speed
-    - `accuracy` of the rotor speeds, relative; default: 1e-8, in single precision 1e-3
-
-    **Returns** `ExactBranches`; a point that could not be solved has NaN and a status. **Raises** `InputError`.
+    The arguments are those of `branches`. A point that could not be solved has NaN and a status.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

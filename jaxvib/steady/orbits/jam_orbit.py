@@ -271,11 +271,7 @@ def _outputs(orbit: Orbit, problem: JamProblem, points: int, max_steps: int | No
 
 @cached(outputs_from_solution=_outputs)
 def _solve_program(problem: JamProblem, points: int, max_steps: int | None) -> Orbit:
-    """Solve for one exact jam.
-
-    **Arguments**: `max_steps`: limit of the number of steps for the multipliers; without a limit they have no reverse
-    derivatives.
-    """
+    """Solve for one exact jam; `max_steps`: see `floquet`."""
     scene, given, value, start, exists, direction, accuracy, implicit, is_start_solved = problem
     model, deviation = jammed_bodies(jammed_model(scene)), None
     if is_start_solved:

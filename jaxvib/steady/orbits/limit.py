@@ -201,17 +201,9 @@ def _require_one_period(scene: Scene, number: NamedNumber) -> None:
 
 
 class _Point(NamedTuple):
-    """Point of a branch.
-
-    **Attributes**
-
-    - `value` of the parameter
-    - `speed`, rad/s, and `phases` (N,), rad, of the motion
-    - `slope`: derivative of the value with respect to the coordinate along the branch
-    - `is_met`: True if the equations are satisfied
-    - `along`: coordinate along the branch: the phase of one exciter, rad, or the relative change of the speed divided by
-      `_SPEED_PER_RADIAN`
-    """
+    """Point of a branch: `value` of the parameter, `speed`, rad/s, and `phases` (N,), rad; `slope`: derivative of the value by
+    the coordinate `along` the branch (phase of one exciter, rad, or relative change of the speed divided by
+    `_SPEED_PER_RADIAN`); `is_met`: True if the equations are satisfied."""
 
     value: np.ndarray
     speed: np.ndarray
@@ -267,12 +259,8 @@ def _branch_point(
     exciter: int | None,
     points: int,
 ) -> tuple[Array, ...]:
-    """Solve for the motion in which an exciter has its given phase, and for the value of the parameter `over`.
-
-    `exciter`: its number; None for the motion that has the given speed. `points`: number of collocation points on a period.
-
-    **Returns** the fields of `_Point` without `along`; `slope` is the derivative with respect to the phase or the speed.
-    """
+    """Solve for the fields of `_Point` without `along` for the motion in which an `exciter` has its given phase, or, if None,
+    that has the given speed; `slope` is the derivative with respect to this phase or speed."""
     value, speed, phases = jnp.asarray(value), jnp.asarray(speed), jnp.asarray(phases)
     number, grid, counts = find_number(scene, over, "over"), grid_of(points, False), body_counts(scene)
     forced = bool(forcing_exciters(scene))

@@ -66,11 +66,8 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
 
 
 def _ends_before(scene: Scene, low: float, high: float, target: float, refinements: int = 2) -> bool:
-    """Return True if the exact branch has a fold between two load speeds, before it reaches the rotor speed `target`.
-
-    The fold is bracketed `refinements` times in smaller and smaller intervals. The rotor speed of the fold is the largest or
-    smallest one of the interpolated cubic in the last interval, with an error of the size of rounding.
-    """
+    """Return True if the exact branch has a fold between two load speeds, before it reaches the rotor speed `target`: that of
+    the interpolated cubic in the last of `refinements` smaller and smaller intervals around the fold, up to rounding."""
     omega = np.linspace(low, high, _BRANCH_POINTS)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
     (folds,) = np.nonzero(slope[1:] * slope[:-1] <= 0.0)

@@ -31,14 +31,8 @@ Parameter = Literal["omega", "rotor_speed"]
 
 
 def unbalance_response(model: JammedBodies, omega: Array, speed: Array, orders: np.ndarray) -> Array:
-    """Return the response of the carrier to unbalance, (K, nd, p).
-
-        X_k = D(k Omega)^-1 B^T k^2 Omega^2,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
-
-    X_k is the k-th harmonic of the carrier's displacement per k-th harmonic of sum_g S_g e(phi_g), 1/kg.
-
-    **Arguments**: load speed `omega` and rotor `speed`, rad/s; `orders` k (K,).
-    """
+    """Return the response X_k = D(k Omega)^-1 B^T k^2 Omega^2 of the carrier to unbalance, (K, nd, p) 1/kg: k-th harmonic of
+    its displacement per k-th harmonic of sum_g S_g e(phi_g), at the load speed `omega` and the rotor's `speed`, rad/s."""
     port = model.linear.mount.rows[0].T.astype(complex)
 
     def at(k: Array) -> Array:
@@ -49,13 +43,12 @@ def unbalance_response(model: JammedBodies, omega: Array, speed: Array, orders: 
 
 
 def _port_response(model: JammedBodies, grid: Grid, omega: Array, speed: Array) -> Array:
-    """Return the response A_k (K, p, p) of the mount to unbalance: k-th harmonic of its acceleration per k-th harmonic of
-    sum_g S_g e(phi_g)."""
     return _port_response_from(model, grid, omega, unbalance_response(model, omega, speed, grid.orders))
 
 
 def _port_response_from(model: JammedBodies, grid: Grid, omega: Array, response: Array) -> Array:
-    """Return `_port_response` from the response of the carrier, whose first orders are those of the grid."""
+    """Return the response A_k (K, p, p) of the mount: k-th harmonic of its acceleration per k-th harmonic of
+    sum_g S_g e(phi_g). The first orders of `response`, the `unbalance_response` of the carrier, are those of the grid."""
     w = jnp.asarray(grid.orders, dtype=omega.dtype) * omega
     return -(w**2)[:, None, None] * (model.linear.mount.rows[0] @ response[: w.size])
 
@@ -361,16 +354,9 @@ class Linearized(NamedTuple):
 
 
 class _NewtonState(NamedTuple):
-    """State of Newton's iteration.
-
-    **Attributes**
-
-    - `steps`: number of steps so far
-    - `unknowns` with the smallest residuals so far; `norm` of these residuals, and `scale` of the terms in them
-    - `change`: Newton step from these unknowns; `length`: largest fraction of this step that is allowed
-    - `done`: True if the iteration ends
-    - `stalled`: True if it ends because no fraction of the step reduces the residuals
-    """
+    """State of Newton's iteration after a number of `steps`: the best `unknowns` so far with their `Linearized` values; the
+    `length` of the next step, the largest fraction of `change` that is allowed; `done`: True if the iteration ends; `stalled`:
+    True if it ends because no fraction of the step reduces the residuals."""
 
     steps: Array
     unknowns: Any
@@ -395,12 +381,8 @@ def newton(
     """Return the root of the equations that `linearize` evaluates at the unknowns, or the unknowns with the smallest residuals
     if the iteration does not converge.
 
-    **Arguments**
-
-    - `move(unknowns, change, length)`: returns the unknowns after at most the fraction `length` of the Newton step `change`
-    - `start`: initial unknowns
-    - `change`: zeros with the shape of a Newton step
-    - `one`: the number 1 in the precision of the unknowns
+    **Arguments**: `move(unknowns, change, length)` returns the unknowns after at most the fraction `length` of the Newton step
+    `change`; `start`: initial unknowns; `change`: zeros with the shape of a Newton step; `one`: 1 in their precision.
     """
     tiny = 128.0 * jnp.finfo(change.dtype).eps
     no = jnp.asarray(False)

@@ -385,11 +385,7 @@ def _solve(plan: SynchronousPlan, points: int, max_steps: int | None = None) -> 
 def _solve_program(
     scene: Scene, speed: Array, phases: Array, points: int, max_steps: int | None, accuracy: float
 ) -> SynchronousOrbit:
-    """Solve for one synchronous motion with a number of collocation points.
-
-    `max_steps`: limit of the integration steps in a period for the multipliers. With a limit, the multipliers have derivatives
-    in reverse mode.
-    """
+    """Solve for one synchronous motion with a number of collocation points; `max_steps`: see `multipliers_of`."""
     whole, grid, forcing = periodic_scene(scene, phases), grid_of(points, False), forcing_exciters(scene)
     forced = bool(forcing)
     motion = solve_whole(whole, grid, speed, forced=forced)

@@ -135,14 +135,11 @@ def state_of(
     for exciter, begin, end in zip(scene.exciters, ends, ends[1:], strict=False):
         angle = exciter.direction * (theta + deviation[begin:end])
         rate = exciter.direction * omega * (1.0 + deviation_rate[begin:end])
-        exciters.append(_exciter_state(exciter, angle, rate))
+        if exciter.loads is not None:
+            exciters.append(ExciterState((angle,), (rate,)))
+        else:
+            exciters.append(ExciterState() if exciter.drive.ideal else ExciterState(rotor=(angle[0], rate[0])))
     return State(displacement, velocity, exciters=exciters)
-
-
-def _exciter_state(exciter: Exciter, angle: Array, rate: Array) -> ExciterState:
-    if exciter.loads is not None:
-        return ExciterState((angle,), (rate,))
-    return ExciterState() if exciter.drive.ideal else ExciterState(rotor=(angle[0], rate[0]))
 
 
 def periodic_scene(scene: Scene, phases: Array) -> PeriodicScene:
@@ -213,15 +210,12 @@ def collocation(scene: PeriodicScene, grid: Grid, x: Array, omega: Array, *, for
 
 
 def solve_whole(scene: PeriodicScene, grid: Grid, omega: Array, *, forced: bool) -> WholeMotion:
-    """Solve for the periodic motion of a scene by Newton's method.
+    """Solve for the periodic motion of a scene by Newton's method, with derivatives by the implicit function theorem.
 
         x'' = f(theta, x, x', Omega)    at the M points of the grid,    ' = d/dtheta
         mean psi of the first body = 0    if the motion is not forced; Omega is then an unknown
 
     **Arguments**: `omega`, rad/s: the speed of a `forced` motion, otherwise the initial value of the speed.
-
-    Derivatives with respect to every parameter of the scene, and with respect to `omega` of a forced motion, follow from the
-    implicit function theorem.
     """
     speed = omega if forced else jax.lax.stop_gradient(omega)
     x, w = _solve(scene, speed, linear_start(scene, grid, omega), grid_key=(grid.theta.size, grid.symmetric), forced=forced)
@@ -293,11 +287,10 @@ def _solve_jvp(primals, tangents, *, grid_key: tuple[int, bool], forced: bool):
 
 
 def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, forced: bool) -> tuple[Array, Array]:
-    """Return the residual of the equations at the points, relative to their terms, and the estimated error of the motion.
+    """Return the residual of the equations at the points, relative to their terms, and the estimated error of the motion: the
+    largest of those of the speed, relative, of angles, rad, and of displacements, relative to the largest displacement.
 
-    The error is the largest of three errors: of the speed, relative; of angles, rad; of displacements, relative to the largest
-    displacement. They are estimated from the change in one Newton step with the residuals at twice as many points, and from the
-    highest harmonic.
+    It follows from one Newton step with the residuals at twice as many points, and from the highest harmonic.
     """
     scene, (x, omega) = jax.lax.stop_gradient((scene, motion))
     system, nd = collocation(scene, grid, x, omega, forced=forced), scene.coordinates
@@ -314,11 +307,10 @@ def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, 
 def multipliers_of(
     scene: PeriodicScene, grid: Grid, motion: WholeMotion, max_steps: int | None, *, forced: bool
 ) -> tuple[Array, Array, Array]:
-    """Return the Floquet multipliers of the full state about a periodic motion, the trivial one, and the error of their moduli.
+    """Return the Floquet multipliers of the full state about a periodic motion without the trivial one of a shift in time, the
+    trivial one (NaN with forcing), and the error of their moduli.
 
-    Without forcing the trivial multiplier of a shift in time is not among the others; with forcing it is NaN. The
-    number of steps of `radau.flow` in a period is the number that the carrier's fastest vibration needs, at most `max_steps`.
-    Derivatives in reverse mode exist only if `max_steps` is given.
+    `max_steps`: limit of the steps of `radau.flow`, without which there are no derivatives in reverse mode.
     """
     x, omega = motion
     n, orders = x.shape[0], jnp.asarray(grid.deviation_orders, x.dtype)
@@ -343,11 +335,8 @@ def multipliers_of(
 
 
 def _radians(scene: PeriodicScene, omega: Array) -> Array:
-    """Return the phase, rad, through which the fastest oscillation advances in a period: 2 pi (w/Omega + 2).
-
-    w is the highest natural frequency of the carrier, with an upper bound of its change by gyroscopic forces. The rotating
-    bodies shift frequencies by up to 2 Omega.
-    """
+    """Return the phase, rad, through which the fastest oscillation advances in a period: 2 pi (w/Omega + 2), with the highest
+    natural frequency w, an upper bound of its gyroscopic change, and a shift by up to 2 Omega by the rotating bodies."""
     carrier, gyroscopic = scene.model.carrier, scene.model.mounts[0].gyroscopic
     half = jnp.linalg.inv(jnp.linalg.cholesky(carrier.mass))
     fastest = jnp.sqrt(jnp.max(jnp.abs(jnp.linalg.eigvalsh(half @ carrier.stiffness @ half.T))))

@@ -34,11 +34,8 @@ _LONGEST_STEP = 0.3
 
 
 class Slopes(NamedTuple):
-    """Singular value decomposition of the Jacobian of the balance, whose rows and columns are multiplied by factors.
-
-    **Attributes**: `rows` and `columns`: the factors; `left`, `values`, `right`: U, s and V^T of the decomposition;
-    `neutral`: number of singular values that are 0 up to rounding.
-    """
+    """Singular value decomposition U, s, V^T (`left`, `values`, `right`) of the Jacobian of the balance, whose `rows` and
+    `columns` are multiplied by these factors."""
 
     rows: Array
     columns: Array
@@ -48,7 +45,7 @@ class Slopes(NamedTuple):
 
     @property
     def neutral(self) -> Array:
-        """Number of directions in which the unknowns can change without a change of torques."""
+        """Number of singular values that are 0 up to rounding: directions in which torques do not change."""
         return jnp.sum(self.values < _rank_tolerance(self.values))
 
 
@@ -78,10 +75,8 @@ def slopes_of(x: Array, balance: TorqueBalance, factor: Array | None = None) -> 
 
 
 def implicit_step(x: Array, slopes: Slopes, residuals: Array) -> Array:
-    """Return the unknowns after a Newton step without a change in neutral directions.
-
-    If `residuals` at `x` are functions of the scene, the result has the derivatives of the implicit function theorem.
-    """
+    """Return the unknowns after a Newton step without a change in neutral directions, with the derivatives of the implicit
+    function theorem if the `residuals` at `x` are functions of the scene."""
     known = slopes.values > _rank_tolerance(slopes.values)
     inverse = jnp.where(known, 1.0 / jnp.where(known, slopes.values, 1.0), 0.0)
     along = inverse * (slopes.left.T @ (slopes.rows * residuals))
@@ -179,11 +174,8 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
 
 
 def _fold_near(balance: TorqueBalance, x: Array, factor: Array) -> tuple[Array, Array, Slopes]:
-    """Return the unknowns, the factor and the slopes at the fold near a regime.
-
-    At the fold the residuals are 0, and their Jacobian J with respect to the unknowns is singular: J v = 0. The length of v is
-    fixed by v0 . v = 1, where v0 is the vector of the smallest singular value at `x`.
-    """
+    """Return the unknowns, the factor and the slopes at the fold near a regime, where the residuals are 0 and their Jacobian J
+    is singular: J v = 0 with v0 . v = 1, where v0 is the vector of the smallest singular value at `x`."""
     begin = slopes_of(x, balance, factor)
     normal = begin.right[-1] / begin.columns
     normal = normal / jnp.sqrt(jnp.sum(normal**2))

@@ -123,11 +123,10 @@ def _total_torques(phases: Array, balance: TorqueBalance, speeds: Array) -> Arra
 
 
 def _speeds(balance: TorqueBalance) -> np.ndarray:
-    """Return speeds up to the largest working speed, dense near resonances and near the working speeds of the drives.
+    """Return speeds up to the largest working speed, above which drives and vibration brake, dense near resonances and near the
+    working speeds of the drives.
 
-    No regime is faster, because above these speeds the sum of the driving torques is negative, and the vibration brakes. The
-    largest speed is repeated in place of higher and equal speeds: otherwise most changes of a parameter would change the number
-    of speeds, and with it the compiled program.
+    The largest speed is repeated, so that the number of speeds, and with it the compiled program, is always the same.
     """
     drives = np.array([float(drive.speed) for drive in balance.averaged.drives])
     top = drives.max()
@@ -141,11 +140,10 @@ def _speeds(balance: TorqueBalance) -> np.ndarray:
 
 
 def sets_of_phases(prescribed: np.ndarray, dtype: np.dtype, per_unknown: int = _PHASES_PER_UNKNOWN) -> np.ndarray:
-    """Return regular and random sets of phases (n, count).
+    """Return regular and random sets of phases (n, count); those of masses with prescribed speed are 0.
 
     The number of random sets is `per_unknown` times the square of the number of unknown phases, and not larger than that for
-    `MAX_COMPLETE` masses. A single unknown phase has `per_unknown` evenly spaced values instead of random ones. The phases of
-    masses with prescribed speed are 0.
+    `MAX_COMPLETE` masses. A single unknown phase has `per_unknown` evenly spaced values instead of random ones.
     """
     free = np.flatnonzero(~prescribed) if prescribed.any() else np.arange(1, prescribed.size)
     n = free.size
@@ -184,10 +182,8 @@ def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tup
 
 
 def _nearly_touching(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of local minima of |values| (n, points) at which the values are close to 0.
-
-    Both neighbours of such a minimum have its sign, and the larger of them is at least twice as large.
-    """
+    """Return the indices of local minima of |values| (n, points) whose neighbours have the same sign, the larger of them at
+    least twice as large."""
     left, size, right = (np.abs(x) for x in (values[:, :-2], values[:, 1:-1], values[:, 2:]))
     same = (values[:, :-2] * values[:, 1:-1] > 0.0) & (values[:, 1:-1] * values[:, 2:] > 0.0)
     row, point = np.nonzero(same & (size <= np.minimum(left, right)) & (2.0 * size <= np.maximum(left, right)))

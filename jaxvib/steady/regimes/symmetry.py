@@ -52,11 +52,8 @@ def exchanges_of(influence: np.ndarray, features: np.ndarray) -> list[Exchange]:
 
 
 def _permutations(size: np.ndarray, same: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return the permutations (n, count) of masses that leave `size` |H| (speeds, count, count) unchanged, first the identity.
-
-    `same` (count, count): True for masses with equal features. The permutations are built up mass by mass; at most
-    `_MAX_EXCHANGES` of them are continued.
-    """
+    """Return the permutations (n, count) of masses that leave `size` |H| (speeds, count, count) unchanged, first the identity,
+    built up mass by mass. `same` (count, count): True for masses with equal features."""
     permutations = np.zeros((1, 0), int)
     for i in range(len(same)):
         k = np.arange(len(same))[None, :, None]
@@ -116,10 +113,8 @@ def distinct_regimes(
 
 
 def _without_copies(speed: np.ndarray, phasors: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
-    """Return the ascending indices of regimes without those that agree with an earlier one in rounded speed and phasors.
-
-    Most regimes are found from many starts. The search for exchanges is slow; this comparison first removes most regimes.
-    """
+    """Return the ascending indices of regimes without those that agree with an earlier one in rounded speed and phasors: most
+    of them, because most regimes are found from many starts. The slow search for exchanges follows."""
     relative = phasors * phasors[:, :1].conj() / (0.5 * tolerance[1])
     level = np.log(np.maximum(speed, np.finfo(speed.dtype).tiny)) / tolerance[0]
     cells = np.round(np.concatenate([level[:, None], relative.real, relative.imag], axis=1))

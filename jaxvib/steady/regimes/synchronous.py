@@ -269,10 +269,8 @@ class SynchronousRegimes(AbstractSynchronousRegime):
 
 @cached
 def _torque_curves(scene: Scene, phases: Array) -> tuple[Array, Array, Array]:
-    """Return speeds up to the largest working speed, and at each the torques of the drives and those that the vibration needs.
-
-    The torque of an ideal drive is NaN.
-    """
+    """Return speeds up to the largest working speed, and at each the torques of the drives (NaN for an ideal drive) and those
+    that the vibration needs."""
     balance = assemble_torque_balance(scene)
     speeds = balance.speed * jnp.linspace(0.0, 1.0, _CURVE_POINTS)[1:]
 
@@ -434,11 +432,8 @@ def fields_of_balance(balance: TorqueBalance, omega: Array, phases: Array) -> di
 
 
 def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: Array | None = None) -> dict[str, Any]:
-    """Return the fields of a regime, except `scene`. They have derivatives with respect to parameters of the scene.
-
-    **Arguments**: unknowns `x` that solve the balance, and the `slopes` there (None if there are no unknowns), both without
-    derivatives; the `growth` of disturbances if it has been computed.
-    """
+    """Return the fields of a regime, except `scene`, with derivatives with respect to parameters of the scene: from unknowns
+    `x` that solve the balance, the `slopes` there (None without unknowns), and the `growth` of disturbances if it is known."""
     frozen = jax.lax.stop_gradient(balance)
     neutral = jnp.asarray(0) if slopes is None else slopes.neutral
     if slopes is not None:
@@ -495,10 +490,7 @@ def _power(balance: TorqueBalance, omega: Array, driving: Array) -> Array:
 
 
 def _has_one_speed(balance: TorqueBalance) -> Array:
-    """Return True if all prescribed speeds of unbalances are equal.
-
-    `require_one_speed` has already checked speeds that are known (not traced).
-    """
+    """Return True if all prescribed speeds of unbalances are equal, see `require_one_speed` for known speeds."""
     field = balance.averaged
     speeds = [drive.speed for count, drive in zip(field.counts, field.drives, strict=True) if count == 0 and drive.ideal]
     return jnp.all(jnp.stack([speed == speeds[0] for speed in speeds])) if speeds else jnp.asarray(True)
