@@ -90,14 +90,8 @@ _CIRCLE = (1.0, -1.0j)
 
 
 def mean_torque(unbalance: Array, acceleration: Array) -> Array:
-    """Return -(S/2) Im(e^{-i psi} a), N m: the mean torque of a vibration on a load.
-
-    **Arguments**, arrays of one shape
-
-    - `unbalance` S = m R, kg m
-    - `acceleration` e^{-i psi} a, m/s^2: the forward circular part a = e^H B A of the acceleration of the point that carries
-      the load, relative to the phase psi of the load
-    """
+    """Return -(S/2) Im(e^{-i psi} a), N m: the mean torque of a vibration on loads with the `unbalance` S, from
+    `acceleration` e^{-i psi} a, m/s^2, an array of the same shape."""
     return -unbalance * acceleration.imag / 2.0
 
 
@@ -306,11 +300,8 @@ class Averaged(eqx.Module):
         return turned[0] if len(turned) == 1 else sum(turned[1:], turned[0]) / len(turned)
 
     def driving_torque(self, t: Array, speeds: Sequence[Array], rate: Array) -> Array:
-        """Return the torque of the drag on each load and of the motor on each unbalance, (count,) N m.
-
-        The torque is 0 for an unbalance of prescribed speed. `t`, s; `speeds` of the rotors, see `rotor_speeds`; `rate`
-        (count,) rad/s.
-        """
+        """Return the torque of the drag on each load and of the motor on each unbalance (0 for a prescribed speed), (count,)
+        N m, at the time `t`, s, the `speeds` of `rotor_speeds` and the `rate` of each mass, rad/s."""
         if len(self.counts) == 1 and self.counts[0]:
             return self.drag * (speeds[0] - rate)
         torques = []
@@ -350,10 +341,7 @@ class Averaged(eqx.Module):
         return together if np.array_equal(places, masses) else together[np.argsort(places)]
 
     def ripple(self, state: Amplitudes) -> Array:
-        """Return the amplitude of the vibration of each load's angle that the dropped torque causes, (count,) rad.
-
-        S |e^T B i Omega V| / (2 I (2 Omega)^2)
-        """
+        """Return the amplitude r_j of the vibration of each load's angle that the dropped torque causes, (count,) rad."""
         backward = times(jnp.sum(self.port * self._circle(), axis=1), state.velocity)
         backward = backward if self.levers is None else jnp.sum(self.levers * backward[:, None], axis=0)
         size = magnitude(backward)
@@ -375,10 +363,8 @@ def averaged_loads(scene: Scene) -> CircularLoads:
 
 
 def require_rotating_masses(scene: Scene, included: tuple[type[Term], ...] = AVERAGED_TERMS) -> None:
-    """Require that each exciter of a scene has an unbalance, or loads on circles with an ideal drive, and allowed effects.
-
-    **Raises** `InputError` for other exciters and for effects with terms that are not `included`.
-    """
+    """**Raises** `InputError` for an exciter with neither an unbalance nor loads on circles with an ideal drive, and for
+    effects with terms that are not `included`."""
     for k, exciter in enumerate(scene.exciters):
         with within(scene.prefix_of(k)):
             if exciter.loads is None:
@@ -395,9 +381,7 @@ def require_rotating_masses(scene: Scene, included: tuple[type[Term], ...] = AVE
 def averaged_field(scene: Scene) -> Averaged:
     """Return the averaged equations of `scene`; the module docstring derives them and states their error.
 
-    **Returns** `Averaged`; `jit`, `vmap` and `grad` apply to it and to the scene. **Raises** `InputError` for loads that do not
-    move on a circle, loads with a motor, a body in a plane, and effects other than potentials such as gravity, whose mean
-    torque is 0.
+    **Raises** `InputError` like `turning_loads`, for effects other than potentials such as gravity, whose mean torque is 0.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jax.numpy as jnp, jaxvib as jv
@@ -487,16 +471,11 @@ def _block_diagonal(blocks: Sequence[Array]) -> Array:
 
 
 def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: Array, neutral: Array | int = 1) -> Array:
-    """Return the growth rate of small disturbances of rotating masses that turn at one speed, 1/s.
+    """Return the growth rate of small disturbances of rotating masses that turn at one speed, 1/s: the `largest_growth` of the
+    averaged equations, linearized about the motion; NaN if the motion is not finite.
 
-    It is the largest real part of the eigenvalues of the averaged equations, linearized about the motion. The eigenvalue 0 of
-    a common shift of all phases is omitted. The result is NaN if the motion is not finite.
-
-    **Arguments**
-
-    - `omega` rad/s; `phase` (count,) rad; `displacement` (nd,) complex, m, as in `Amplitudes`. The drives have constant speed,
-      or their torque is a function of the speed
-    - `neutral`: number of zero eigenvalues to omit: 1, and one more for each free parameter of a continuous family of motions
+    **Arguments**: `omega` rad/s; `phase` (count,) rad; `displacement` (nd,) complex, m, as in `Amplitudes`; `neutral`: 1 for a
+    common shift of all phases, and one more for each free parameter of a continuous family of motions.
     """
     nd, count = displacement.shape[0], phase.shape[0]
     free = np.flatnonzero(~field.is_prescribed)
@@ -515,18 +494,14 @@ def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: A
 
 
 def decays(growth: Array, omega: Array) -> Array:
-    """Return True if disturbances with a growth rate, 1/s, of a motion at the speed `omega`, rad/s, decay.
-
-    The rate must be more negative than a limit, because small computed rates can be rounding errors.
-    """
+    """Return True if disturbances with a growth rate, 1/s, of a motion at the speed `omega`, rad/s, decay, see
+    `_MIN_DAMPING`."""
     return growth < -max(_MIN_DAMPING, 100.0 * float(jnp.finfo(growth.dtype).eps)) * omega
 
 
 def largest_growth(matrix: Array, neutral: Array | int) -> Array:
-    """Return the largest real part of the eigenvalues of a matrix, 1/s, without the `neutral` ones closest to 0.
-
-    The result is NaN if the matrix is not finite.
-    """
+    """Return the largest real part of the eigenvalues of a matrix, 1/s, without the `neutral` ones closest to 0; NaN if the
+    matrix is not finite."""
     # The library routine for eigenvalues does not terminate for a matrix that is not finite.
     finite = jnp.all(jnp.isfinite(matrix))
     values = eigenvalues_in_turn(jnp.where(finite, matrix, 0.0))

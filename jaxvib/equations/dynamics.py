@@ -41,11 +41,8 @@ T = TypeVar("T")
 
 
 class _Support(eqx.Module):
-    """Place of a `SupportForce`.
-
-    **Attributes**: `rows` (k, nd): its k displacements are `rows` q; `input_matrix` (nd, k): accelerations of the carrier per
-    force at this place, 1/kg.
-    """
+    """Place of a `SupportForce` with the displacements `rows` (k, nd) q; `input_matrix` (nd, k): accelerations of the carrier
+    per force at this place, 1/kg."""
 
     rows: Array
     input_matrix: Array
@@ -138,10 +135,8 @@ class Dynamics(eqx.Module):
         ]
 
     def at_rows(self, rows: Array) -> Dynamics:
-        """Return the equations with the accelerations of P's rows and of further `rows` (k, nd) in place of the carrier's q''.
-
-        The cost is then proportional to nd, and not to its square. P must not have more rows than there are coordinates.
-        """
+        """Return the equations with the accelerations of P's rows, at most nd, and of further `rows` (k, nd) in place of the
+        carrier's q''. The cost is then proportional to nd, and not to its square."""
         every = jnp.concatenate([self.rows, rows])
         supports = tuple(_Support(support.rows, every @ support.input_matrix) for support in self.supports)
         return dataclasses.replace(
@@ -228,8 +223,6 @@ class Dynamics(eqx.Module):
     def _solve_in_coordinates(
         self, mass: Array, unforced: Array, weights: list[dict[int, Array | float]], reaction: list[Array | float]
     ) -> Array:
-        """Return the accelerations of the carrier from the added masses that couple the rows, and from the reaction on each
-        row."""
         force = times(mass, unforced)
         for row, line, g in zip(self.rows, weights, reaction, strict=True):
             weighted_row = functools.reduce(operator.add, (w * self.rows[k] for k, w in line.items()))
@@ -299,11 +292,8 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
 
 
 def _groups_of_directions(exciters: Sequence[RotorDynamics], directions: Sequence[int]) -> tuple[Group[RotorDynamics], ...]:
-    """Return the exciters in groups.
-
-    A group with both directions of rotation contains the directions as an array. In another group, the direction
-    is not an array, and the program has no products with it.
-    """
+    """Return the exciters in groups. Only a group with both directions of rotation contains them as an array, so that programs
+    of other groups have no products with it."""
 
     def directed(part: RotorDynamics, direction: int) -> RotorDynamics:
         drive = part.drive.drive if isinstance(part.drive, Directed) else part.drive

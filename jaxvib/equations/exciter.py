@@ -188,10 +188,7 @@ class RotorDynamics(eqx.Module):
         drag_torque: Array,
         coupling: Axes,
     ) -> tuple[list[list[Array | float]], list[Array | float], tuple[Array, list[Array]] | None]:
-        """Add the rotor's imbalance to the added mass and the reaction.
-
-        **Returns** both, and the acceleration of the rotor, see `Eliminated.rotor`.
-        """
+        """Return added mass and reaction with the rotor's imbalance, and the acceleration of the rotor, see `Eliminated`."""
         motor = self._motor(motion)
         if motor is None:
             if motion.imbalance_derivatives is not None:
@@ -214,10 +211,8 @@ class RotorDynamics(eqx.Module):
         return self.drive.torque_and_inertia(motion.time, motion.driven_speed, states)
 
     def _braking_torque(self, motion: Motion, drag_torque: Array, coupling: Axes) -> tuple[Array, list[Array]]:
-        """Return (T, c) of the torque T + c . a, N m, with which loads, gravity and imbalance brake the rotor.
-
-        c has entries for the first scalar rows of the mount only; the torque does not depend on the other rows.
-        """
+        """Return (T, c) of the torque T + c . a, N m, with which loads, gravity and imbalance brake the rotor, with entries of
+        c for the first scalar rows of the mount only, the others being 0."""
         torque = self._total(drag_torque)
         torque = torque if motion.weight_torque is None else torque + motion.weight_torque
         by_loads = [self._total(coupling[i], lever) for lever in self.levers for i in self.axes] if coupling else []
@@ -241,11 +236,11 @@ class RotorDynamics(eqx.Module):
         return part._replace(added_mass=added_mass, reaction=[*part.reaction, torque], rotor=rotor)
 
     def _imbalance_derivatives(self, t: Array, state: ExciterState) -> tuple[list[Array], list[Array]] | None:
-        """Return two derivatives of d(theta).
+        """Return two derivatives of d(theta), the first moment of the unbalance and of the imbalances of the effects for each
+        row of the mount, kg m (kg m^2 for tilts); None without them.
 
-        d contains one number for each row of the mount: the first moment of the unbalance and of the imbalances of the effects,
-        kg m (kg m^2 for tilts). The first derivative is d'. The second is d'' theta'^2 under a motor, and the second time
-        derivative of d under an ideal drive. The result is None for a rotor without unbalance and imbalances.
+        The first derivative is d'. The second is d'' theta'^2 under a motor, and the second time derivative of d under an ideal
+        drive.
         """
         terms = terms_of(self.effects, RotorImbalance)
         if not terms and self.unbalance is None:
@@ -277,12 +272,9 @@ class RotorDynamics(eqx.Module):
         return list(first), second
 
     def weight_torque(self, t: Array, state: ExciterState) -> Array | None:
-        """Return g dh/dtheta, the torque of gravity against the rotor's rotation.
-
-        h = S sin(theta) + sum M e sin(theta + angle) is the upward component of the first moment of the unbalance and of the
-        imbalances of the effects, kg m. None for a rotor without unbalance and imbalances, or without gravity in the rotor's
-        plane.
-        """
+        """Return g dh/dtheta, the torque of gravity against the rotor's rotation, with the upward component
+        h = S sin(theta) + sum M e sin(theta + angle) of the first moment of the unbalance and of the imbalances of the effects,
+        kg m; None without these, or without gravity in the rotor's plane."""
         g, imbalances = total_gravity(self.effects), static_imbalances(self.effects)
         if 1 not in g or (self.unbalance is None and not imbalances):
             return None
@@ -307,11 +299,9 @@ class ExciterDynamics(RotorDynamics):
 
     @property
     def can_slide(self) -> bool:
-        """True if an effect lets loads slide."""
         return has_term(self.effects, SlipRelease)
 
     def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
-        """Return the quantities that do not depend on the accelerations, for a rotor that turns at `speed`."""
         imbalance_derivatives = self._imbalance_derivatives(t, state)
         of_loads = kinematics(self.loads, state.angle, state.rate)
         drag_torque, force = self._forces(state, speed)
@@ -324,10 +314,6 @@ class ExciterDynamics(RotorDynamics):
         return Motion(state, speed, imbalance_derivatives, of_loads, drag_torque, weight, contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
-        """Express the accelerations of loads and rotor in terms of the accelerations of the mount's rows.
-
-        The friction of `contact` must be linear in the accelerations, see `signed`.
-        """
         loads, axes, of_loads = self.loads, self.axes, motion.kinematics
         drag_torque, force, coupling = self._add_friction(motion.drag_torque, contact)
         m = loads.mass
@@ -347,14 +333,12 @@ class ExciterDynamics(RotorDynamics):
         return self._add_housing(motion, part, drag_torque, coupling[0])
 
     def at_loads(self, a: Sequence[Array]) -> Axes:
-        """Return the accelerations of the points that carry the loads from those of the mount's rows."""
         n = len(self.axes)
         moved = (a[k : k + n] for k in range(0, len(a), n))
         terms = [[scaled(lever, x) for x in row] for lever, row in zip(self.levers, moved, strict=False)]
         return {axis: total(row[k] for row in terms) for k, axis in enumerate(self.axes)}
 
     def slide(self, motion: Motion, contact: ContactSolution, part: Eliminated, a: Sequence[Array]) -> ContactSolution:
-        """Decide which loads slide, from the contact forces that the motion needs if all loads roll."""
         slip, state = self._slip(motion.state), motion.state
         if slip is None:
             return contact
@@ -370,7 +354,6 @@ class ExciterDynamics(RotorDynamics):
         )
 
     def rates(self, motion: Motion, rolling: ContactSolution, part: Eliminated, a: Sequence[Array]) -> ExciterState:
-        """Return the time derivative of the exciter's state."""
         state, speed = motion.state, motion.speed
         rotor = self._rotor_rates(motion, part, a)
         at_loads = self.at_loads(a)
@@ -386,10 +369,8 @@ class ExciterDynamics(RotorDynamics):
         return self._forces(state, speed, rotation=False)[1]
 
     def _forces(self, state: ExciterState, speed: Array, *, rotation: bool = True) -> tuple[Array, list[Array]]:
-        """Return the torque of the drag, and the generalized forces on the loads without friction.
-
-        If `rotation` is False, the forces that turn a load about its own centre are left out.
-        """
+        """Return the torque of the drag, and the generalized forces on the loads without friction and, if `rotation` is False,
+        without those that turn a load about its own centre."""
         loads = self.loads
         resistance = loads.resistance(state.angle, state.rate, speed)
         force = list(resistance)
@@ -406,10 +387,8 @@ class ExciterDynamics(RotorDynamics):
         return resistance[0], force
 
     def _add_friction(self, drag_torque: Array, contact: ContactSolution) -> tuple[Array, list[Array], list[Axes]]:
-        """Add the friction that does not depend on the accelerations to the drag and to the forces.
-
-        **Returns** both, and for each coordinate of a load the friction per acceleration, by axis; {} without such friction.
-        """
+        """Return the drag and the forces with the friction that does not depend on the accelerations, and for each coordinate
+        of a load the friction per acceleration, by axis; {} without such friction."""
         force, coupling = list(contact.force), [dict[int, Array]() for _ in contact.force]
         for each in contact.friction:
             frictions = [lever * each.static_normal_force for lever in (each.lever, *each.others)]
@@ -426,10 +405,7 @@ class ExciterDynamics(RotorDynamics):
     def _reaction_of_loads(
         self, of_loads: Kinematics, free: tuple[Array, ...], response_to_carrier: Mapping[int, tuple[Array, ...]]
     ) -> tuple[list[list[Array | float]], list[Array | float]]:
-        """Return added mass and reaction of the loads.
-
-        Each load acts on a row of the mount with its lever on this row. Rows that move no load have zeros.
-        """
+        """Return added mass and reaction of the loads, each of which acts on a row of the mount with its lever on this row."""
         m, axes, levers = self.loads.mass, self.axes, self.levers
         columns = {axis: [column[axis] for column in of_loads.columns] for axis in axes}
         mass = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(columns[i], response_to_carrier[k]) for i in axes for k in axes}
@@ -479,14 +455,12 @@ class ExciterDynamics(RotorDynamics):
         return self.loads.drilling_spin(state.angle, state.rate, speed, state.spin.slip)
 
     def _total(self, values: Array, *levers: Array | None) -> Array:
-        """Return the sum over all loads."""
         for lever in levers:
             values = scaled(lever, values)
         return jnp.sum(jnp.broadcast_to(values, (self.loads.count,)))
 
 
 def depends_on_acceleration(contact: ContactSolution) -> bool:
-    """Return True if a friction is proportional to a normal force that depends on the accelerations."""
     return any(each.normal_force_per_acceleration is not None for each in contact.friction)
 
 
@@ -496,10 +470,7 @@ def without_coupling(contact: ContactSolution) -> ContactSolution:
 
 
 def signed(contact: ContactSolution, at_loads: Axes) -> ContactSolution:
-    """Return the contact with friction that is linear in the accelerations.
-
-    Each normal force keeps the sign that it has at the accelerations `at_loads`.
-    """
+    """Return the contact with friction that is linear in the accelerations: each normal force keeps its sign at `at_loads`."""
     friction: list[Friction] = [
         each if each.normal_force_per_acceleration is None else each.signed(at_loads) for each in contact.friction
     ]

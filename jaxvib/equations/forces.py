@@ -281,11 +281,8 @@ def _drive_torque(
     acceleration: Array,
     rotor: tuple[Array, Array, Array],
 ) -> Array:
-    """Return the torque of a drive, N m.
-
-    **Arguments**: `acceleration` of the carrier; `rotor`: its angle, its speed relative to the housing, and the braking torque
-    of its loads.
-    """
+    """Return the torque of a drive, N m, from the `acceleration` of the carrier, and the angle, the speed relative to the
+    housing and the braking torque of the loads of its `rotor`."""
     turn, driven, braking = rotor
     motor = dynamics.drive.torque_and_inertia(t, driven, (state.rotor or ())[2:])
     if motor is not None:
@@ -296,11 +293,8 @@ def _drive_torque(
 
 
 def drive_torques(model: Model, field: Dynamics, t: Array, state: State) -> tuple[Array, Array]:
-    """Return the torque of each drive in the direction of its rotation, N m, and its power, W, as arrays (exciters,).
-
-    **Arguments**: `field`: `dynamics_of(model)`; `t`, s. The torque with which the rotor changes the spin of loads that spin or
-    slide is not included.
-    """
+    """Return the torque of each drive in the direction of its rotation, N m, and its power, W, as arrays (exciters,), without
+    the torque with which the rotor changes the spin of loads that spin or slide. `field`: `dynamics_of(model)`."""
     change, torques, powers = field(t, state), [], []
     for exciter, dynamics, mount, part in zip(model.scene.exciters, field.exciters, model.mounts, state.exciters, strict=True):
         turn, speed = dynamics.drive.rotor_angle(t, part.rotor), dynamics.drive.rotor_speed(t, part.rotor)
@@ -343,11 +337,8 @@ def _load_power(
 def _spin_power(
     exciter: ExciterDynamics, state: ExciterState, change: ExciterState, at_load: Mapping[int, Array], speed: Array
 ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
-    """Return rates and powers of loads that spin and slide.
-
-    **Returns** the sliding velocity c as rates of the coordinates, c_i / |dp/du_i|; the power of the rotor to loads that
-    spin and slide, W; the power that sliding dissipates, W, without rolling friction.
-    """
+    """Return the sliding velocity c as rates of the coordinates, c_i / |dp/du_i|, the power of the rotor to loads that spin and
+    slide, W, and the power that sliding dissipates, W, without rolling friction."""
     loads, spin, zero = exciter.loads, state.spin, jnp.zeros(())
     if spin is None:
         return (), (zero, zero)

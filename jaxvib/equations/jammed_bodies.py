@@ -61,10 +61,8 @@ class JammedBodies(eqx.Module):
         return jnp.asarray(phi) + self.offsets[:, None], jnp.broadcast_to(rate, (self.loads.count, phi.shape[1]))
 
     def rotor_torque(self, phi: Points, rate: Array, speed: Array, a: Array) -> Array:
-        """Return the torque of the rotor on loads at the angles `phi`, N m: viscous resistance and dry friction.
-
-        `a` (np, ...) is the acceleration of the mount, m/s^2.
-        """
+        """Return the torque of viscous resistance and dry friction on loads at the angles `phi`, N m, under the acceleration
+        `a` (np, ...) of the mount, m/s^2."""
         loads, u, rates = self.loads, (jnp.asarray(phi),), (rate,)
         at = dict(zip(self.linear.mount.axes, a, strict=True))
         gravity = total_gravity(self.effects)
@@ -81,10 +79,8 @@ class JammedBodies(eqx.Module):
         return torque
 
     def torque(self, phi: Points, rate: Array, speed: Array, a: Array, of_each: Callable[..., Array] | None = None) -> Array:
-        """Return the torque on the bodies (G, M), N m, at their angles `phi` (G, M), without inertia torques.
-
-        It is the sum over the loads of each body of `of_each`, by default `torque_of_each`. `a` is (np, M).
-        """
+        """Return the torque on the bodies (G, M), N m, without inertia torques: the sum of `of_each`, by default
+        `torque_of_each`, over the loads of each body. `a` is (np, M)."""
         of_each = self.torque_of_each if of_each is None else of_each
         if not self.loads.alike:
             return jax.vmap(lambda p, r, x: of_each(p, r, speed, x), in_axes=1, out_axes=1)(phi, rate, a)
@@ -93,10 +89,8 @@ class JammedBodies(eqx.Module):
         return jnp.sum(of_each(*self.each_load(phi, rate), speed, a[:, None]), axis=0, keepdims=True)
 
     def torque_slopes(self, phi: Points, rate: Array, speed: Array, a: Array) -> tuple[Array, Array, Array | None]:
-        """Return the derivatives of `torque` with respect to angle and rate of each body (G, M) and to `a` (np, G, M).
-
-        The last one is None without friction, because no other part of `torque` depends on the acceleration `a` of the mount.
-        """
+        """Return the derivatives of `torque` with respect to angle and rate of each body (G, M) and to `a` (np, G, M), None
+        without friction."""
         angle = jnp.asarray(phi)
         by_angle = jax.jvp(lambda p: self.torque(p, rate, speed, a), (angle,), (jnp.ones_like(angle),))[1]
         by_rate = jax.jvp(lambda r: self.torque(angle, r, speed, a), (rate,), (jnp.ones_like(rate),))[1]
@@ -121,10 +115,7 @@ def jammed_bodies(linear: JammedModel) -> JammedBodies:
 
 
 def require_periodic_jams(scene: Scene) -> CircularLoads:
-    """Return the loads of a scene whose jams are periodic.
-
-    **Raises** `InputError` for an unbalanced rotor, and for the reasons of `jammed_loads`.
-    """
+    """Return `jammed_loads` of a scene whose jams are periodic. **Raises** `InputError` also for an unbalanced rotor."""
     loads = jammed_loads(scene)
     _require_balance(scene.all_effects)
     return loads

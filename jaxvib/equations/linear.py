@@ -82,10 +82,7 @@ class LinearModel(Model):
 
     @property
     def direction(self) -> Array:
-        """B^T e (nd,) complex, with e from `rotating_direction`.
-
-        A unit force that turns with w at the mount has the generalized force Re(B^T e exp(i w t)).
-        """
+        """Generalized force B^T e (nd,), complex, of a unit force that turns at the mount, with e from `rotating_direction`."""
         return self.mount.rows[0].T @ rotating_direction(self.mount)
 
     def damping(self, speed: Array) -> Array:
@@ -94,25 +91,17 @@ class LinearModel(Model):
         return damping if gyroscopic is None else damping + speed * gyroscopic
 
     def dynamic_stiffness(self, omega: Array, speed: Array | None = None) -> Array:
-        """Return D(w) (nd, nd) complex, N/m: force per displacement at the frequency `omega` w (scalar, rad/s).
-
-        n is the rotor's `speed`, rad/s. If it is None, the rotor turns with the loads at w.
-        """
+        """Return D(w) (nd, nd), N/m, at the frequency `omega` w and the rotor's `speed` n, rad/s (default: w)."""
         damping = self.damping(omega if speed is None else speed)
         return jax.lax.complex(self.carrier.stiffness - omega**2 * self.mass, omega * damping)
 
     def dissipated(self, velocity: Array) -> Array:
-        """Return the mean power, W, that the carrier's damping dissipates in a periodic motion: sum_k V_k^H C V_k / 2.
-
-        **Arguments**: `velocity` V (nd, K) or (nd,), the complex amplitudes of the coordinates' rates.
-        """
+        """Return the mean power sum_k V_k^H C V_k / 2, W, that the carrier's damping dissipates in a periodic motion with the
+        complex amplitudes `velocity` V (nd, K) or (nd,) of the coordinates' rates."""
         return jnp.vdot(velocity, self.carrier.damping @ velocity).real / 2.0
 
     def peak_matrices(self) -> tuple[Array, Array, Array]:
-        """Return M, C and K (nd, nd) at the working speed.
-
-        Peaks of the response are near the imaginary parts of the poles s, the roots of det(s^2 M + s C + K) = 0.
-        """
+        """Return M, C and K at the working speed; peaks of the response are near the roots s of det(s^2 M + s C + K) = 0."""
         return self.mass, self.damping(self.scene.drive.speed), self.carrier.stiffness
 
     @property
@@ -121,21 +110,17 @@ class LinearModel(Model):
         return None
 
     def modes(self) -> tuple[Array, Array]:
-        """Return the undamped natural frequencies (nd,) rad/s, ascending, and the mass-normalized mode shapes (nd, nd).
-
-        Each column is the shape of one mode.
-        """
+        """Return the undamped natural frequencies (nd,) rad/s, ascending, and the mass-normalized mode shapes as columns."""
         square, inverse = relative_to(self.mass, self.carrier.stiffness)
         values, vectors = hermitian_modes(square)
         return root_or_zero(values), inverse.T @ vectors
 
     def decomposed(self, direction: Array | None = None) -> Self:
-        """Return this model with its modal form, which is faster for many load speeds.
+        """Return this model with its modal form, which is faster for many load speeds; `direction` (count, nd) of the forces of
+        several masses, default: that of the model.
 
-        Models of up to 3 coordinates are returned without a modal form, because a direct solution takes no longer. Models with
-        gyroscopic coupling are also returned without it, because the modal form does not include this coupling.
-
-        **Arguments**: `direction` (count, nd) of the forces of several masses, default: `direction` of the model.
+        Models of up to 3 coordinates have no modal form, because a direct solution takes no longer, and models with gyroscopic
+        coupling have none, because it does not include this coupling.
         """
         if self.mass.shape[0] <= _MAX_DIRECT_SIZE or self.mounts[0].gyroscopic is not None:
             return self
@@ -165,12 +150,8 @@ def linear_model(scene: Scene) -> LinearModel:
 
 
 def mean_speed(scene: Scene, unbalances: Array | None = None) -> Array:
-    """Return the mean speed of all rotors, rad/s, anticlockwise.
-
-    Rotors turn at the working speeds of their drives.
-
-    **Arguments**: `unbalances`: speed of the rotors without loads, rad/s; default: their working speeds.
-    """
+    """Return the mean speed of all rotors, rad/s, anticlockwise, at the working speeds of their drives, or with the speed
+    `unbalances` of the rotors without loads."""
     speeds = [
         exciter.direction * (exciter.drive.speed if unbalances is None or exciter.loads is not None else unbalances)
         for exciter in scene.exciters
@@ -190,7 +171,6 @@ class ExcitedModel(LinearModel):
 
     @property
     def direction(self) -> Array:
-        """Return `force_direction`."""
         return self.force_direction
 
     @property
@@ -223,12 +203,8 @@ class ExcitedModel(LinearModel):
         return jax.lax.custom_linear_solve(product, self.force(omega), solver(modal), solver(modal.transposed))
 
     def forward_acceleration(self, omega: Array) -> Array:
-        """Return w^2 f^H Y (complex scalar, m/s^2) at the speed `omega` of the masses.
-
-        It is minus the product of f^H and the complex amplitudes -w^2 Y of the accelerations.
-
-        If the model has a modal form, the cost is O(nd), and there are no derivatives with respect to parameters of the scene.
-        """
+        """Return w^2 f^H Y (complex scalar, m/s^2) at the speed `omega` of the masses. With a modal form the cost is O(nd), and
+        there are no derivatives with respect to parameters of the scene."""
         if self.modal is None:
             return omega**2 * jnp.sum(jnp.conj(self.force_direction) * self.displacement(omega))
         return self.unbalance * omega**4 * self.modal.receptance(omega)
@@ -331,10 +307,7 @@ def _natural_frequencies(scene: Scene) -> tuple[Array, Array]:
 
 
 def lost_frequencies(model: LinearModel, frequencies: Array, shapes: Array) -> Array:
-    """Return True for each of the natural frequencies (nd,) that is lost in rounding errors.
-
-    **Arguments**: `shapes` (nd, nd): the mode shapes, one in each column.
-    """
+    """Return True for each of the natural frequencies (nd,) that is lost in rounding errors, from `LinearModel.modes`."""
     w, x, mass, carrier = jax.lax.stop_gradient((frequencies, shapes, model.mass, model.carrier))
     lost = hermitian_error((carrier.stiffness, mass), w**2, x) > 2.0 * MAX_EIGENVALUE_ERROR
     # A motion of frequency 0 is free to drift unless springs resist it. Beside stiff springs soft ones can be seen in their own
@@ -346,12 +319,8 @@ def lost_frequencies(model: LinearModel, frequencies: Array, shapes: Array) -> A
 
 
 def rotating_direction(mount: Mount, direction: int = 1) -> Array:
-    """Return the rotating direction e, one entry for each direction of the mount.
-
-    A point on the unit circle at the angle w t (clockwise: -w t) has the position Re(e exp(i w t)).
-
-    **Arguments**: `direction`: +1 anticlockwise, -1 clockwise.
-    """
+    """Return the rotating direction e, one entry for each direction of the mount: a point on the unit circle at the angle
+    `direction` w t (-1: clockwise) has the position Re(e exp(i w t))."""
     return jnp.asarray([(1.0, -1.0j if direction == 1 else 1.0j)[axis] for axis in mount.axes])
 
 
@@ -360,16 +329,8 @@ def peak_force(force: Array) -> Array:
     return magnitude(force[0]) if force.shape[0] == 1 else jnp.sqrt(jnp.sum(magnitude(force) ** 2))
 
 
-def circular_loads(scene: Scene) -> CircularLoads:
-    """Return the loads of a scene, for an analysis that requires loads on a circle at one point of the machine."""
-    return turning_loads(scene, at_one_point=True)
-
-
 def jammed_loads(scene: Scene) -> CircularLoads:
-    """Return the loads of a scene, for an analysis of jams.
-
-    The loads may have dry friction. All other requirements are those of `circular_loads`.
-    """
+    """Return the loads of a scene, for an analysis of coincident loads, which may have dry friction."""
     return turning_loads(scene, JAM_TERMS, at_one_point=True)
 
 
@@ -384,52 +345,36 @@ def turning_loads(
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
-    loads, drive, effects, mount = scene.loads, scene.drive, scene.all_effects, scene.mounting
-    at_stations = at_one_point and not mount.at_one_point
-    if mount.turn is not None:
+    if scene.mounting.turn is not None:
         problem = (
             "rotates with the housing of its exciter, which this function does not include: use simulate, settle or ensemble"
         )
         raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}, which {problem}")
-    require_circular(loads, drive)
-    require_terms(effects, included)
-    if at_stations:
-        raise _stations_differ()
-    return cast(CircularLoads, loads)
+    require_circular(scene.loads, scene.drive)
+    require_terms(scene.all_effects, included)
+    if at_one_point:
+        require_one_point(scene)
+    return cast(CircularLoads, scene.loads)
 
 
 def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
-    """Require that at least one load has drag or, with `each`, that all loads have drag. Traced values are not checked.
-
-    **Raises** `InputError` for other loads.
-    """
-
-    def check(drag: np.ndarray | float) -> None:
-        if not (np.all if each else np.any)(np.asarray(drag) > 0.0):
-            raise InputError("loads.drag", "is 0; loads without drag never follow the rotor; use a drag greater than 0")
-
-    when_known(check, loads.drag)
+    """**Raises** `InputError` unless one load or, with `each`, all loads have drag. Traced values are not checked."""
+    if when_known(lambda drag: not (np.all if each else np.any)(np.asarray(drag) > 0.0), loads.drag):
+        raise InputError("loads.drag", "is 0; loads without drag never follow the rotor; use a drag greater than 0")
 
 
 def require_one_point(scene: Scene) -> None:
-    """Require one station of all loads along the machine's axis. **Raises** `InputError` for different stations."""
+    """**Raises** `InputError` for loads at different stations along the machine's axis."""
     if not scene.mounting.at_one_point:
-        raise _stations_differ()
-
-
-def _stations_differ() -> InputError:
-    problem = (
-        "differ; this function needs loads that run at one point of the machine: use phase_jams for their jams, "
-        "balanced_states for their balance (jaxvib balance), or simulate"
-    )
-    return InputError("machine.stations", problem)
+        problem = (
+            "differ; this function needs loads that run at one point of the machine: use phase_jams for their jams, "
+            "balanced_states for their balance (jaxvib balance), or simulate"
+        )
+        raise InputError("machine.stations", problem)
 
 
 def require_circular(loads: Loads, drive: Drive) -> None:
-    """Require loads on circles in a rotor of prescribed speed.
-
-    **Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`.
-    """
+    """**Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`."""
     if not loads.circular:
         needed = "this function needs loads on a circle with viscous drag (property circular): ball, roller, pendulum"
         raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {needed}; use simulate for other loads")
@@ -447,12 +392,10 @@ def require_terms(
     problem: str = "is|are not included in this function",
     advice: str = "here, or simulate",
 ) -> None:
-    """Require that an analysis includes every term of the `effects`.
+    """**Raises** `InputError` that names the `effects` with terms that are not `included` in an analysis, and their types.
 
-    **Arguments**: `problem`, the message about other effects. It begins with the verb for one effect, then | and the verb
-    for several effects. `advice`: end of the sentence that advises to leave the effects out.
-
-    **Raises** `InputError` that names all effects with other terms, and the types of these terms.
+    **Arguments**: `problem`, the message, which begins with the verbs for one effect and, after |, for several; `advice`: end
+    of the sentence that advises to leave the effects out.
     """
     others = [(effect.kind, type(term).__name__) for effect in effects for term in effect.terms() if type(term) not in included]
     if not others:
@@ -467,5 +410,4 @@ def require_terms(
 
 
 def _list_words(words: Sequence[str]) -> str:
-    """Return words as "a", "a and b" or "a, b and c"."""
     return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))

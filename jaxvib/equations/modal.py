@@ -39,10 +39,8 @@ class ModalResponse(eqx.Module):
     is_rough: Array
 
     def receptance(self, omega: Array) -> Array:
-        """Return the receptance e^H B D^-1 B^T e of the mount, m/N, at the frequency `omega` (scalar, rad/s).
-
-        It is the displacement per force, both turning with `omega`. For several masses, return the receptances
-        e_i^H B_i D^-1 B_k^T e_k (count, count) between them.
+        """Return the receptance e^H B D^-1 B^T e of the mount, m/N, at the frequency `omega` (scalar, rad/s), or the
+        receptances e_i^H B_i D^-1 B_k^T e_k (count, count) between several masses.
 
         The sum is a loop over the poles. In a batch each of its steps is then computed for many frequencies by vector
         instructions, which for 200 platforms takes a fifth of the time of sums over arrays. The sum uses real numbers because

@@ -27,13 +27,8 @@ T = TypeVar("T")
 
 
 class Group(eqx.Module, Generic[Part]):
-    """One part of an exciter, or the parts of several exciters if these parts have the same structure.
-
-    **Attributes**
-
-    - `part`: the part; for several exciters, its arrays have a leading axis over the exciters
-    - `members`: the numbers of the exciters
-    """
+    """One `part` of an exciter, or the parts of several exciters of the same structure as one, whose arrays have a leading axis
+    over the exciters; `members`: the numbers of the exciters."""
 
     part: Part
     members: tuple[int, ...] = eqx.field(static=True)
@@ -44,10 +39,7 @@ class Group(eqx.Module, Generic[Part]):
 
 
 def grouped(parts: Sequence[Part], kinds: Sequence[Hashable] | None = None) -> tuple[Group[Part], ...]:
-    """Return parts in groups of equal structure, and of equal `kinds` if these are given.
-
-    A group of fewer than `_MIN_GROUP_SIZE` is divided into single parts.
-    """
+    """Return parts in groups of equal structure, and of equal `kinds` if these are given; small groups are single parts."""
     alike: dict[Hashable, list[int]] = {}
     for k, part in enumerate(parts):
         leaves, structure = jax.tree.flatten(part)
@@ -112,18 +104,13 @@ class Model(eqx.Module):
         return force if self.scene.machine.has_foundation else jnp.full_like(force, jnp.nan)
 
     def vibration_force(self, displacement: Array, omega: Array) -> Array:
-        """Return the complex amplitudes of the force of the carrier's supports on the foundation, N; NaN if the foundation is
-        unknown. The forces of effects are not included.
-
-        **Arguments**: `displacement` (nd,) or (nd, K): complex amplitudes; `omega`: their frequency, or one for each column.
-        """
+        """Return the complex amplitudes of the force of the carrier's supports, without effects, on the foundation, N, from
+        those of the coordinates (nd,) or (nd, K) with one frequency or one for each column; NaN if the foundation is
+        unknown."""
         return self.known_force(self.carrier.foundation_force(displacement, 1j * omega * displacement))
 
     def natural_force(self, unit: State) -> Array:
-        """Return S n^2, N: the centrifugal force of the unbalance S at the rotor speed n.
-
-        **Arguments**: `unit`: a state that contains the natural units of the scene, such as the unbalance radius.
-        """
+        """Return S n^2, N: the centrifugal force of the unbalance S at the rotor speed n, from `natural_units`."""
         speeds = [each.rate[0] for each in unit.exciters if each.rate] or [unit.velocity / unit.displacement]
         speed = functools.reduce(jnp.maximum, speeds)
         return jnp.mean(jnp.diagonal(self.carrier.mass)) * unit.displacement * speed**2

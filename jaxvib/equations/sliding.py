@@ -64,14 +64,13 @@ def contact_force(
     force: Sequence[Array],
     kappa: Array | float,
 ) -> list[Array]:
-    """Return the force of the contact along each coordinate's unit tangent, (count,) N each.
+    """Return the force along each coordinate's unit tangent, (count,) N each, that the motion requires from the contact in
+    addition to the generalized `force` Q.
 
         [kappa m J^T (J u'' + (dJ/dt) u') + m J^T a - Q]_i / |dp/du_i|
 
-    The motion requires this force in addition to the generalized `force` Q.
-
-    **Arguments**: `acceleration` u''; `a`, the acceleration of the points that carry the loads, by axis; `kappa`: 1 for the
-    translation of the loads alone, or their inertia factor to include the inertia of their rotation.
+    **Arguments**: `acceleration` u''; `a` of the points that carry the loads, by axis; `kappa`: 1 for the translation of the
+    loads alone, or their inertia factor to include the inertia of their rotation.
     """
     curvature, needed = found.curvature_along, []
     for i, (column, metric, f, size) in enumerate(zip(found.columns, found.metric, force, found.sizes, strict=True)):
@@ -141,12 +140,8 @@ def resolve_contact(
 
 
 def slip_rates(loads: Loads, u: Coordinates, rate: Coordinates, slip: Coordinates, change: Sequence[Array]) -> Coordinates:
-    """Return the rate of the slip along each coordinate, m/s^2.
-
-    The slip c is a vector with the components `slip` along the tangents of the track. `change` contains the components of c'
-    along the tangents. The rate of a component of c differs from that component of c', because the tangents rotate while the
-    load moves.
-    """
+    """Return the rates, m/s^2, of the components `slip` of the slip vector c along the tangents of the track from the
+    components `change` of c'. They differ, because the tangents rotate while the load moves."""
 
     def tangents(*v: Array) -> list[list[Array]]:
         columns = [jax.jvp(loads.position, v, _unit(v, i))[1] for i in range(len(v))]

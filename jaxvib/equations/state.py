@@ -156,10 +156,7 @@ class State(Readable):
 
 
 def require_state(scene: Scene, state: State, name: str) -> None:
-    """Require that a user's state fits the scene.
-
-    **Raises** `InputError` for a state of another scene, and for several states in one. `name`: the state in messages.
-    """
+    """**Raises** `InputError` for a state of another scene, and for several states in one; `name`: the state in messages."""
     require_motion(scene, state, name)
     if len(state.exciters) != len(scene.exciters):
         raise InputError(f"{name}.exciters", f"are {len(state.exciters)}; this scene needs {len(scene.exciters)}")

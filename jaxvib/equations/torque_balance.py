@@ -102,17 +102,13 @@ class TorqueBalance(eqx.Module):
         return self.model.dynamic_stiffness(omega, self.averaged.gyroscopic_speed(speeds))
 
     def decomposed(self) -> TorqueBalance:
-        """Return this balance with the modal form of its model, for searches at many speeds.
-
-        Each influence coefficient then costs O(nd), and has no derivatives with respect to parameters of the scene.
-        """
+        """Return this balance with the modal form of its model, for searches at many speeds: each influence coefficient costs
+        O(nd), and has no derivatives with respect to parameters of the scene."""
         return eqx.tree_at(lambda balance: balance.model, self, self.model.decomposed(self.direction))
 
     def total_driving_torque(self, omega: Array, factor: Array | None = None) -> Array:
-        """Return `driving_torque`, with the differences of the torques from their mean multiplied by `factor`.
-
-        If an ideal drive turns an unbalance, all torques are multiplied, because the ideal drive balances any torque.
-        """
+        """Return `driving_torque`, with the differences from the mean multiplied by `factor`, or all torques if an ideal drive,
+        which balances any torque, turns an unbalance."""
         torque = self.driving_torque(omega)
         if factor is None:
             return torque
@@ -200,10 +196,8 @@ class UnbalancedModel(ExcitedModel):
         return mean_torque(self.balance.unbalance, jnp.conj(self.phasors) * forward)
 
     def drive_torque(self, omega: Array, required: Array) -> Array:
-        """Return the torque of each drive, (count,) N m, from the torques that the rotors need, `required_torque`.
-
-        An ideal drive supplies the torque that its rotor needs, and an equal share of the torque that the motors lack.
-        """
+        """Return the torque of each drive, (count,) N m, from the `required_torque`: an ideal drive supplies that of its rotor
+        and an equal share of the torque that the motors lack."""
         prescribed, driving = self.balance.is_prescribed, self.balance.driving_torque(omega)
         if prescribed.all() or not prescribed.any():
             return jnp.where(prescribed, required, driving)
@@ -288,10 +282,8 @@ def _on_one_shaft(balance: TorqueBalance, force: Array) -> TorqueBalance:
 
 
 def _mount_of_force(force: Array, direction: int, mount: Mount) -> Mount:
-    """Return a mount on which an unbalance of 1 kg m causes the generalized force w^2 f, with f = `force` (nd,).
-
-    The displacement of its point is B q with B^T e = f: B = (Re f, -Im f) for the direction e = (1, -i).
-    """
+    """Return a mount on which an unbalance of 1 kg m causes the generalized force w^2 f, with f = `force` (nd,) = B^T e: the
+    displacement of its point is B q with B = (Re f, -Im f) for the direction e = (1, -i)."""
     rows = jnp.stack([force.real, -direction * force.imag])
     return Mount(rows=(rows,), axes=(0, 1), gyroscopic=mount.gyroscopic, turn=mount.turn)
 
@@ -303,10 +295,7 @@ def _imbalances(exciter: Exciter, *, about_tilts: bool) -> list[Array]:
 
 
 def with_imbalances(model: LinearModel) -> LinearModel:
-    """Return the model with one equivalent unbalance in place of the unbalance and the imbalances of each rotor.
-
-    The force per w^2 on the coordinates is the sum of S B^T e and of the forces of the imbalances.
-    """
+    """Return the model with one unbalance of the same force in place of the unbalance and the imbalances of each rotor."""
     if not has_term(model.scene.all_effects, RotorImbalance):
         return model
     exciters, mounts = [], []
@@ -324,11 +313,10 @@ def with_imbalances(model: LinearModel) -> LinearModel:
 
 
 def resultant_of(model: LinearModel, phasors: Array) -> Array:
-    """Return the resultant of the centrifugal forces per w^2, sum_j S_j exp(i alpha_j) e_j, kg m, complex, shaped like e_j.
+    """Return the resultant of the centrifugal forces per w^2, sum_j S_j exp(i alpha_j) e_j, kg m, complex, shaped like e_j,
+    from the `phasors` (count,) exp(i alpha) of the rotating masses; an unbalance includes the static imbalance of its rotor.
 
-    `phasors` (count,): exp(i alpha) of each load, or of the unbalance of an exciter without loads, which includes the static
-    imbalance of its rotor. The result is NaN for loads that do not move on a circle, and 0 if the forces cancel up to the
-    errors of the phases.
+    The result is NaN for loads that do not move on a circle, and 0 if the forces cancel up to the errors of the phases.
     """
     total, largest, first = jnp.zeros((), phasors.dtype), 0.0, 0
     for exciter, mount in zip(model.scene.exciters, model.mounts, strict=True):
@@ -347,19 +335,15 @@ def resultant_of(model: LinearModel, phasors: Array) -> Array:
 
 @cached
 def assemble_for_search(scene: Scene, masses: tuple[int, ...] | None = None) -> TorqueBalance:
-    """Assemble the torque balance of a validated scene in the form for searches, see `TorqueBalance.decomposed`.
-
-    `masses`: numbers of the rotating masses, see `balance_of_group`; None for all.
-    """
+    """Assemble the torque balance of a validated scene, or of some of its `masses`, see `balance_of_group`, in the form for
+    searches, see `TorqueBalance.decomposed`."""
     balance = assemble_torque_balance(scene)
     return (balance if masses is None else balance_of_group(balance, masses)).decomposed()
 
 
 def balance_of_group(balance: TorqueBalance, masses: tuple[int, ...]) -> TorqueBalance:
-    """Return the balance of some rotating masses, by number. The others move with the machine, but exert no force.
-
-    The rotors of the other exciters turn at the working speeds of their drives.
-    """
+    """Return the balance of some rotating masses, by number. The others move with the machine, but exert no force; the rotors
+    of other exciters turn at the working speeds of their drives."""
     field, indices = balance.averaged, np.asarray(masses)
     owner = owners_of(field.counts)[indices]
     exciters = sorted(set(owner.tolist()))
@@ -409,10 +393,7 @@ def _motor_torque(averaged: Averaged) -> Array:
 
 
 def influence_of(balance: TorqueBalance, omega: Array, rate: Array | None = None) -> Array:
-    """Return the influence coefficients H_jk (count, count), complex, m/N: response at mass j per force of mass k.
-
-    `rate` (count,), rad/s: speeds of the masses, on which gyroscopic forces depend; default: all turn at `omega`.
-    """
+    """Return the influence coefficients H_jk (count, count), m/N, for masses that turn at `rate` (default: `omega`), rad/s."""
     if balance.model.modal is not None:
         return balance.model.modal.receptance(omega)
     return balance.direction.conj() @ response_of(balance, omega, rate)
@@ -436,10 +417,8 @@ def torques_at(unbalance: Array, influence: Array, omega: Array, phasors: Array)
 
 
 def unknowns_of(balance: TorqueBalance, omega: Array, phase: Array) -> Array:
-    """Return the unknowns of the balance: the speed relative to `TorqueBalance.speed`, and all phases relative to the first.
-
-    If unbalances have a prescribed speed, the unknowns are the phases of the other masses.
-    """
+    """Return the unknowns of the balance: the speed relative to `TorqueBalance.speed`, and all phases relative to the first;
+    with unbalances of prescribed speed the phases of the other masses."""
     if any(balance.is_prescribed):
         return phase[np.flatnonzero(~balance.is_prescribed)]
     return jnp.concatenate([jnp.reshape(omega / jax.lax.stop_gradient(balance.speed), (1,)), phase[1:] - phase[0]])
@@ -456,10 +435,8 @@ def motion_of(balance: TorqueBalance, x: Array) -> tuple[Array, Array]:
 
 
 def balance_residuals(x: Array, balance: TorqueBalance, factor: Array | None = None) -> Array:
-    """Return L_i + V_i of the masses of unknown motion, relative to `TorqueBalance.torque_scale`.
-
-    **Arguments**: `x`, see `unknowns_of`; `factor`, see `TorqueBalance.total_driving_torque`.
-    """
+    """Return L_i + V_i of the masses of unknown motion, relative to `TorqueBalance.torque_scale`, at the unknowns `x` of
+    `unknowns_of`; `factor`: see `TorqueBalance.total_driving_torque`."""
     w, angles = motion_of(balance, x)
     phasors = jax.lax.complex(jnp.cos(angles), jnp.sin(angles))
     torque = torques_at(balance.unbalance, influence_of(balance, w), w, phasors)

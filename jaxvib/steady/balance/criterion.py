@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, SpeedUnit, speed_unit
-from jaxvib.equations.linear import circular_loads, require_one_point, require_terms, rotating_direction
+from jaxvib.equations.linear import require_one_point, require_terms, rotating_direction, turning_loads
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import (
@@ -116,7 +116,7 @@ def criterion_functional(scene: Scene, omega: Array) -> Array:
     Source: Filimonikhin et al. 2022, equations (1)-(3), (15), (28).
     """
     direction = rotating_direction(scene.mounting)
-    unbalance = circular_loads(scene).unbalance()
+    unbalance = turning_loads(scene, at_one_point=True).unbalance()
     receptance = jnp.sum(direction.conj() * (port_receptance(scene, omega) @ direction)).real
     return unbalance**2 * omega**2 / 2.0 * receptance
 

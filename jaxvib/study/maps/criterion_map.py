@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit
-from jaxvib.equations.linear import circular_loads
+from jaxvib.equations.linear import turning_loads
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
@@ -109,7 +109,7 @@ def criterion_map(
             raise InputError(name, "must be an ascending list of at least one number; all numbers must be greater than 0")
     grid, mass_factor, drag_factor = values.values()
 
-    scene_loads = circular_loads(scene)
+    scene_loads = turning_loads(scene, at_one_point=True)
 
     def scene_with(m: jax.Array, d: float = 1.0) -> Scene:
         factors = scene_loads.mass * m, scene_loads.drag * d
