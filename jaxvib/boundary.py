@@ -211,7 +211,7 @@ def _require(value: Any, kind: Any, field: str) -> None:
     kinds = _alternatives(kind)
     if any(_is_number_with_unit(each) for each in kinds):
         return
-    if any(set(_alternatives(alike)) <= set(kinds) for alike in (np_typing.ArrayLike, jax_typing.ArrayLike)):
+    if any(set(_alternatives(array_type)) <= set(kinds) for array_type in (np_typing.ArrayLike, jax_typing.ArrayLike)):
         problem = _problem_of_array(value)
         if problem is not None and not (value is None and type(None) in kinds):
             raise InputError(field, f"is {quoted(value)}; it must be {problem}")

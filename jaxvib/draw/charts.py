@@ -178,11 +178,11 @@ def log_limits(
 
     At lower load speeds the loads turn with the rotor, and the curves approach zero.
     """
-    there = np.isfinite(rotor_speed)
-    shown = np.stack([values[there] for values in curves])
+    exists = np.isfinite(rotor_speed)
+    shown = np.stack([values[exists] for values in curves])
     top = float(np.max(shown, initial=1e-300, where=np.isfinite(shown)))
     lowest = float(np.min(resonances, initial=np.inf, where=resonances > 0.0))
-    included = np.isfinite(shown) & (shown > 0.0) & (omega[there] > 0.5 * lowest)
+    included = np.isfinite(shown) & (shown > 0.0) & (omega[exists] > 0.5 * lowest)
     least = float(np.min(shown, initial=top, where=included))
     return float(np.clip(0.5 * least, 1e-5 * top, 1e-2 * top)), 2.5 * top
 
@@ -265,15 +265,15 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
     """
     figure, (axis,) = panels(1, size=(9.0, 0.42 * len(rows) + 1.5), ax=ax)
     ratios = np.asarray([after / before if before else np.nan for _, before, after in rows])
-    drawn = np.isfinite(ratios) & (ratios > 0.0)
+    has_bar = np.isfinite(ratios) & (ratios > 0.0)
     places = np.arange(len(rows))[::-1]
     # Bars of ratios beyond these limits are cut off; otherwise all other bars would be as thin as lines.
-    low, high = max(min([0.7, *ratios[drawn]]), 1e-4), min(max([1.4, *ratios[drawn]]), 1e4)
-    for place, ratio, there, (_, before, after) in zip(places, ratios, drawn, rows, strict=True):
+    low, high = max(min([0.7, *ratios[has_bar]]), 1e-4), min(max([1.4, *ratios[has_bar]]), 1e4)
+    for place, ratio, is_drawn, (_, before, after) in zip(places, ratios, has_bar, rows, strict=True):
         look: Look = {"color": COLORS[0]} if ratio <= 1.0 else {"color": COLORS[3], "hatch": "///", "edgecolor": "white"}
-        if there:
+        if is_drawn:
             axis.barh(place, ratio - 1.0, left=1.0, height=0.6, lw=0.0, **look)
-        share = f"   ({ratio:.3g} x)" if there else ""
+        share = f"   ({ratio:.3g} x)" if is_drawn else ""
         text = f"{before:.4g} → {after:.4g}{share}"
         axis.text(1.02, place, text, va="center", fontsize=9, transform=axis.get_yaxis_transform())
     axis.axvline(1.0, color="black", lw=0.9)
@@ -316,8 +316,8 @@ def front_chart(x: np.ndarray, y: np.ndarray, *, x_label: str, y_label: str, ax:
     figure, (axis,) = panels(1, size=(6.5, 4.4), ax=ax)
     order = np.lexsort((y, x))
     axis.plot(x[order], y[order], "o-", color=COLORS[0], mfc="white", ms=5.0, label="front; numbers: its machines")
-    for k, place in enumerate(zip(x, y, strict=True)):
-        axis.annotate(f"{k}", place, xytext=(5, 4), textcoords="offset points", fontsize="small")
+    for k, point in enumerate(zip(x, y, strict=True)):
+        axis.annotate(f"{k}", point, xytext=(5, 4), textcoords="offset points", fontsize="small")
     axis.margins(0.08)
     axis.set(xlabel=x_label, ylabel=y_label)
     legend_above(axis)

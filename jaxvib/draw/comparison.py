@@ -77,7 +77,7 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], error_levels: Sequence[
     handles = [
         *(Line2D([], [], ms=5, color=color, marker=marker) for color, marker in looks.values()),
         Line2D([], [], ls=":", lw=1.0, marker="o", ms=11, mfc="none", color="black"),
-        Patch(color=_FLOOR),
+        Patch(color=_FLOOR_COLOR),
     ]
     extra_labels = ["fastest within " + ", ".join(f"{error:.0e}" for error in error_levels), "error of the reference"]
     if ax is None:
@@ -88,7 +88,7 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], error_levels: Sequence[
     return figure if ax is None else ax
 
 
-_FLOOR = "#e6e6e6"
+_FLOOR_COLOR = "#e6e6e6"
 
 
 def _cost_panel(axes: Axes, panel: CostPanel, error_levels: Sequence[float], looks: Mapping[str, tuple[str, str]]) -> None:
@@ -97,7 +97,7 @@ def _cost_panel(axes: Axes, panel: CostPanel, error_levels: Sequence[float], loo
         color, marker = looks[name]
         axes.loglog(seconds, np.maximum(error, 1e-16), ms=5, color=color, marker=marker)
     floor = min(max(panel.floor, 1e-17), 1.0)
-    axes.axhspan(1e-17, floor, color=_FLOOR, zorder=0.4)
+    axes.axhspan(1e-17, floor, color=_FLOOR_COLOR, zorder=0.4)
     if panel.best.size:
         axes.plot(*panel.best.T, "o", ms=11, mfc="none", color="black")
     errors = np.concatenate([points[:, 1] for points in panel.lines.values()])
@@ -201,7 +201,7 @@ def audit_chart(
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
     low = max(min([100.0 * accuracy, *shown]) / 3.0, 1e-8)
     unresolved = np.maximum(100.0 * np.nan_to_num(uncertainty), low)
-    left.hlines(place, low, unresolved, color=_FLOOR, lw=14, label="not resolved")
+    left.hlines(place, low, unresolved, color=_FLOOR_COLOR, lw=14, label="not resolved")
     for color, mark, (name, values) in zip(COLORS, "os^D", changes.items(), strict=False):
         if not np.any(np.isfinite(values)):
             continue

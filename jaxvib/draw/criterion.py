@@ -18,7 +18,7 @@ _KINDS = (
     ("loads gather (both agree)", "#ececec"),
     ("loads balance (both agree)", "#9bd3c7"),
     ("criterion predicts balance, wrongly", "#d55e00"),
-    ("balance missed", "#004488"),
+    ("balance not predicted", "#004488"),
 )
 
 

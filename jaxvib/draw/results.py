@@ -76,10 +76,10 @@ def modes_chart(
     if shown.size:
         bottom.set(yscale="log", ylim=(0.6 * np.min(shown), 1.7 * np.max(shown)))
         log_ticks(bottom)
-    there = mode[np.isfinite(omega)]
-    bottom.set_xticks(there)
-    if there.size:
-        bottom.set_xlim(np.min(there) - 0.5, np.max(there) + 0.5)
+    existing = mode[np.isfinite(omega)]
+    bottom.set_xticks(existing)
+    if existing.size:
+        bottom.set_xlim(np.min(existing) - 0.5, np.max(existing) + 0.5)
     return figure if ax is None else ax
 
 
@@ -126,8 +126,7 @@ def phase_circles(
 
     A black arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel.
     `resultant`: False for masses that turn in different directions, whose mean has no meaning. `weights` and `imbalance`: see
-    `draw_circle`.
-    `ax` must contain one axes object for each circle.
+    `draw_circle`. `ax` must contain one axes object for each circle.
 
     >>> import numpy as np
     >>> len(phase_circles([("a", np.zeros(2)), ("b", np.ones(2))]).axes)
@@ -418,10 +417,10 @@ def drag_limits_chart(
     """
     figure, axes = panels(1, size=(6.4, 3.0), ax=ax)
     unit, scale = speed_unit(unit)
-    axis, there = axes[0], np.isfinite(drag)
+    axis, exists = axes[0], np.isfinite(drag)
     for k, w in enumerate(resonances):
         axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "resonance")
-    axis.plot(scale * omega[there], drag[there], "o", color=COLORS[0], label="no jam above")
-    axis.set(xlabel=f"load speed, {unit}", ylabel="greatest drag, N s/m", yscale="log" if there.any() else "linear")
+    axis.plot(scale * omega[exists], drag[exists], "o", color=COLORS[0], label="no jam above")
+    axis.set(xlabel=f"load speed, {unit}", ylabel="greatest drag, N s/m", yscale="log" if exists.any() else "linear")
     legend_above(axis)
     return figure if ax is None else ax

@@ -9,7 +9,18 @@ from jaxvib.draw.machine.parts import Text
 from jaxvib.draw.machine.svg import svg
 from jaxvib.draw.style import COLORS, GUIDE
 from jaxvib.draw.whirl import critical_groups, whirl_lines
-from jaxvib.explore.panel import APART, FIRST, LAST, ROTOR, TALL, WIDE, WORKING, Panel, dot, legend
+from jaxvib.explore.panel import (
+    LEFT_MARGIN,
+    PANEL_GAP,
+    PANEL_HEIGHT,
+    PANEL_WIDTH,
+    RIGHT_MARGIN,
+    ROTOR,
+    WORKING,
+    Panel,
+    dot,
+    legend,
+)
 from jaxvib.steady.whirl import Whirl
 
 _SENSE_STYLES = {
@@ -56,7 +67,7 @@ def campbell(result: Whirl, at: float) -> str:
     groups = critical_groups(critical, critical_sense, right)
     shown = [k for group, _ in groups for k in group]
     top = 1.12 * max(scale * float(np.nanmax(speed)), *critical[shown].tolist(), 1e-300)
-    panel = Panel(FIRST, "whirl frequency, rpm", (0.0, right), (0.0, top), wide=3.0 * WIDE + 2.0 * APART)
+    panel = Panel(LEFT_MARGIN, "whirl frequency, rpm", (0.0, right), (0.0, top), width=3.0 * PANEL_WIDTH + 2.0 * PANEL_GAP)
     parts, texts = panel.frame(), panel.texts()
     for word, look in _SENSE_STYLES.items():
         parts += [panel.line(scale * rotor_speed, scale * values, look) for values in whirl_lines(speed, sense == word)]
@@ -74,4 +85,5 @@ def campbell(result: Whirl, at: float) -> str:
         ends[row:] = [x + _LETTER_WIDTH * len(word), *ends[row + 1 :]]
         texts.append(Text(x + 0.08, 0.2 + 0.27 * row, word, {"fontsize": "small", "bbox": {"fc": "white"}}))
     keys, names = legend([_LEGEND])
-    return svg((0.0, FIRST + panel.wide + LAST, -0.6, TALL + 1.1), [[*parts, *keys]], [[*texts, *names]], "", 1.0, 0.0)
+    limits = (0.0, LEFT_MARGIN + panel.width + RIGHT_MARGIN, -0.6, PANEL_HEIGHT + 1.1)
+    return svg(limits, [[*parts, *keys]], [[*texts, *names]], "", 1.0, 0.0)

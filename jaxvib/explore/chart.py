@@ -11,7 +11,18 @@ from jaxvib.draw.charts import crossings, log_limits, scaled_amplitudes, segment
 from jaxvib.draw.machine.parts import Part, Text
 from jaxvib.draw.machine.svg import svg
 from jaxvib.draw.style import COLORS, GUIDE, join_names
-from jaxvib.explore.panel import APART, FIRST, LAST, ROTOR, TALL, WIDE, WORKING, Panel, dot, legend
+from jaxvib.explore.panel import (
+    LEFT_MARGIN,
+    PANEL_GAP,
+    PANEL_HEIGHT,
+    PANEL_WIDTH,
+    RIGHT_MARGIN,
+    ROTOR,
+    WORKING,
+    Panel,
+    dot,
+    legend,
+)
 from jaxvib.steady.branches import Branches
 from jaxvib.steady.jams.branch_plot import MARKS
 
@@ -28,8 +39,9 @@ _LEGEND = {
 }
 """Styles of the lines in the legend, by their names."""
 
-_STRIDE = 16
-"""Stride of the points at which the stability of free loads is computed; all would take five times as long as the chart."""
+_STABILITY_STRIDE = 16
+"""Stride of the points at which the stability of free loads is computed. Its computation at all points would take five times as
+long as the chart."""
 
 
 def chart(result: Branches, max_speed: float) -> str:
@@ -49,7 +61,7 @@ def chart(result: Branches, max_speed: float) -> str:
     True
     """
     scale, at = speed_unit("rpm")[1], float(result.scene.drive.speed)
-    result, criterion = result.with_free_loads(_STRIDE)
+    result, criterion = result.with_free_loads(_STABILITY_STRIDE)
     rotor_speed = np.asarray(result.rotor_speed)
     rotor_speed = np.where(rotor_speed <= max_speed, rotor_speed, np.nan)
     panels = _panels(result, scale, rotor_speed)
@@ -79,9 +91,9 @@ def chart(result: Branches, max_speed: float) -> str:
     parts += [dot(*speeds.at(n, w), _FOLD) for n, w in folds]
     platforms = {name: {**_STABLE, "color": color} for name, color in zip(panels[1][1], COLORS, strict=False)}
     keys, names = legend([{**_LEGEND, MARKS["fold"]: _FOLD} if folds else _LEGEND, platforms])
-    width = FIRST + 3.0 * WIDE + 2.0 * APART + LAST
+    width = LEFT_MARGIN + 3.0 * PANEL_WIDTH + 2.0 * PANEL_GAP + RIGHT_MARGIN
     texts.append(Text(0.5 * width, -0.8, f"stable {criterion}", {"fontsize": "small", "ha": "center"}))
-    return svg((0.0, width, -0.95, TALL + 1.1), [[*parts, *keys]], [[*texts, *names]], "", 1.0, 0.0)
+    return svg((0.0, width, -0.95, PANEL_HEIGHT + 1.1), [[*parts, *keys]], [[*texts, *names]], "", 1.0, 0.0)
 
 
 def _panels(result: Branches, scale: float, rotor_speed: np.ndarray) -> list[tuple[Panel, dict[str, np.ndarray]]]:
@@ -93,13 +105,15 @@ def _panels(result: Branches, scale: float, rotor_speed: np.ndarray) -> list[tup
     if len(curves) > len(COLORS):
         curves = {f"largest of {len(curves)}": np.max([*curves.values()], axis=0)}
     high = scale * float(np.nanmax(rotor_speed))
-    panels = [(Panel(FIRST, "load speed, rpm", (0.0, high), (0.0, 1.06 * high)), {"loads": scale * omega})]
+    panels = [(Panel(LEFT_MARGIN, "load speed, rpm", (0.0, high), (0.0, 1.06 * high)), {"loads": scale * omega})]
     for title, drawn in (
         (f"amplitude, {', '.join(dict.fromkeys(units))}, zero to peak", curves),
         ("foundation force, N, zero to peak", {"force": np.asarray(result.foundation_force)}),
     ):
         limits = log_limits([*drawn.values()], rotor_speed, omega, resonances)
-        panels.append((Panel(FIRST + len(panels) * (WIDE + APART), title, (0.0, high), limits, log=True), drawn))
+        panels.append(
+            (Panel(LEFT_MARGIN + len(panels) * (PANEL_WIDTH + PANEL_GAP), title, (0.0, high), limits, log=True), drawn)
+        )
     return panels
 
 
@@ -114,10 +128,10 @@ def _jams_at_working_speed(
     dots, numbers = [], []
     for i, share, name, filled in crossed:
         heights = [panel.at(at, float(np.interp(share, [0, 1], values[i : i + 2])))[1] for values in curves]
-        shown = [y for y in heights if 0.0 <= y <= TALL]
+        shown = [y for y in heights if 0.0 <= y <= PANEL_HEIGHT]
         look = {"fc": "black" if filled else "white", "ec": "black", "lw": 1.0, "zorder": 4.0}
         dots += [dot(panel.at(at, panel.y[0])[0], y, look) for y in shown]
-        numbers += [(max(shown) / TALL, name)] if shown else []
+        numbers += [(max(shown) / PANEL_HEIGHT, name)] if shown else []
     look = {"fontsize": "small", "fontweight": "bold", "bbox": {"fc": "white"}}
     x = panel.at(at, panel.y[0])[0] + 0.1
-    return dots, [Text(x, TALL * share, name, look) for share, name in join_names(sorted(numbers))]
+    return dots, [Text(x, PANEL_HEIGHT * share, name, look) for share, name in join_names(sorted(numbers))]

@@ -23,8 +23,8 @@ def keep_latest(function: Callable[[Scene], _Result]) -> Callable[[Scene], _Resu
 
     @functools.wraps(function)
     def of_scene(scene: Scene) -> _Result:
-        for known, result in latest:
-            if known is scene:
+        for stored_scene, result in latest:
+            if stored_scene is scene:
                 return result
         result = function(scene)
         latest[:] = [(scene, result)]

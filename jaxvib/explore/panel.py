@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jaxvib.draw.machine.parts import Part, Text, box, circle
 from jaxvib.draw.style import GUIDE, Look, log_places
 
-WIDE, TALL, FIRST, APART, LAST = 4.2, 3.6, 0.75, 1.1, 0.25
+PANEL_WIDTH, PANEL_HEIGHT, LEFT_MARGIN, PANEL_GAP, RIGHT_MARGIN = 4.2, 3.6, 0.75, 1.1, 0.25
 """Width and height of a panel; space to the left of the first panel, between two panels and to the right of the last one; in
 units of the drawing."""
 
@@ -39,7 +39,7 @@ class Panel:
     """Chart over a speed.
 
     **Attributes**: `left`: position of its left end, in units of the drawing; `title` above it; `x` and `y`: limits of its
-    axes; `log`: True for a logarithmic vertical axis; `wide`: its width, in units of the drawing; `below`: title of the
+    axes; `log`: True for a logarithmic vertical axis; `width`: its width, in units of the drawing; `below`: title of the
     horizontal axis.
     """
 
@@ -48,7 +48,7 @@ class Panel:
     x: tuple[float, float]
     y: tuple[float, float]
     log: bool = False
-    wide: float = WIDE
+    width: float = PANEL_WIDTH
     below: str = "rotor speed, rpm"
 
     def place(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -56,7 +56,7 @@ class Panel:
         x, y, (left, right), (low, high) = np.asarray(x, float), np.asarray(y, float), self.x, self.y
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.log(y / low) / math.log(high / low) if self.log else (y - low) / (high - low)
-        return self.left + self.wide * (x - left) / (right - left), TALL * share
+        return self.left + self.width * (x - left) / (right - left), PANEL_HEIGHT * share
 
     def at(self, x: float, y: float) -> tuple[float, float]:
         """Return the position of one point in the drawing."""
@@ -66,7 +66,7 @@ class Panel:
     def line(self, x: ArrayLike, y: ArrayLike, look: Look) -> Part:
         """Return a line through points, without the points below or above the chart."""
         points = np.stack(self.place(x, y), axis=1)
-        inside = (points[:, 1] >= 0.0) & (points[:, 1] <= TALL)
+        inside = (points[:, 1] >= 0.0) & (points[:, 1] <= PANEL_HEIGHT)
         return Part(_thin_out(np.where(inside[:, None], points, np.nan)), look)
 
     def frame(self) -> list[Part]:
@@ -82,8 +82,8 @@ class Panel:
         small = {"fontsize": "small"}
         across = [Text(self.at(x, self.y[0])[0], -0.18, text, {**small, "ha": "center"}) for x, text in self._x_ticks]
         up = [Text(self.left - 0.08, self.at(self.x[0], y)[1], text, {**small, "ha": "right"}) for y, text in self._y_ticks]
-        below = Text(self.left + 0.5 * self.wide, -0.46, self.below, {**small, "ha": "center"})
-        return [*across, *up, below, Text(self.left - FIRST + 0.05, TALL + 0.22, self.title, small)]
+        below = Text(self.left + 0.5 * self.width, -0.46, self.below, {**small, "ha": "center"})
+        return [*across, *up, below, Text(self.left - LEFT_MARGIN + 0.05, PANEL_HEIGHT + 0.22, self.title, small)]
 
     @functools.cached_property
     def _x_ticks(self) -> list[tuple[float, str]]:
@@ -126,7 +126,7 @@ def legend(groups: Sequence[Mapping[str, Look]]) -> tuple[list[Part], list[Text]
     parts, texts = [], []
     for columns, looks in zip(_COLUMNS, groups, strict=False):
         for k, (name, look) in enumerate(looks.items()):
-            x, y = columns[k // 2], TALL + (0.95, 0.68)[k % 2]
+            x, y = columns[k // 2], PANEL_HEIGHT + (0.95, 0.68)[k % 2]
             parts.append(dot(x + 0.2, y, look) if "fc" in look else Part(np.array([[x, y], [x + 0.4, y]]), look))
             texts.append(Text(x + 0.5, y, name, {"fontsize": "small"}))
     return parts, texts

@@ -20,21 +20,21 @@ from jaxvib.equations.linear import natural_frequencies
 from jaxvib.equations.torque_balance import mass_owners
 from jaxvib.errors import InputError
 from jaxvib.explore.latest import keep_latest
-from jaxvib.explore.panel import APART, FIRST, LAST, ROTOR, TALL, WIDE, WORKING, Panel, legend
+from jaxvib.explore.panel import LEFT_MARGIN, PANEL_GAP, PANEL_HEIGHT, PANEL_WIDTH, RIGHT_MARGIN, ROTOR, WORKING, Panel, legend
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.regimes.collected import collected_regimes, follow_regimes
 from jaxvib.steady.regimes.synchronous import SynchronousRegime, SynchronousRegimes, synchronous_regimes
 from jaxvib.steady.regimes.working import working_regime
 
-_SPEEDS = {1: 61, 2: 61, 3: 25}
+_SPEED_COUNTS = {1: 61, 2: 61, 3: 25}
 """Number of speeds of the chart for each number of exciters; the time for one speed grows steeply with the number."""
 
-_MAX_LISTED, _MAX_WITH_LOADS = 2, 4
+_MAX_WITHOUT_LOADS, _MAX_WITH_LOADS = 2, 4
 """Largest numbers of exciters for which all regimes are searched for: without loads, and if at least one exciter has loads. For
 more exciters the search takes too long."""
 
-_MAX_LINES = 12
+_MAX_SHOWN_REGIMES = 12
 """Largest number of regimes in the list."""
 
 _MAX_FOLLOWED = 4
@@ -85,9 +85,9 @@ def regime_chart(scene: Scene, max_speed: float) -> str:
     True
     """
     count = len(scene.exciters)
-    if not scene.has_loads and count not in _SPEEDS:
-        problem = f"are {count}; the chart over the motor speed is drawn for at most {max(_SPEEDS)}, because it takes too long"
-        raise InputError("exciters", f"{problem} for more; use jaxvib sweep")
+    if not scene.has_loads and count not in _SPEED_COUNTS:
+        problem = f"are {count}; the chart over the motor speed is drawn for at most {max(_SPEED_COUNTS)}"
+        raise InputError("exciters", f"{problem}, because it takes too long for more; use jaxvib sweep")
     for k, exciter in enumerate(scene.exciters):
         if "speed" not in exciter.drive.__dataclass_fields__:
             problem = (
@@ -117,15 +117,15 @@ def regime_chart(scene: Scene, max_speed: float) -> str:
     ]
     unstable = {} if np.all(curves.stable) else {"unstable": {**_UNSTABLE, "color": "black"}}
     keys, words = legend([{**_LEGEND, **unstable}, *names])
-    width = FIRST + 3.0 * WIDE + 2.0 * APART + LAST
-    return svg((0.0, width, -0.95, TALL + 1.1), [[*parts, *keys]], [[*texts, *words]], "", 1.0, 0.0)
+    width = LEFT_MARGIN + 3.0 * PANEL_WIDTH + 2.0 * PANEL_GAP + RIGHT_MARGIN
+    return svg((0.0, width, -0.95, PANEL_HEIGHT + 1.1), [[*parts, *keys]], [[*texts, *words]], "", 1.0, 0.0)
 
 
 def _curves(scene: Scene, max_speed: float) -> _Curves:
     """Return the curves of the chart: the working regime of unbalances, or the first regimes of loads, which are followed."""
     at = float(scene.top_speed)
     if not scene.has_loads:
-        count = _SPEEDS[len(scene.exciters)]
+        count = _SPEED_COUNTS[len(scene.exciters)]
         motor_speed = max_speed * np.arange(1, count + 1) / count
         return jax.device_get(_working_regimes(scene, jnp.asarray(motor_speed / at)))
     regimes = regimes_of(scene)[:_MAX_FOLLOWED]
@@ -171,7 +171,7 @@ def _panels(scene: Scene, curves: _Curves, resonances: np.ndarray, high: float) 
 
 def _panel(k: int, title: str, high: float, limits: tuple[float, float], log: bool = False) -> Panel:
     below = "speed of the motors without load, rpm"
-    return Panel(FIRST + k * (WIDE + APART), title, (0.0, high), limits, log=log, below=below)
+    return Panel(LEFT_MARGIN + k * (PANEL_WIDTH + PANEL_GAP), title, (0.0, high), limits, log=log, below=below)
 
 
 def _with_gaps(phase: np.ndarray) -> np.ndarray:
@@ -205,7 +205,7 @@ def _search(scene: Scene) -> SynchronousRegimes:
 
 def _has_list(scene: Scene) -> bool:
     """Return True if the page shows all regimes, False if it shows the working regime alone."""
-    return scene.has_loads or len(scene.exciters) <= _MAX_LISTED
+    return scene.has_loads or len(scene.exciters) <= _MAX_WITHOUT_LOADS
 
 
 @keep_latest
@@ -221,7 +221,7 @@ def regimes_of(scene: Scene) -> list[SynchronousRegime]:
         regime = jax.device_get(working_regime(scene, throw=False))
         return [regime] if np.isfinite(regime.speed) else []
     found = _search(scene)
-    return [found.select(k) for k in range(min(found.speed.shape[0], _MAX_LINES))]
+    return [found.select(k) for k in range(min(found.speed.shape[0], _MAX_SHOWN_REGIMES))]
 
 
 def deck_points(scene: Scene) -> list[tuple[float, float]]:

@@ -18,7 +18,7 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.results.readable import Readable
-from jaxvib.runtime.devices import known, numpy_of, on_device
+from jaxvib.runtime.devices import array_module, numpy_if_known, on_device
 from jaxvib.units import Number, Numbers, number, numbers
 from jaxvib.units import count as whole
 
@@ -153,13 +153,13 @@ class Dimensionless(Readable):
         return self.mass_scale * self.frequency_scale**2 * self.length_unit
 
     def _by_platform(self, others: Array | np.ndarray, exciter: float) -> Array:
-        others = known(others)  # within `jit` even a slice of a JAX array is traced
+        others = numpy_if_known(others)  # within `jit` even a slice of a JAX array is traced
         index = min(1, others.shape[0])
-        return numpy_of(others).concatenate([others[:index], np.full(1, exciter, dtype=others.dtype), others[index:]])
+        return array_module(others).concatenate([others[:index], np.full(1, exciter, dtype=others.dtype), others[index:]])
 
     def scene(self) -> Scene:
         """Return the `Scene` in SI units, with the chosen size."""
-        return on_device(jax.tree.map(known, self)._scene())
+        return on_device(jax.tree.map(numpy_if_known, self)._scene())
 
     def _scene(self) -> Scene:
         n = self.natural.shape[0]

@@ -37,7 +37,7 @@ from jaxvib.motion.integration.stiffness import (
 )
 from jaxvib.motion.start import Start, initial_state, require_start, start_state, with_spin, with_spin_up_drive
 from jaxvib.ode.dopri8_loop import LoopDopri8
-from jaxvib.runtime.devices import known as numpy_of_known
+from jaxvib.runtime.devices import numpy_if_known
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
 from jaxvib.steady.outcome import unknown_is_positive
@@ -207,7 +207,7 @@ def plan_run(
     state = start_state(scene, start, mode, separation, throw=throw)
 
     known = is_known(scene, end, state)
-    fastest, slowest = map(numpy_of_known, frequency_bounds(scene))
+    fastest, slowest = map(numpy_if_known, frequency_bounds(scene))
     stiff = stiff_solver(scene, state, fastest) if solver is None and known else None
     control = _step_control(end, steps, estimate)
     require_error_estimate(solver, control)

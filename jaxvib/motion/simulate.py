@@ -26,7 +26,7 @@ from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, StepChoice, plan_run
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.start import Start, must_compile_jams
 from jaxvib.results.status import status_name
-from jaxvib.runtime.devices import known, on_device
+from jaxvib.runtime.devices import numpy_if_known, on_device
 from jaxvib.runtime.parallel import in_background, in_threads
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.outcome import outcome
@@ -223,7 +223,7 @@ def _run_in_segments(plan: RunPlan, control: Control, *, is_measured: bool) -> R
         last,
         **{name: _sum([getattr(run, name) for run in runs]) for name in ("steps", "rejected", "evaluations")},
         window=dataclasses.replace(last.window, time=last.window.time + length * (number - 1)),
-        coincident=on_device(np.all([known(run.coincident) for run in runs])),
+        coincident=on_device(np.all([numpy_if_known(run.coincident) for run in runs])),
     )
 
 
@@ -275,7 +275,7 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
     previous = run = _run(plan, coarser)
     for _ in range(_MAX_ACCURACY_RUNS - 1):
         latest = _run(plan, control)
-        run = _compare_runs(plan, latest, previous, control, coarser, known(run.evaluations))
+        run = _compare_runs(plan, latest, previous, control, coarser, numpy_if_known(run.evaluations))
         if status_name(run.status) != "done" or float(run.error) <= accuracy:
             return run
         tolerance = float(cast(Array, control.tolerance))

@@ -23,7 +23,7 @@ from jaxvib.machine.effects.terms import DrillingSpinRelease, LoadInteraction, S
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
-from jaxvib.runtime.devices import known, on_device
+from jaxvib.runtime.devices import numpy_if_known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes, jams_of, require_mode_of
 from jaxvib.units import Number, Numbers, known_number, numbers
@@ -93,7 +93,7 @@ def initial_state(
         raise InputError("angles", "are for a scene with one exciter; give a State with those of each exciter")
 
     def phases(exciter: Exciter, loads: Loads, rest: float | Array) -> Array:
-        middle = known(rest if angles is None else numbers(angles, "rad", "angles", loads.count))
+        middle = numpy_if_known(rest if angles is None else numbers(angles, "rad", "angles", loads.count))
         one_each = angles is not None and not isinstance(angles, str) and np.ndim(angles) > 0  # pyright: ignore[reportArgumentType]
         return middle + _places(exciter, loads, start, separation, one_each=one_each)
 
@@ -155,7 +155,7 @@ def _places(exciter: Exciter, loads: Loads, start: Start, separation: Number | N
     else:
         gap = min(START_SEPARATION, math.pi / n) if is_default and not (has_size or one_each) else 0.0
     offsets = gap * (np.arange(n) - 0.5 * (n - 1)).astype(exciter.drive.speed.dtype)
-    return offsets + known(loads.offsets()) if side_by_side else offsets
+    return offsets + numpy_if_known(loads.offsets()) if side_by_side else offsets
 
 
 @cached

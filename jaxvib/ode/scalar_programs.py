@@ -15,10 +15,10 @@ from jaxvib.ode.scalar_rules import primitive_of
 from jaxvib.runtime.compat import (
     Atoms,
     ClosedJaxpr,
-    Instead,
     JaxprEqn,
     Literal,
     Primitive,
+    Replacement,
     Var,
     jaxpr_as_fun,
     operation_like,
@@ -130,7 +130,7 @@ def _variables(atoms: Iterable[Var | Literal]) -> list[Var]:
     return list(dict.fromkeys(atom for atom in atoms if isinstance(atom, Var)))
 
 
-def substituted(program: ClosedJaxpr, chosen: Callable[[JaxprEqn, Atoms], Instead | None]) -> ClosedJaxpr:
+def substituted(program: ClosedJaxpr, chosen: Callable[[JaxprEqn, Atoms], Replacement | None]) -> ClosedJaxpr:
     """Return the program in which some operations are replaced by other operations.
 
     **Arguments**: `chosen`: function of an operation and its inputs. It returns the operations that replace this operation, and
@@ -163,7 +163,7 @@ def with_reciprocals(program: ClosedJaxpr, changing: int) -> ClosedJaxpr:
             moving.update(equation.outvars)
     reciprocals: dict[Var, Var] = {}
 
-    def product(equation: JaxprEqn, inputs: Atoms) -> Instead | None:
+    def product(equation: JaxprEqn, inputs: Atoms) -> Replacement | None:
         divisor = inputs[-1]
         if equation.primitive != _division() or not isinstance(divisor, Var) or divisor in moving or not is_floating(divisor):
             return None

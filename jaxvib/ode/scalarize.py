@@ -36,11 +36,11 @@ from jaxvib.runtime.compat import (
     HAS_JAXPRS,
     Atoms,
     ClosedJaxpr,
-    Instead,
     Jaxpr,
     JaxprEqn,
     Literal,
     Primitive,
+    Replacement,
     Var,
     operation_like,
 )
@@ -141,7 +141,7 @@ def arrays_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Ar
         return None
     known: dict[Var, list[Var]] = {}
 
-    def polynomial(equation: JaxprEqn, inputs: Atoms) -> Instead | None:
+    def polynomial(equation: JaxprEqn, inputs: Atoms) -> Replacement | None:
         place = _trigonometric_primitives().get(equation.primitive)
         if place is None or not isinstance(angle := inputs[0], Var) or not is_floating(angle):
             return None

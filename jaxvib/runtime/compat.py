@@ -66,7 +66,7 @@ def rewritten(
 Atoms: TypeAlias = "list[Var | Literal]"
 """The inputs of an operation."""
 
-Instead: TypeAlias = "tuple[list[tuple[JaxprEqn, Atoms]], Var]"
+Replacement: TypeAlias = "tuple[list[tuple[JaxprEqn, Atoms]], Var]"
 """Operations with their inputs that replace another operation, and the variable that replaces its result."""
 
 
@@ -136,7 +136,7 @@ def accepted_flags(flags: list[str]) -> list[str]:
     For a version of jaxlib outside `_TESTED_JAXLIB` each flag is tried in a separate process, which takes seconds; the result
     is stored in a file.
     """
-    version, number = importlib.metadata.version("jaxlib"), _jaxlib()
+    version, number = importlib.metadata.version("jaxlib"), _jaxlib_version()
     if _TESTED_JAXLIB[0] <= number <= _TESTED_JAXLIB[1]:
         return [flag for flag in flags if number < _REMOVED_FLAGS.get(flag.partition("=")[0], (number[0], number[1] + 1))]
     path = user_folder() / f"flags-{version}.json"
@@ -158,7 +158,7 @@ def loops_need_a_flag() -> bool:
     Measured ratio of the CPU time of a run without the flag to that with it: 7 to 10 with jaxlib 0.10.2. The ratio of the
     times with jaxlib 0.12.0 is 0.9 to 1.1.
     """
-    return _jaxlib() < (0, 12)
+    return _jaxlib_version() < (0, 12)
 
 
 def wide_vectors_are_right(flags: list[str]) -> bool:
@@ -168,10 +168,10 @@ def wide_vectors_are_right(flags: list[str]) -> bool:
     arctangent of an array of 64 or more numbers is then 0. In jaxlib 0.11 the fusion emitters cannot be switched off; vectors
     of 512 bits are not used there.
     """
-    return "--xla_cpu_use_fusion_emitters=false" in flags or _jaxlib() >= (0, 12)
+    return "--xla_cpu_use_fusion_emitters=false" in flags or _jaxlib_version() >= (0, 12)
 
 
-def _jaxlib() -> tuple[int, ...]:
+def _jaxlib_version() -> tuple[int, ...]:
     return tuple(int(part) for part in importlib.metadata.version("jaxlib").split(".")[:2])
 
 
@@ -182,7 +182,7 @@ def jax_starts_with(flags: list[str]) -> bool:
     return subprocess.run(command, env=environment, capture_output=True, check=False).returncode == 0
 
 
-_patching = threading.Lock()
+_patch_lock = threading.Lock()
 _patches: dict[tuple[str, str], tuple[list[int], Any]] = {}
 """Replaced attributes by module and name: the threads for which they are replaced, and the original attribute."""
 
@@ -191,29 +191,29 @@ _patches: dict[tuple[str, str], tuple[list[int], Any]] = {}
 def _patched(module: ModuleType, name: str, instead: Callable[..., object]) -> Iterator[None]:
     """Replace a function of a module in the current thread only; several threads may use this context at the same time."""
     key, thread = (module.__name__, name), threading.get_ident()
-    with _patching:
+    with _patch_lock:
         if key not in _patches:
-            inside: list[int] = []
+            threads: list[int] = []
             original = getattr(module, name)
-            _patches[key] = inside, original
-            setattr(module, name, lambda *a, **k: (instead if threading.get_ident() in inside else original)(*a, **k))
+            _patches[key] = threads, original
+            setattr(module, name, lambda *a, **k: (instead if threading.get_ident() in threads else original)(*a, **k))
         _patches[key][0].append(thread)
     try:
         yield
     finally:
-        with _patching:
-            inside, original = _patches[key]
-            inside.remove(thread)
-            if not inside:
+        with _patch_lock:
+            threads, original = _patches[key]
+            threads.remove(thread)
+            if not threads:
                 del _patches[key]
                 setattr(module, name, original)
 
 
 def _unpatched(module: ModuleType | None, name: str) -> Any:
     """Return the original function of a module, even while `_patched` replaces it; None if the module has no such function."""
-    with _patching:
-        known = _patches.get((getattr(module, "__name__", ""), name))
-    return getattr(module, name, None) if known is None else known[1]
+    with _patch_lock:
+        patch = _patches.get((getattr(module, "__name__", ""), name))
+    return getattr(module, name, None) if patch is None else patch[1]
 
 
 @contextlib.contextmanager
@@ -277,8 +277,8 @@ def fast_diffrax_loop_end() -> Iterator[None]:
     """
     integrate = sys.modules.get("diffrax._integrate")
     loop, internals = _unpatched(integrate, "loop"), getattr(integrate, "eqxi", None)
-    readable = inspect.isfunction(loop) and internals is not None and len(_ULPS_ONE_BY_ONE.findall(_source(loop))) == 1
-    if integrate is None or not readable:
+    is_replaceable = inspect.isfunction(loop) and internals is not None and len(_ULPS_ONE_BY_ONE.findall(_source(loop))) == 1
+    if integrate is None or not is_replaceable:
         yield
         return
 

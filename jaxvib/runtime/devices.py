@@ -47,7 +47,7 @@ def is_cpu() -> bool:
     return (chosen if isinstance(chosen, str) else (chosen or jax.local_devices()[0]).platform) == "cpu"
 
 
-def known(value: ArrayLike) -> Any:
+def numpy_if_known(value: ArrayLike) -> Any:
     """Convert a value to NumPy, because arithmetic on JAX arrays would compile a program; return a tracer unchanged."""
     return value if traced(value) else np.asarray(value)
 
@@ -57,7 +57,7 @@ def float_dtype() -> np.dtype:
     return np.dtype(np.float64 if jax_option("jax_enable_x64") else np.float32)
 
 
-def numpy_of(tree: PyTree) -> ModuleType:
+def array_module(tree: PyTree) -> ModuleType:
     """Return the module `numpy`, or `jax.numpy` if a leaf of the tree is traced."""
     return jnp if any(map(traced, jax.tree.leaves(tree))) else np
 

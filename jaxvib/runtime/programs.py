@@ -248,7 +248,7 @@ def _pullback(call: _CallSignature, active: tuple[bool, ...], arrays: Sequence[A
     function, active_arrays = _differentiable(call, active, arrays)
     inexact, pullback, outputs = jax.vjp(function, *active_arrays, has_aux=True)
     form = Skeleton.of(*jax.tree.flatten(pullback)), tuple(map(zero_of, inexact))
-    with _keeping:
+    with _pullbacks_lock:
         _pullbacks[code_state(), call, active, _types(arrays)] = form
         while len(_pullbacks) > MAX_PULLBACK_FORMS:
             _pullbacks.popitem(last=False)
@@ -260,7 +260,7 @@ MAX_PULLBACK_FORMS = 64
 which follows soon after the trace of the forward program, if at all."""
 
 _pullbacks: collections.OrderedDict[Hashable, tuple[Skeleton, tuple[object, ...]]] = collections.OrderedDict()
-_keeping = threading.Lock()
+_pullbacks_lock = threading.Lock()
 
 
 def _traced_pullback(call: _CallSignature, active: tuple[bool, ...], types: _Types) -> tuple[Skeleton, tuple[object, ...]]:

@@ -245,7 +245,7 @@ class _Program:
         self.run.lower(*arrays).compile()  # pyright: ignore[reportFunctionMemberAccess]
 
 
-_pausing = threading.Lock()
+_traces_lock = threading.Lock()
 _traces: list[bool] = []
 """Entries of all traces in progress, each True if garbage collection was enabled before the first of them."""
 
@@ -253,13 +253,13 @@ _traces: list[bool] = []
 @contextlib.contextmanager
 def _no_garbage_collection() -> Iterator[None]:
     """Disable garbage collection, which takes a fifteenth of the time of a trace because a trace creates many objects."""
-    with _pausing:
+    with _traces_lock:
         _traces.append(gc.isenabled() if not _traces else _traces[0])
         gc.disable()
     try:
         yield
     finally:
-        with _pausing:
+        with _traces_lock:
             if _traces.pop() and not _traces:
                 gc.enable()
 
@@ -366,7 +366,7 @@ def _machine() -> str:
     return f"{jax.devices()} {os.environ.get('XLA_FLAGS')} {processor()}"
 
 
-_clearing = threading.RLock()
+_clearing_lock = threading.RLock()
 _traced_code = [code_state()]
 """State of the code from which the functions in JAX's caches were traced."""
 
@@ -375,7 +375,7 @@ def _current_code(*, look: bool = False) -> CodeState:
     """Return the state of the code, see `code_state`; after a change, clear all caches that depend on the former code."""
     state = code_state(look=look)
     if state != _traced_code[0]:
-        with _clearing:
+        with _clearing_lock:
             if state != _traced_code[0]:
                 clear_function_caches()
                 eqx.clear_caches()

@@ -107,9 +107,9 @@ def describe(value: object, array: Callable[[Any], Description]) -> Description:
         case dict() if type(value) is dict:
             return {"dict": [[inner(key), inner(x)] for key, x in value.items()]}
     if isinstance(value, type) or inspect.isroutine(value) or hasattr(value, "__wrapped__"):
-        return {"name": _name(value)}
+        return {"name": _import_name(value)}
     try:
-        return {"class": _name(type(value)), "fields": [inner(getattr(value, name)) for name in _fields(type(value))]}
+        return {"class": _import_name(type(value)), "fields": [inner(getattr(value, name)) for name in _fields(type(value))]}
     except AttributeError as error:
         raise Undescribable(str(error)) from error
 
@@ -134,9 +134,9 @@ def rebuild(description: Description, arrays: Iterator[object]) -> Any:
         case {"dict": [*items]}:
             return {rebuild(key, arrays): rebuild(x, arrays) for key, x in items}  # pyright: ignore
         case {"name": str() as name}:
-            return _named(name)
+            return _import_definition(name)
         case {"class": str() as name, "fields": [*items]}:
-            return _instance(_named(name), [rebuild(x, arrays) for x in items])
+            return _instance(_import_definition(name), [rebuild(x, arrays) for x in items])
     raise Undescribable(f"{description!r} is not a valid description")
 
 
@@ -162,16 +162,16 @@ def _instance(kind: object, values: list[object]) -> object:
     return instance
 
 
-def _name(value: object) -> str:
+def _import_name(value: object) -> str:
     """Return `module:name` of a class or function; raise `Undescribable` if an import by this name does not return the same
     object."""
     name = f"{getattr(value, '__module__', None)}:{getattr(value, '__qualname__', None)}"
-    if _named(name) is not value:
+    if _import_definition(name) is not value:
         raise Undescribable(f"{value!r} cannot be found by its name")
     return name
 
 
-def _named(name: str) -> object:
+def _import_definition(name: str) -> object:
     module, _, path = name.partition(":")
     if module.partition(".")[0] not in KNOWN_PACKAGES:
         raise Undescribable(f"{name} does not belong to a known package")

@@ -15,14 +15,14 @@ from matplotlib.patches import Polygon
 
 from jaxvib.boundary import validated
 from jaxvib.draw.machine.animation import Animation
-from jaxvib.draw.machine.parts import Part, put
+from jaxvib.draw.machine.parts import Part, draw_part
 from jaxvib.draw.motion.histories import period_of
 from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, panels
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.run import Run
-from jaxvib.show.sketch import drawable_scene, fit
+from jaxvib.show.sketch import drawable_scene, set_drawing_limits
 from jaxvib.show.view import ARROWS_NOTE
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose, RotorPose
@@ -179,14 +179,14 @@ def _animation(
     assert grid is not None
     grid.set_height_ratios([0.8 * tall + 0.3, 1.3, 1.3])
     figure.set_dpi(100.0)
-    fit(stage, view.limits)
+    set_drawing_limits(stage, view.limits)
     magnify_given = None if magnify is None else float(number(magnify, "", "magnify", low=0.0, open_low=True))
     magnification = view.magnified(shown_motion.displacement) if magnify_given is None else magnify_given
     reach = magnification * view.scale
     farthest = float(np.max(np.abs(shown_motion.displacement), initial=0.0)) * view.scale
-    if magnification * farthest > (most_seen := _MAX_DRAWN_HEIGHTS * (top - bottom)):
+    if magnification * farthest > (max_shift := _MAX_DRAWN_HEIGHTS * (top - bottom)):
         raise InputError(
-            "magnify", f"is {magnification:g}, which moves the machine out of the figure; at most {most_seen / farthest:.3g}"
+            "magnify", f"is {magnification:g}, which moves the machine out of the figure; at most {max_shift / farthest:.3g}"
         )
     poses = list(map(shown_motion.pose, range(shown_motion.time.size)))
     forces = np.array([view.support_forces(pose) for pose in poses])
@@ -196,7 +196,7 @@ def _animation(
     def parts(k: int) -> list[Part]:
         return [*view.parts(poses[k], reach), *view.arrows(poses[k], shown_motion.force[k], per_newton)]
 
-    artists = [put(stage, part) for part in parts(0)]
+    artists = [draw_part(stage, part) for part in parts(0)]
     clock = stage.set_title("t", loc="left", family="monospace", fontsize="medium")
     slower = (shown_motion.time.size / fps) / (shown_motion.time[-1] - shown_motion.time[0])
     note = f"slowed down {slower:.3g} x, displacements drawn {magnification:.3g} x as large\n{ARROWS_NOTE}"
@@ -314,9 +314,9 @@ def motion_of_run(run: Run, time: np.ndarray) -> SampledMotion:
         turn, speed = arrays(rotor)
         rotors.append(RotorPose(tuple(angle), cubic(_continuous_angle(turn, speed, t), speed)))
     force = np.asarray(stored.foundation_force, float)
-    between = (1.0 - share)[:, None] * force[k] + share[:, None] * force[k + 1]
+    force_at_times = (1.0 - share)[:, None] * force[k] + share[:, None] * force[k + 1]
     velocity = (1.0 - share)[:, None] * v[k] + share[:, None] * v[k + 1]
-    return SampledMotion(time, cubic(q, v), velocity, tuple(rotors), between)
+    return SampledMotion(time, cubic(q, v), velocity, tuple(rotors), force_at_times)
 
 
 def _stored_states(run: Run, time: np.ndarray) -> Trajectory:

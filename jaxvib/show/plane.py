@@ -37,14 +37,14 @@ the drawing. The arrow above a rotor then does not cover its neighbour."""
 class _Strut(NamedTuple):
     """Spring with its damper, from the body to the foundation.
 
-    **Attributes**: `support`: index of its support; `start`: its end on the body; `way`: the vector from `start` to its end on
-    the foundation; `along`: unit vector of its direction (angle of the support, plus a right angle for the second spring);
+    **Attributes**: `support`: index of its support; `start`: its end on the body; `vector`: the vector from `start` to its end
+    on the foundation; `along`: unit vector of its direction (angle of the support, plus a right angle for the second spring);
     `stiffness`, N/m; `damping`, N s/m.
     """
 
     support: int
     start: np.ndarray
-    way: np.ndarray
+    vector: np.ndarray
     along: np.ndarray
     stiffness: float
     damping: float
@@ -96,7 +96,7 @@ class PlaneView(View):
         return struts
 
     def _limits(self, outline: np.ndarray) -> tuple[float, float, float, float]:
-        points = np.concatenate([outline, *([strut.start + strut.way] for strut in self.struts)])
+        points = np.concatenate([outline, *([strut.start + strut.vector] for strut in self.struts)])
         tops = [self.scale * at + 2.0 * wheel.rim for at, wheel in zip(self._axes, self.wheels, strict=True)]
         points = np.concatenate([points, tops])
         (left, bottom), (right, top) = np.min(points, axis=0), np.max(points, axis=0)
@@ -109,8 +109,8 @@ class PlaneView(View):
         ends, axes, centre = rest[: len(self._supports)], rest[len(self._supports) : -1], rest[-1]
         parts = []
         for strut in self.struts:
-            end = strut.start + strut.way
-            side = 0.4 * np.array([strut.way[1], -strut.way[0]]) / _SPRING_LENGTH
+            end = strut.start + strut.vector
+            side = 0.4 * np.array([strut.vector[1], -strut.vector[0]]) / _SPRING_LENGTH
             parts.append(Part(ground(tuple(end - side), tuple(end + side)), FOUNDATION))
             parts += spring_and_damper(tuple(ends[strut.support]), tuple(end), strut.stiffness, strut.damping, _SPRING_LENGTH)
         parts.append(Part(corners, BODY, True))
@@ -132,8 +132,8 @@ class PlaneView(View):
         for strut in self.struts:
             struts_of_support.setdefault(strut.support, []).append(strut)
         for struts in struts_of_support.values():
-            lowest = min(struts, key=lambda strut: float((strut.start + strut.way)[1]))
-            x, y = lowest.start + lowest.way
+            lowest = min(struts, key=lambda strut: float((strut.start + strut.vector)[1]))
+            x, y = lowest.start + lowest.vector
             lines = [_pair([s.stiffness for s in struts], "N/m"), _pair([s.damping for s in struts], "N s/m")]
             texts.append(
                 Text(

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn
 from jaxvib.draw.machine.deck import ellipses, magnification
-from jaxvib.draw.machine.parts import Part, Text, put
+from jaxvib.draw.machine.parts import Part, Text, draw_part
 from jaxvib.draw.style import COLORS, panels
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
@@ -68,9 +68,9 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
     wide = max(_INCHES_PER_UNIT * (right - left), _LETTER_WIDTH * max(map(len, title.splitlines())))
     tall = _INCHES_PER_UNIT * (top - bottom) + 0.25 + 0.18 * len(title.splitlines())
     figure, (axis,) = panels(1, size=(wide, tall), ax=ax)
-    fit(axis, limits)
+    set_drawing_limits(axis, limits)
     for part in parts:
-        put(axis, part)
+        draw_part(axis, part)
     for text in texts:
         axis.text(text.x, text.y, text.text, zorder=6, **text.look)
     if deck is not None:
@@ -118,7 +118,7 @@ def drawable_scene(scene: object) -> Scene:
     return scene
 
 
-def fit(axis: Axes, limits: Limits) -> None:
+def set_drawing_limits(axis: Axes, limits: Limits) -> None:
     """Set the limits of axes to those of a drawing, with equal scales, and hide ticks and frame."""
     left, right, bottom, top = limits
     axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")

@@ -78,6 +78,7 @@ class PlatformView(View):
     """Platforms above each other, numbered from the foundation upward, with each spring and each exciter in a separate lane."""
 
     pitch, thick, lane = 1.9, 0.34, 2.0
+    """Distance between platforms, thickness of a platform, and width of the lane of a spring, in units of the drawing."""
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
@@ -266,6 +267,9 @@ class ShaftView(RotorView):
 
     On the left the shaft is seen from the side, with distances from the centre of mass; on the right the rotor is seen along
     its axis.
+
+    **Attributes**: `middle`: position along the shaft, m, that is drawn in the middle of the left view; `along`: units of the
+    drawing per metre of the shaft; `front`: horizontal position of the right view.
     """
 
     def __init__(self, scene: Scene):

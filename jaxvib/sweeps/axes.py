@@ -22,10 +22,10 @@ from jaxvib.units import Number, count, number
 SAMPLE = "sample"
 """Name of the dimension of the samples."""
 
-_START = {"angle": "rad", "rate": "rad/s", "displacement": "m", "velocity": "m/s"}
+_START_UNITS = {"angle": "rad", "rate": "rad/s", "displacement": "m", "velocity": "m/s"}
 """Parameters of an initial state, with the names of `State`, and their units."""
 
-_KEYS = ["from", "to", "count", "scale"]
+_AXIS_FIELDS = ["from", "to", "count", "scale"]
 
 _MAX_CORNERS = 1024
 """Maximum number of corners with which the search for extreme cases begins: all corners of up to 10 axes."""
@@ -155,9 +155,9 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
 
     if isinstance(spec, Mapping):
         for key in spec:
-            if key not in _KEYS:
+            if key not in _AXIS_FIELDS:
                 hint = f'; write the whole name in quotes, "{name}.{key}"' if not {"from", "to"} & set(spec) else ""
-                raise InputError(f"axes.{name}.{key}", f"is not a field of an axis{hint}; {suggest_name(key, _KEYS)}")
+                raise InputError(f"axes.{name}.{key}", f"is not a field of an axis{hint}; {suggest_name(key, _AXIS_FIELDS)}")
         for key in ("from", "to"):
             if key not in spec:
                 raise InputError(f"axes.{name}.{key}", "is missing; an axis is a list, or a table with from and to")
@@ -193,16 +193,16 @@ def _target_of(scene: Scene, name: str) -> tuple[Target, str]:
         present_numbers(scene, parameter, "axes")  # raises an error for an array of absent springs
         return Target(parameter, "", None), parameter.unit
     match = re.fullmatch(r"start\.([a-z]+)(?:\[(\d+)\])?", str(name))
-    if match is None or match[1] not in _START:
+    if match is None or match[1] not in _START_UNITS:
         raise InputError(
             f"axes.{name}",
-            f"is not a parameter of the initial state; {suggest_name(str(name), [f'start.{f}' for f in _START])}",
+            f"is not a parameter of the initial state; {suggest_name(str(name), [f'start.{f}' for f in _START_UNITS])}",
         )
     size = scene.loads.count if match[1] in ("angle", "rate") else scene.machine.structure().mass.shape[0]
     entry = None if match[2] is None else int(match[2])
     if entry is not None and entry >= size:
         raise InputError(f"axes.{name}", f"does not exist; start.{match[1]} has {size} entries, counted from 0")
-    unit = _START[match[1]]
+    unit = _START_UNITS[match[1]]
     if unit in ("m", "m/s"):
         units = scene.machine.structure().units  # a coordinate may be a rotation
         changed = set(units if entry is None else units[entry : entry + 1])
@@ -267,21 +267,21 @@ def extreme_cases(axes: Sequence[Axis], rates: Callable[[np.ndarray], np.ndarray
     between them, until no change increases a rate.
     """
     tried = np.stack([_values_to_try(axis) for axis in axes])
-    number = len(axes)
-    if 2**number <= _MAX_CORNERS:
-        is_high = np.indices((2,) * number).reshape(number, -1).T
+    axes_count = len(axes)
+    if 2**axes_count <= _MAX_CORNERS:
+        is_high = np.indices((2,) * axes_count).reshape(axes_count, -1).T
     else:
-        is_high = np.random.Generator(np.random.Philox(key=0)).integers(0, 2, (_MAX_CORNERS, number))
+        is_high = np.random.Generator(np.random.Philox(key=0)).integers(0, 2, (_MAX_CORNERS, axes_count))
     corners = np.where(is_high, tried[:, -1], tried[:, 0])
     best = corners[np.argmax(rates(corners), axis=0)]
-    which = np.arange(len(best))
+    rate_index = np.arange(len(best))
     for _ in range(_MAX_ROUNDS):
         before = best
-        for k in range(number):
+        for k in range(axes_count):
             trials = np.repeat(best[:, None], 1 + _VALUES_TO_TRY, axis=1)  # the first is unchanged and wins if rates are equal
             trials[:, 1:, k] = tried[k]
-            found = rates(trials.reshape(-1, number)).reshape(len(best), -1, len(best))[which, :, which]
-            best = trials[which, np.argmax(found, axis=1)]
+            rates_of_trials = rates(trials.reshape(-1, axes_count)).reshape(len(best), -1, len(best))[rate_index, :, rate_index]
+            best = trials[rate_index, np.argmax(rates_of_trials, axis=1)]
         if np.array_equal(best, before):
             break
     return best

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jaxvib.draw.style import Look
 
 _MAX_DOTS = 1500
-"""Maximum number of cases along an axis of a figure; of more cases only every k-th one is drawn."""
+"""Maximum number of cases along an axis of a figure. If there are more, only every k-th case is drawn."""
 
 _THEORY_ROWS = 9
 """Number of values, along the axis that is not the rotor speed, for which folds and torus bifurcations are computed."""
@@ -79,18 +79,18 @@ def _plot_line(store: Store, ax: Axes | None) -> Drawn:
     figure, axes = panels(len(named), size=(7.0, 3.6 if len(named) == 1 else 2.2), share_x=True, ax=ax)
     log = _is_log(store, axis)
     scale = display_unit(store, axis)[1]
-    for drawn, name in zip(axes, named, strict=True):
-        shared = {"log": log, "x_label": axis_label(store, axis) if drawn is axes[-1] else ""}
+    for panel, name in zip(axes, named, strict=True):
+        shared = {"log": log, "x_label": axis_label(store, axis) if panel is axes[-1] else ""}
         if is_label(store, name):
             codes, words = case_labels(store, region)
             present = sorted(set(codes[codes >= 0].ravel().tolist()))
-            places = np.array([[present.index(k) if k >= 0 else np.nan for k in row] for row in codes.reshape(x.size, -1)])
-            points_over(scale * x, places, y_label="", ax=drawn, **shared)
-            drawn.set_yticks(range(len(present)), [words[k].replace("_", " ") for k in present])
-            drawn.set_ylim(-0.6, len(present) - 0.4)
+            heights = np.array([[present.index(k) if k >= 0 else np.nan for k in row] for row in codes.reshape(x.size, -1)])
+            points_over(scale * x, heights, y_label="", ax=panel, **shared)
+            panel.set_yticks(range(len(present)), [words[k].replace("_", " ") for k in present])
+            panel.set_ylim(-0.6, len(present) - 0.4)
             continue
         values = display_unit(store, name)[1] * _values(store, name, region)
-        points_over(scale * x, values.reshape(x.size, -1), y_label=measure_label(store, name), ax=drawn, **shared)
+        points_over(scale * x, values.reshape(x.size, -1), y_label=measure_label(store, name), ax=panel, **shared)
     return figure if ax is None else ax
 
 

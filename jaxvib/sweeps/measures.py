@@ -73,7 +73,8 @@ def _regime_measure(name: str, unit: str, field: str, meanings: tuple[str, ...] 
 
 
 def _settling_time(run: BatchRun) -> Array:
-    """Return the end, s, of the last part of the run in which the speed of a load or rotor differs from its final speed.
+    """Return the end, s, of the last part of the run in which the speed of a load or rotor differs from its final speed by more
+    than 1 %.
 
     If a speed still changes within the window, the end of the run is returned. For a scene that is not plain
     (`Scene.is_plain`), differences are relative to the largest speed in the window, otherwise to the rotor speed.
@@ -99,7 +100,7 @@ def _relative_rotation(run: BatchRun) -> Array:
     return jnp.max(turned) - jnp.min(turned)
 
 
-_MEANS = ("torque", "power", "static_load")
+_MEAN_FIELDS = ("torque", "power", "static_load")
 """Fields of `VibrationMeasures` that are mean values, and exist for motions without a vibration."""
 
 
@@ -111,7 +112,7 @@ def _vibration_measure(name: str, unit: str, field: str, axis: str = "", text: s
         value = getattr(vibration_measures(run.scene, motion), field)
         if value is None:
             raise InputError("measure", f"is {name}, which needs a body in a plane, not a {quoted(run.scene.machine.kind)}")
-        if field in _MEANS:
+        if field in _MEAN_FIELDS:
             return value
         share = vibration_share(run.scene.machine, run.window.time, run.measured, motion.displacement)
         return jnp.where(has_vibration(share), value, jnp.nan)

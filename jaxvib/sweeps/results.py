@@ -15,7 +15,7 @@ _MAX_CASES = 40
 """Largest number of cases for which the table has a row for each case."""
 
 _MAX_ENTRIES = 4
-"""Largest number of entries of a measure that are all shown; of more entries the range is shown."""
+"""Largest number of entries of a measure that are shown one by one; if there are more, their range is shown."""
 
 _MAX_READ = 1_000_000
 """Largest number of cases of a store that is read as a whole."""

@@ -269,8 +269,8 @@ class Store:
     def pieces(self) -> list[slice]:
         """Return slices of the first dimension; each has whole chunks: one row of them, or several with at most about a million
         cases."""
-        wide = max(int(np.prod(self.shape[1:], dtype=np.int64)), 1)
-        rows = max(1, (1 << 20) // (wide * self.tile[0])) * self.tile[0]
+        cases_per_row = max(int(np.prod(self.shape[1:], dtype=np.int64)), 1)
+        rows = max(1, (1 << 20) // (cases_per_row * self.tile[0])) * self.tile[0]
         return [slice(k, min(k + rows, self.shape[0])) for k in range(0, self.shape[0], rows)]
 
     def read(self, name: str, region: slice | tuple[slice, ...] = slice(None)) -> np.ndarray:
@@ -297,7 +297,7 @@ def _short(value: Plain) -> str:
 def cannot_write(path: Path, error: OSError) -> InputError:
     """Return the error for a store that cannot be written. Its finished chunks are not affected."""
     reason = error.strerror or str(error)
-    advice = "make room or name another store; finished chunks are kept, run the same command again to continue"
+    advice = "make room or name another store; finished chunks are kept; run the same command again to continue"
     return InputError("store", f"is {quoted(str(path))}, which cannot be written ({reason}); {advice}")
 
 

@@ -30,9 +30,9 @@ Measures: TypeAlias = Sequence[Measure | str] | Mapping[str, Measure | str]
 _CASES_PER_CHUNK = {"leading": 16384, "exact": 512, "time": 1024}
 """Default number of cases of a chunk by tier: about one second of computation, much more than the time to write the chunk."""
 
-_RESERVED = ("status", "error")
+_RESERVED_NAMES = ("status", "error")
 
-_LABELS = ("regime", "mode")
+_LABEL_MEASURES = ("regime", "mode")
 """Names of the measures by which figures label cases."""
 
 _MAX_CASES = 10**9
@@ -98,9 +98,9 @@ def _require_free_names(names: Sequence[str], measures: Sequence[Measure], axes:
     """**Raises** `InputError` for names of measures that cannot be used for arrays of a store, or that are used already."""
     dimensions = [measure.axis for measure in measures if isinstance(measure, RunMeasure)]
     for name, measure in zip(names, measures, strict=True):
-        if name in _LABELS and measure != measure_of(f"run.{name}", f"measure.{name}"):
+        if name in _LABEL_MEASURES and measure != measure_of(f"run.{name}", f"measure.{name}"):
             raise InputError(f"measure.{name}", f"is the name of the measure run.{name}; choose another one")
-        if name in (*_RESERVED, *axes, *dimensions, "sample"):
+        if name in (*_RESERVED_NAMES, *axes, *dimensions, "sample"):
             raise InputError(f"measure.{name}", "is a name that is used already; choose another one")
         if not _is_name(name):
             problem = "is not a valid name of an array: up to 200 printable characters without /, \\ and $"

@@ -45,7 +45,7 @@ class Progress(NamedTuple):
 
     **Attributes**
 
-    - `done`: number of finished cases of `cases`, including those of earlier calls
+    - `done`: number of finished cases, including those of earlier calls; `cases`: number of all cases
     - `rate`: cases per second in this call
     - `left`: estimated seconds until the end
     """

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxvib.boundary import is_whole
 from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.compat import traced
-from jaxvib.runtime.devices import numpy_of
+from jaxvib.runtime.devices import array_module
 from jaxvib.units.reading import ADDED, Number, Numbers, number_words, to_float
 
 
@@ -50,7 +50,7 @@ class Bounds(NamedTuple):
         return " and ".join(filter(None, (low, high)))
 
 
-_COLLECTED: contextvars.ContextVar[list[Array] | None] = contextvars.ContextVar("collected", default=None)
+_COLLECTED_CONDITIONS: contextvars.ContextVar[list[Array] | None] = contextvars.ContextVar("collected", default=None)
 
 
 @contextlib.contextmanager
@@ -60,21 +60,21 @@ def conditions_of_traced_values() -> Iterator[list[Array]]:
     The yielded list receives a traced Boolean for each traced value, True if the value is allowed.
     """
     conditions: list[Array] = []
-    token = _COLLECTED.set(conditions)
+    token = _COLLECTED_CONDITIONS.set(conditions)
     try:
         yield conditions
     finally:
-        _COLLECTED.reset(token)
+        _COLLECTED_CONDITIONS.reset(token)
 
 
 _MAX_NUMBERS = 10**7
 """Largest length of a list of numbers; more numbers must be passed as an array."""
 
 
-def _check_bounds(value: Array | np.ndarray, field: str, unit: str, bounds: Bounds, place: str = "") -> None:
+def _check_bounds(value: Array | np.ndarray, field: str, unit: str, bounds: Bounds, *, is_list: bool = False) -> None:
     """Check values against bounds. The condition for a traced value is added to the list of `conditions_of_traced_values`."""
     if traced(value):
-        collected = _COLLECTED.get()
+        collected = _COLLECTED_CONDITIONS.get()
         if collected is not None:
             collected.append(jnp.all(bounds.allow(value)))
         return
@@ -85,7 +85,7 @@ def _check_bounds(value: Array | np.ndarray, field: str, unit: str, bounds: Boun
     if np.all(allowed):
         return
     index = int(np.argmin(allowed))
-    entry, name = flat[index], f"{field}[{index}]" if place == "each" else field
+    entry, name = flat[index], f"{field}[{index}]" if is_list else field
     needed = f"it must be {bounds.words}"
     if not np.isfinite(entry):
         needed = "a finite number is needed"
@@ -176,7 +176,7 @@ def numbers(
     if np.ndim(magnitude) == 0:
         scalar = _converted(magnitude, unit, field, (), bounds)
         if not (shared or length is None):
-            scalar = numpy_of(scalar).broadcast_to(scalar, (length,))
+            scalar = array_module(scalar).broadcast_to(scalar, (length,))
         return jnp.asarray(scalar, dtype=float)
     if np.size(magnitude) == 0 and length is None:
         raise InputError(field, "is an empty array; at least 1 value is needed")
@@ -213,7 +213,7 @@ def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], 
         raise InputError(field, f"is {quoted(value)}, which is not a number; write a {number_words(unit)}") from error
     if array.shape != shape:
         raise InputError(field, f"has shape {array.shape}; one {number_words(unit)} is needed")
-    _check_bounds(array, field, unit, bounds, place="each" if shape else "")
+    _check_bounds(array, field, unit, bounds, is_list=bool(shape))
     return array
 
 
@@ -237,7 +237,7 @@ def count(value: object, field: str, *, low: int = 1, each: float = 0.0) -> int:
         room = 0.5 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2.0**33
         if value * each > room:
             needs = f"needs {value * each / 2.0**30:.3g} GiB, more than half of the computer's memory"
-            raise InputError(field, f"is {value}, which {needs}; {int(room / each)} at most fit")
+            raise InputError(field, f"is {value}, which {needs}; at most {int(room / each)} fit")
     if value > _MAX_COUNT:
         raise InputError(field, f"is {quoted(value)}; it must be a whole number from {low} to {_MAX_COUNT}")
     return int(value)

@@ -31,7 +31,9 @@ Numbers: TypeAlias = Number | Sequence[Number]
 """Several numbers, or a single number for all entries."""
 
 
-_TEXT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(\s*[^\W\d_]|\s+1\s*/|\s*[%°])((?:(?!\s\d)[^,;()])*)")
+_NUMBER_WITH_UNIT = re.compile(
+    r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(\s*[^\W\d_]|\s+1\s*/|\s*[%°])((?:(?!\s\d)[^,;()])*)"
+)
 """Pattern of one number (with a point, not a comma, before decimals), then one unit, which may begin with "1/". Other texts
 are refused as mistakes, even if pint could evaluate them."""
 
@@ -118,7 +120,7 @@ _POWER = re.compile(
 _MAX_UNIT_CHARACTERS = 100
 """Largest length of a unit. pint takes minutes for long strings."""
 
-_UNREADABLE = (AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError, tokenize.TokenError)
+_PARSE_ERRORS = (AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError, tokenize.TokenError)
 """Errors, other than pint's own classes, that pint raises for a string that is not a unit; it parses the string as Python."""
 
 
@@ -166,7 +168,7 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         several = _SEVERAL.fullmatch(text) if unit in ADDED and len(text) < 100 else None
         if several is not None and _SEVERAL.fullmatch(several[2]) is None:
             return int(several[1].rstrip("x×* \t")) * to_float(several[2], unit, field)
-        parts = _TEXT.fullmatch(text) if len(text) < 100 else None
+        parts = _NUMBER_WITH_UNIT.fullmatch(text) if len(text) < 100 else None
         if parts is None:
             if len(text) < 100 and _COMMA.fullmatch(text):
                 point, none = quoted(text.replace(",", ".")), quoted(text.replace(",", ""))
@@ -200,7 +202,7 @@ def _stiffness_under(deflection: str, load: str, value: str, field: str) -> floa
     mass = _in_unit(load, "kg")
     sag = to_float(deflection, "m", field)
     force = to_float(load, "N", field) if mass is None else STANDARD_GRAVITY * mass
-    has_units = all(_TEXT.fullmatch(text) for text in (deflection, load))
+    has_units = all(_NUMBER_WITH_UNIT.fullmatch(text) for text in (deflection, load))
     if not (has_units and 0.0 < float(sag) < math.inf and 0.0 < float(force) < math.inf):
         problem = "needs a positive deflection and a positive mass or force, with units"
         raise InputError(field, f"is {quoted(value)}, which {problem}, such as '25 mm under 650 kg'")
@@ -210,7 +212,7 @@ def _stiffness_under(deflection: str, load: str, value: str, field: str) -> floa
 def _in_unit(text: str, unit: str) -> float | None:
     """Return a text with a unit as a number in `unit`; None for a plain number and for another dimension."""
     try:
-        return None if _TEXT.fullmatch(text.strip()) is None else float(to_float(text, unit, ""))
+        return None if _NUMBER_WITH_UNIT.fullmatch(text.strip()) is None else float(to_float(text, unit, ""))
     except InputError:
         return None
 
@@ -258,7 +260,7 @@ def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
 
 
 def _parsed(unit: str) -> Any:
-    """Return pint's unit for a string. **Raises** an error of `_UNREADABLE` or of pint for a string that is not a unit."""
+    """Return pint's unit for a string. **Raises** an error of `_PARSE_ERRORS` or of pint for a string that is not a unit."""
     import pint
 
     if any(pattern.search(unit) for pattern, _ in _AMBIGUOUS):
@@ -278,7 +280,7 @@ def _quantity(magnitude: float, written: str, value: str, unit: str | None, fiel
 
     try:
         return pint.get_application_registry().Quantity(magnitude, _parsed(written))
-    except (pint.PintError, *_UNREADABLE) as error:
+    except (pint.PintError, *_PARSE_ERRORS) as error:
         raise _wrong_unit(value, unit, field) from error
 
 
@@ -301,7 +303,7 @@ def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
         if rest != wanted_rest:
             raise _wrong_unit(text, unit, field)
         magnitude = given.m_as(str(wanted))
-    except (pint.PintError, *_UNREADABLE) as error:
+    except (pint.PintError, *_PARSE_ERRORS) as error:
         if isinstance(error, InputError):
             raise
         raise _wrong_unit(text, unit, field) from error
@@ -337,7 +339,7 @@ def unit_ratio(one: str, other: str) -> float | None:
 
     try:
         return float(_magnitude(pint.get_application_registry().Quantity(1.0, _parsed(one)), other, "unit", one))
-    except (InputError, pint.PintError, *_UNREADABLE):
+    except (InputError, pint.PintError, *_PARSE_ERRORS):
         return None
 
 
@@ -348,7 +350,7 @@ def in_own_unit(value: str | Quantity, field: str, beside: str = "") -> tuple[fl
     ratio:
 
     - if it is the unit of a speed, a speed is returned in this unit
-    - a value in 1/s is a rate. Beside a speed in rad/s it is refused, because it states neither radians nor revolutions
+    - a value in 1/s is a rate. It is refused beside a speed in rad/s, because it states neither radians nor revolutions
     - a value in 1/min is returned in the unit `beside` if that is a rate such as 1/s; otherwise it is in rpm
 
     **Raises** `InputError` for other strings, for values that are not finite, and for 1/s beside a speed in rad/s.
@@ -360,7 +362,7 @@ def in_own_unit(value: str | Quantity, field: str, beside: str = "") -> tuple[fl
 
     given: Any = value
     if isinstance(value, str):
-        parts = _TEXT.fullmatch(value.strip()) if len(value) < 100 else None
+        parts = _NUMBER_WITH_UNIT.fullmatch(value.strip()) if len(value) < 100 else None
         if parts is None:
             return _finite(to_float(value, "", field), field), ""
         given = _quantity(float(parts[1]), (parts[2] + parts[3]).strip(), value, None, field)
@@ -376,7 +378,7 @@ def in_own_unit(value: str | Quantity, field: str, beside: str = "") -> tuple[fl
                 given = pint.get_application_registry().Quantity(given.m, "rpm")
         given = given.to_base_units() * pint.get_application_registry().Quantity(2.0 * math.pi, "rad") ** hertz
         magnitude = _finite(given.m, field)
-    except (pint.PintError, *_UNREADABLE) as error:
+    except (pint.PintError, *_PARSE_ERRORS) as error:
         if isinstance(error, InputError):
             raise
         raise _wrong_unit(str(value), None, field) from error

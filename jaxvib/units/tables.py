@@ -44,10 +44,10 @@ def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.nda
 def row_names(path: str | Path, unit: str, column: str | None = None) -> list[str]:
     """Return texts that identify the rows of `csv_column`: the first cell, if it is not a number, with the row and the file."""
     _, cells = _column(path, unit, column)
-    return [f"{_named(first)}row {line} of {Path(path).name}" for line, _, first in cells]
+    return [f"{_row_prefix(first)}row {line} of {Path(path).name}" for line, _, first in cells]
 
 
-def _named(cell: str) -> str:
+def _row_prefix(cell: str) -> str:
     """Return the first cell of a row as the beginning of a text, "" for a number."""
     try:
         float(cell or "0")

@@ -19,7 +19,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate
-from jaxvib.runtime.devices import known, numpy_of
+from jaxvib.runtime.devices import array_module, numpy_if_known
 from jaxvib.steady.jams.follow import follow_fold, follow_jam
 from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes, require_mode_of
 from jaxvib.steady.orbits.describe import Orbit
@@ -199,8 +199,8 @@ class Evaluation:
 
     def _sixty_periods(self) -> Array:
         """Return the length of 60 periods of the lowest natural frequency, s; a frequency of 0 counts as the rotor speed."""
-        frequencies, speed = map(known, jax.lax.stop_gradient((natural_frequencies(self.scene), self.scene.top_speed)))
-        return 60.0 * 2.0 * np.pi / numpy_of(frequencies).where(frequencies > 0.0, frequencies, speed).min()
+        frequencies, speed = map(numpy_if_known, jax.lax.stop_gradient((natural_frequencies(self.scene), self.scene.top_speed)))
+        return 60.0 * 2.0 * np.pi / array_module(frequencies).where(frequencies > 0.0, frequencies, speed).min()
 
     def keep_run(self, motion: int | Literal["working"], run: Run) -> None:
         """Store a run that has settled in a jam mode or in the working regime; quantities then use it in place of a

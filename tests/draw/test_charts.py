@@ -45,7 +45,12 @@ def test_colours_of_agreement_belong_to_their_legend():
     mesh = figure.axes[0].collections[0]
     shown = [matplotlib.colors.to_hex(color) for color in mesh.to_rgba(mesh.get_array()).reshape(-1, 4)]
     legend = {text.get_text(): matplotlib.colors.to_hex(patch.get_facecolor()) for text, patch in _entries(figure.legends[0])}
-    right = ["loads balance (both agree)", "criterion predicts balance, wrongly", "balance missed", "loads gather (both agree)"]
+    right = [
+        "loads balance (both agree)",
+        "criterion predicts balance, wrongly",
+        "balance not predicted",
+        "loads gather (both agree)",
+    ]
     assert shown == [legend[each] for each in right]
 
 

@@ -19,7 +19,7 @@ from jaxvib.draw.style import COLORS
 from jaxvib.explore import figures, server
 from jaxvib.explore.campbell import _SENSE_STYLES
 from jaxvib.explore.figures import SceneOrProblem, scene_or_problem
-from jaxvib.explore.panel import TALL, WIDE, Panel
+from jaxvib.explore.panel import PANEL_HEIGHT, PANEL_WIDTH, Panel
 from jaxvib.explore.sliders import COUNT, scene_at, sliders_of, typed_value
 from jaxvib.machine.files import SCREENS, TEMPLATES
 from jaxvib.show.moving import moving_svg
@@ -211,7 +211,7 @@ def test_the_page_sets_a_slider_to_a_typed_number(one_mass, tmp_path, monkeypatc
 
 
 def test_the_middle_of_the_limits_is_that_of_a_panel():
-    middle = (1.0 + 0.5 * WIDE, 0.5 * TALL)
+    middle = (1.0 + 0.5 * PANEL_WIDTH, 0.5 * PANEL_HEIGHT)
     assert Panel(1.0, "", (0.0, 10.0), (2.0, 6.0)).at(5.0, 4.0) == pytest.approx(middle)
     assert Panel(1.0, "", (0.0, 10.0), (1.0, 100.0), log=True).at(5.0, 10.0) == pytest.approx(middle)
 

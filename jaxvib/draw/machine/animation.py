@@ -18,7 +18,7 @@ from PIL import Image
 
 from jaxvib.errors import written
 
-_COLORS = 64
+_MAX_COLORS = 64
 """Maximum number of colours of an animation."""
 
 _MIN_COLOR_DIFFERENCE = 10
@@ -91,40 +91,40 @@ class Animation(FuncAnimation):
             return
         with written(path) as part:
             if path.suffix.lower() == ".gif":
-                self._gif(part)
+                self._write_gif(part)
             else:
                 part.write_text(self._page(path.stem), encoding="utf-8")
 
-    def _gif(self, path: Path) -> None:
-        first, *others = self._few_colours()
+    def _write_gif(self, path: Path) -> None:
+        first, *others = self._frames_with_palette()
         # The unit of pauses in a GIF is a hundredth of a second.
         pause = max(20, round(100.0 / self.fps) * 10)
         first.save(path, save_all=True, append_images=others, duration=pause, loop=0, optimize=True, disposal=1)
 
-    def _few_colours(self) -> list[Image.Image]:
+    def _frames_with_palette(self) -> list[Image.Image]:
         """Return all frames with a common palette, which is computed from a few frames, without dithering.
 
         Parts that do not move therefore have the same pixels in all frames.
         """
-        every = list(self.frames())
-        some = every[:: max(1, len(every) // 4)]
-        strip = Image.new("RGB", (some[0].width, some[0].height * len(some)))
-        for k, each in enumerate(some):
+        frames = list(self.frames())
+        sampled = frames[:: max(1, len(frames) // 4)]
+        strip = Image.new("RGB", (sampled[0].width, sampled[0].height * len(sampled)))
+        for k, each in enumerate(sampled):
             strip.paste(each, (0, k * each.height))
         # The most frequent colours, such as white, come first and are not changed.
         colours, counts = np.unique(np.asarray(strip).reshape(-1, 3), axis=0, return_counts=True)
         chosen: list[np.ndarray] = []
         for colour in colours[np.argsort(-counts, kind="stable")].astype(int):
             # A colour that is close to one in the palette would only take the place of another colour.
-            if len(chosen) < _COLORS and all(np.max(np.abs(colour - other)) > _MIN_COLOR_DIFFERENCE for other in chosen):
+            if len(chosen) < _MAX_COLORS and all(np.max(np.abs(colour - other)) > _MIN_COLOR_DIFFERENCE for other in chosen):
                 chosen.append(colour)
         palette = Image.new("P", (1, 1))
         palette.putpalette([int(level) for colour in chosen for level in colour])
-        return [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in every]
+        return [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in frames]
 
     def _page(self, title: str) -> str:
         coded = []
-        for each in self._few_colours():
+        for each in self._frames_with_palette():
             with io.BytesIO() as memory:
                 each.save(memory, "PNG", optimize=False)
                 coded.append('"' + base64.b64encode(memory.getvalue()).decode("ascii") + '"')

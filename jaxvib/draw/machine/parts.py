@@ -138,7 +138,7 @@ def ground(start: Point, end: Point, step: float = 0.22) -> np.ndarray:
     return _along(start, end, np.array(forward), np.array(side))
 
 
-def put(axis: Axes, part: Part) -> Line2D | Polygon:
+def draw_part(axis: Axes, part: Part) -> Line2D | Polygon:
     """Draw a part. **Returns** its artist, whose points are changed by `set_data` (line) or `set_xy` (filled outline)."""
     if part.filled:
         outline = Polygon(part.points, closed=True, **part.look)

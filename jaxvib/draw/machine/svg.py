@@ -16,7 +16,7 @@ _UNITS_PER_LENGTH = 62.0
 _UNITS_PER_POINT = 100.0 / 72.0
 """SVG units per typographic point."""
 
-_SIZES = {"small": 8.3, "x-small": 7.0}
+_FONT_SIZES = {"small": 8.3, "x-small": 7.0}
 _ANCHORS = {"left": "start", "center": "middle", "right": "end"}
 _DASHES = {":": "1 2", "--": "4 2", "-.": "9 2 2 2"}
 
@@ -49,7 +49,7 @@ def svg(
     """
     left, right, bottom, top = limits
     lines = head.split("\n") if head else []
-    above = 1.35 * _SIZES["small"] * _UNITS_PER_POINT * len(lines)
+    above = 1.35 * _FONT_SIZES["small"] * _UNITS_PER_POINT * len(lines)
 
     def place(points: np.ndarray) -> np.ndarray:
         return np.asarray(points, float) * (_UNITS_PER_LENGTH, -_UNITS_PER_LENGTH) + (
@@ -67,7 +67,7 @@ def svg(
         places = place(np.array([(frame[k].x, frame[k].y) for frame in texts]))
         x, y = places[0].tolist()
         found.append(_shifted(_text(x, y, text.text, text.look), places - places[0], seconds))
-    found += [_text(0.0, 1.35 * _SIZES["small"] * _UNITS_PER_POINT * (k + 0.5), line, {}) for k, line in enumerate(lines)]
+    found += [_text(0.0, 1.35 * _FONT_SIZES["small"] * _UNITS_PER_POINT * (k + 0.5), line, {}) for k, line in enumerate(lines)]
     return "".join([*found, "</svg>"])
 
 
@@ -131,7 +131,7 @@ def _style(part: Part) -> str:
 
 
 def _text(x: float, y: float, text: str, look: dict[str, object]) -> str:
-    size = _SIZES[str(look.get("fontsize", "small"))] * _UNITS_PER_POINT
+    size = _FONT_SIZES[str(look.get("fontsize", "small"))] * _UNITS_PER_POINT
     lines = text.split("\n")
     step = 1.25 * size
     # Offset of the baseline of the first line for each vertical alignment of the whole text.

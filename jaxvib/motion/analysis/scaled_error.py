@@ -13,7 +13,7 @@ from jaxvib.equations.state import ExciterState, Spin, State
 from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, RotorImbalance, SlipRelease
 from jaxvib.machine.scene import Exciter, Scene
-from jaxvib.runtime.devices import numpy_of
+from jaxvib.runtime.devices import array_module
 from jaxvib.runtime.programs import cached
 
 
@@ -66,7 +66,7 @@ def error_scale(state: State, unit: State) -> State:
     **Returns** `State` with a scalar in each place. If the values are known, the scalars are computed by NumPy, without
     compilation.
     """
-    xp = numpy_of((state, unit))
+    xp = array_module((state, unit))
 
     def largest(x: Array, least: Array) -> Array:
         return xp.maximum(xp.max(xp.abs(xp.asarray(x))), xp.asarray(least))
@@ -111,7 +111,7 @@ def scaled_error(a: State, b: State, scale: State) -> Array:
     >>> float(scaled_error(a, b, error_scale(a, unit))), float(scaled_error(a, b, error_scale(b, unit)))
     (0.5, 1.0)
     """
-    xp = numpy_of((a, b, scale))
+    xp = array_module((a, b, scale))
 
     def relative_difference(x: Array, y: Array, unit: Array) -> Array:
         with np.errstate(invalid="ignore"):  # the states of a run that did not finish are NaN
@@ -159,7 +159,7 @@ def with_nearest_turns(state: State, to: State) -> State:
     >>> round(float(with_nearest_turns(a, b).angle[0][0]), 4)
     -3.1832
     """
-    xp = numpy_of((state, to))
+    xp = array_module((state, to))
 
     def near(x: Array, y: Array) -> Array:
         return x + 2.0 * np.pi * xp.round((y - x) / (2.0 * np.pi))

@@ -25,7 +25,7 @@ from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.fourier import grid_of
-from jaxvib.runtime.devices import known, numpy_of, on_device
+from jaxvib.runtime.devices import array_module, numpy_if_known, on_device
 from jaxvib.runtime.parallel import in_background
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import light_rotor_speed
@@ -215,9 +215,9 @@ def _mode_start(scene: Scene, mode: int) -> tuple[Array, Array, Array]:
     if scene.mounting.gyroscopic is not None:
         raise InputError("mode", "is not defined for a machine whose resonances depend on the rotor speed; give omega or near")
     jams = jams_of(scene)
-    light, speed = known(jams.omega)[jams.row(mode)], known(scene.drive.speed)
+    light, speed = numpy_if_known(jams.omega)[jams.row(mode)], numpy_if_known(scene.drive.speed)
     direction = on_device(np.asarray(1.0 if mode % 2 == 1 else -1.0, speed.dtype))
-    xp = numpy_of((light, speed))
+    xp = array_module((light, speed))
     exists = on_device(xp.asarray(xp.isfinite(light)))
     return exists, direction, on_device(xp.asarray(xp.where(xp.isfinite(light), light, speed)))
 

@@ -1,4 +1,4 @@
-"""Costs of the methods for one quantity: table rows, the fastest method, the figure."""
+"""Error and computing time of one quantity by several methods: the table, the fastest method, the figure."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class CostRow(NamedTuple):
 
 
 class Cost(Result):
-    """Cost of a quantity by every method.
+    """Error and computing time of one quantity by every method.
 
     Returned by `work_precision`.
 
@@ -69,7 +69,7 @@ class Cost(Result):
     def cheapest(self, error: float) -> CostRow | None:
         """Return the row of the fastest method whose relative error, plus that of the reference, is at most `error`.
 
-        **Arguments**: `error`: typical: 1e-2 to 1e-6.
+        **Arguments**: `error`: largest allowed relative error; typical: 1e-2 to 1e-6.
 
         **Returns** None if no method is accurate enough, or if the reference is not accurate enough.
         """

@@ -86,7 +86,7 @@ def work_precision(
       quantity is measured at the end of a run from rest. The reference is then the full equations with a tolerance of 1e-13;
       its error is the difference from a run with a tolerance of 1e-11
     - "final_state": the state of the full equations at `until`, from rest, by every solver. The reference is a run with a
-      tolerance of 1e-13, with the estimated error of this run
+      tolerance of 1e-13; its error is estimated by this run
     - "gradient" of the largest amplitude of the jam with respect to the stiffnesses of the machine: implicit derivatives of
       leading order and exact orbit; forward mode, reverse mode and finite differences through time integration
 
@@ -135,7 +135,7 @@ def work_precision(
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
     request = _Request(scene, tuple(tolerances), tuple(solvers), repeats, progress)
     if quantity == "final_state":
-        return _final_state(request, end)
+        return _cost_of_final_state(request, end)
     if quantity == "gradient":
         return gradient_precision(scene, exact_jam(scene, mode), end, repeats)
     try:
@@ -143,8 +143,8 @@ def work_precision(
     except InputError as problem:
         if mode is not None:
             raise
-        return _at_the_end(request, quantity, end, f"leading order, exact orbit: {problem}")
-    return _steady(request, quantity, jam, end)
+        return _cost_at_end(request, quantity, end, f"leading order, exact orbit: {problem}")
+    return _cost_of_jam(request, quantity, jam, end)
 
 
 @dataclasses.dataclass
@@ -161,9 +161,9 @@ class _Request:
     ) -> CostRow:
         """Return the row of a method, and report it to `progress`."""
         if self.progress is not None:
-            single = len(self.tolerances) if "default" in self.solvers else 0
+            single_rows = len(self.tolerances) if "default" in self.solvers else 0
             algebraic = _REFERENCE_ROWS + _ALGEBRAIC_ROWS * (2 + len(_ORBIT_POINTS))
-            whole = algebraic + len(_ENVELOPE_TOLERANCES) + len(self.tolerances) * len(self.solvers) + single
+            whole = algebraic + len(_ENVELOPE_TOLERANCES) + len(self.tolerances) * len(self.solvers) + single_rows
             name = ", ".join(filter(None, (tier, method, setting)))
             call_user(self.progress, "progress", name, min((_REFERENCE_ROWS + self.finished) / whole, 1.0))
         self.finished += _ALGEBRAIC_ROWS if tier in ("leading order", "exact orbit") else 1.0
@@ -175,7 +175,7 @@ def _single(tree: Tree) -> Tree:
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), tree)
 
 
-def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) -> Cost:
+def _cost_of_jam(request: _Request, quantity: str, jam: ExactJam, end: float | None) -> Cost:
     scene, mode = request.scene, jam.mode
     read = operator.attrgetter(quantity)
     reference = np.ravel(np.asarray(read(jam.fine), float))
@@ -209,12 +209,12 @@ def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) 
         def length(tolerance: float) -> float:
             return jam.length(scene, tolerance) if end is None else end
 
-        integrated, reasons = _integrated(request, read, error, start, length)
+        integrated, reasons = _integration_rows(request, read, error, start, length)
         rows, left_out = rows + integrated, left_out + reasons
     return Cost(quantity, reference.tolist(), error(read(jam.coarse)), rows, tuple(left_out))
 
 
-def _at_the_end(request: _Request, quantity: str, end: float | None, reason: str) -> Cost:
+def _cost_at_end(request: _Request, quantity: str, end: float | None, reason: str) -> Cost:
     """Return the cost of a quantity of a scene without an exact jam, measured at the end of a run from rest."""
     end = WINDOW_PERIODS * slow_period(request.scene) if end is None else end
     read = operator.attrgetter(quantity)
@@ -231,11 +231,11 @@ def _at_the_end(request: _Request, quantity: str, end: float | None, reason: str
     def error(value: Array) -> float:
         return relative(value, reference(), units)
 
-    rows, left_out = _integrated(request, read, error, start, lambda tolerance: end)
+    rows, left_out = _integration_rows(request, read, error, start, lambda tolerance: end)
     return Cost(quantity, reference().tolist(), relative(reference(1e-11), reference(), units), rows, (reason, *left_out))
 
 
-def _integrated(
+def _integration_rows(
     request: _Request,
     read: Callable[[Result], Array],
     error: Callable[[Array], float],
@@ -246,7 +246,7 @@ def _integrated(
 
     **Arguments**: `length(tolerance)`: duration of a run, s.
     """
-    full, rows, left_out = _full(request, start, length, lambda run: error(read(run))), [], []
+    full, rows, left_out = _full_rows(request, start, length, lambda run: error(read(run))), [], []
     for tolerance in _ENVELOPE_TOLERANCES:
         end = length(tolerance)
 
@@ -262,7 +262,9 @@ def _integrated(
     return rows + full, left_out
 
 
-def _full(request: _Request, start: State, length: Callable[[float], float], error: Callable[[Run], float]) -> list[CostRow]:
+def _full_rows(
+    request: _Request, start: State, length: Callable[[float], float], error: Callable[[Run], float]
+) -> list[CostRow]:
     """Return rows of full runs by every solver with every tolerance, in double precision, and by the default method also in
     single precision."""
     ends = {tolerance: length(tolerance) for tolerance in request.tolerances}
@@ -303,7 +305,7 @@ def _compiled(function: Callable[[Scene], Array], scene: Scene) -> Callable[[], 
     return lambda: jitted(scene)
 
 
-def _final_state(request: _Request, end: float | None) -> Cost:
+def _cost_of_final_state(request: _Request, end: float | None) -> Cost:
     end = WINDOW_PERIODS * slow_period(request.scene) if end is None else end
     reference_run = functools.cache(lambda: simulate(request.scene, end, save="window", stepsize_controller=Tolerance(1e-13)))
 
@@ -317,7 +319,7 @@ def _final_state(request: _Request, end: float | None) -> Cost:
         value = float(scaled_error(with_nearest_turns(last, exact) if single else last, exact, scale()))
         return value if np.isfinite(value) else np.inf
 
-    rows = _full(request, initial_state(request.scene), lambda tolerance: end, error)
+    rows = _full_rows(request, initial_state(request.scene), lambda tolerance: end, error)
     reason = "leading order, exact orbit, envelope: these do not determine the phase, which is part of the final state"
     scaled_entries = jax.tree.leaves(jax.tree.map(lambda x, unit: np.ravel(x / unit), _last(reference_run()), scale()))
     return Cost("final_state", np.concatenate(scaled_entries).tolist(), float(reference_run().error), rows, (reason,))

@@ -121,10 +121,10 @@ def audit(
     The audit shows which effects of a scene are negligible, and which effects the scene lacks.
 
     - Each effect of the scene is removed. Each effect that the scene lacks and could have is added, with typical values
-      (`Effect.typical`). The same quantities of both scenes are compared
-    - For a scene that jams at a constant rotor speed the jam is compared. It is computed by the exact orbit. If the
-      theory of exact orbits does not support the scene, it is computed by the full equations, which are integrated until the
-      motion has settled. For other scenes the end of a run is compared. Transients are not compared
+      (`Effect.typical`). The same quantities are compared with and without the effect
+    - For a scene that jams at a constant rotor speed, the jam is compared. It is computed as an exact orbit or, if the theory
+      of exact orbits does not support the scene, by integration of the full equations until the motion has settled. For other
+      scenes, the end of a run is compared. Transients are not compared
     - The gyroscopic coupling of a rotor's tilts and the limited power of a motor are removed in the same way
     - Your own effects are audited in the same way as those of the package
 
@@ -231,7 +231,7 @@ def _comparison(
         except InputError:
             if mode is not None:
                 raise
-    _ = scene.loads  # refuses exciters without loads
+    _ = scene.loads  # raises an error for exciters without loads
     run = RunComparison.of_arguments(scene, until, start)
     names = {"rest": "from rest", "turning": "with turning loads"}
     name = "from a given state" if isinstance(run.start, State) else names[run.start]

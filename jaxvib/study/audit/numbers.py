@@ -16,7 +16,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.study.audit.comparisons import MotionValues, total_drag_torque
 
 _G = 9.81
-_STEEL = 7850.0
+_STEEL_DENSITY = 7850.0
 _ROLLING, _BEARING, _BEARING_DIAMETER = 3e-5, 0.0015, 0.2
 """Typical values: arm of rolling friction of steel on steel, m; friction coefficient mu2 of a ball bearing; diameter of the
 bearing of a load, relative to the radius of its track."""
@@ -92,7 +92,7 @@ def _ball_radius(scene: Scene) -> tuple[float, str] | None:
         return float(stated), ""
     if scene.loads.has_bearing:
         return None
-    radius = (3.0 * float(np.mean(np.asarray(scene.loads.mass))) / (4.0 * math.pi * _STEEL)) ** (1.0 / 3.0)
+    radius = (3.0 * float(np.mean(np.asarray(scene.loads.mass))) / (4.0 * math.pi * _STEEL_DENSITY)) ** (1.0 / 3.0)
     return radius, f"balls of steel of this mass have the radius {1e3 * radius:.3g} mm; "
 
 

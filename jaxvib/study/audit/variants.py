@@ -81,8 +81,8 @@ def require_absent(scene: Scene, possible: Sequence[Effect]) -> None:
     present = {effect.kind for effect in scene.all_effects if not effect.repeatable}
     for k, effect in enumerate(possible):
         if effect.kind in present:
-            problem = f"is {effect.kind}, which the scene has already; leave it out, an audit removes each effect of the scene"
-            raise InputError(f"possible[{k}]", problem)
+            problem = f"is {effect.kind}, which the scene has already; leave it out"
+            raise InputError(f"possible[{k}]", f"{problem}, because an audit removes each effect of the scene")
 
 
 def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[Effect] | None) -> Iterator[Variant]:

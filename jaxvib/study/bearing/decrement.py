@@ -201,7 +201,8 @@ def _longest_regular_sequence(t: np.ndarray, peaks: list[int]) -> list[int]:
 def require_uncertainty(instrument: object) -> None:
     """**Raises** `InputError` for a relative uncertainty of J that is not a number of at least 0 and less than 1."""
     if not isinstance(instrument, (int, float)) or not 0.0 <= instrument < 1.0:
-        raise InputError("instrument", f"is {quoted(instrument)}; the relative uncertainty of J is at least 0 and less than 1")
+        problem = "it is the relative uncertainty of J and must be at least 0 and less than 1"
+        raise InputError("instrument", f"is {quoted(instrument)}; {problem}")
 
 
 @validated
@@ -262,10 +263,10 @@ def ten_periods(
     slopes = np.zeros((pairs, turns.angle.size))
     signs = np.sign(np.diff(turns.angle))
     for k in range(pairs):
-        for where, sign in ((k, 1.0), (k + n, -1.0)):
-            change = sign * factor[k] * signs[where] * float(_slope(a[where])) / 4.0
-            slopes[k, where + 1] += change
-            slopes[k, where] -= change
+        for j, sign in ((k, 1.0), (k + n, -1.0)):
+            change = sign * factor[k] * signs[j] * float(_slope(a[j])) / 4.0
+            slopes[k, j + 1] += change
+            slopes[k, j] -= change
     covariance = (slopes * turns.error**2) @ slopes.T
     value, error = float(np.mean(estimates)), float(np.sqrt(np.mean(covariance)))
     variance_of_drift = covariance[0, 0] + covariance[-1, -1] - 2.0 * covariance[0, -1]

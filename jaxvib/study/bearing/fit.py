@@ -215,16 +215,16 @@ def _least_squares(
         damping = jnp.where(better, 0.1 * damping, 10.0 * damping)
         cost, x, scaled_residual, jacobian, *_ = best
         basis, triangle = jnp.linalg.qr(jacobian)
-        reached = basis.T @ scaled_residual
+        projected = basis.T @ scaled_residual
         normal = triangle.T @ triangle
         damped = normal + damping * jnp.diag(jnp.diagonal(normal))
-        change = jnp.linalg.solve(damped, triangle.T @ reached)
+        change = jnp.linalg.solve(damped, triangle.T @ projected)
         variance = cost / (n - p) + floor
         # Squares of the lengths, in standard errors, of the damped and of the undamped step from the best point so far.
-        length_squared, next_step_squared = jnp.sum((triangle @ change) ** 2) / variance, jnp.sum(reached**2) / variance
+        length_squared, next_step_squared = jnp.sum((triangle @ change) ** 2) / variance, jnp.sum(projected**2) / variance
         return count + 1, x - change, damping, length_squared, *best, next_step_squared
 
-    none = (jnp.asarray(jnp.inf), start, jnp.zeros(size), jnp.zeros((size, p)), jnp.asarray(jnp.nan), jnp.zeros(size))
-    far = jnp.asarray(jnp.inf)
-    end = jax.lax.while_loop(is_unfinished, step, (jnp.asarray(0), start, jnp.asarray(0.1), far, *none, far))
+    no_best = (jnp.asarray(jnp.inf), start, jnp.zeros(size), jnp.zeros((size, p)), jnp.asarray(jnp.nan), jnp.zeros(size))
+    infinite = jnp.asarray(jnp.inf)
+    end = jax.lax.while_loop(is_unfinished, step, (jnp.asarray(0), start, jnp.asarray(0.1), infinite, *no_best, infinite))
     return end[5], end[6], end[7], (end[8], end[9]), end[-1] < 1e-2

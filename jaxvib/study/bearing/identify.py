@@ -33,8 +33,8 @@ _PATTERN_PROBABILITY = 1e-5
 """Probability with which the F test of residuals that are pure noise gives the status `patterned`."""
 
 _MAX_FREQUENCY_DIFFERENCE = 0.05
-"""Largest relative difference between the fitted frequency and that of the pendulum, without the part due to the instruments,
-that errors of length and mass can explain. A larger difference gives the status `contradicted`."""
+"""Largest relative difference between the fitted frequency and that of the pendulum, in addition to the argument `instrument`.
+A larger difference gives the status `contradicted`."""
 
 
 class IdentifyStatus(eqx.Enumeration):
@@ -299,10 +299,10 @@ def _notes(result: Identified, *, is_patterned: bool) -> Iterator[str]:
 _LAWS = {"dry": "dry friction", "air": "drag of the air", "torque": "a constant torque"}
 """Parts of the law other than viscous friction, by the argument of `identify` that adds them."""
 
-_CLEARLY = 4.0
+_MIN_STANDARD_ERRORS = 4.0
 """Distance of a coefficient from 0, in standard errors, above which its part of the law is named."""
 
-_LESS_NOISE = 0.9
+_MAX_NOISE_RATIO = 0.9
 """A law with further parts fits clearly better if it reduces the residuals to less than this fraction."""
 
 
@@ -318,14 +318,14 @@ def _better_law(result: Identified, weight: Array, start: Unknowns, width: Array
     time = jnp.asarray(record.time - record.time[0])
     fit = fit_swing(pendulum, time, jnp.asarray(record.angle), weight, start, width, steps)
     used = np.asarray(weight) > 0.0
-    if not bool(fit.converged) or float(fit.noise) > _LESS_NOISE * result.noise:
+    if not bool(fit.converged) or float(fit.noise) > _MAX_NOISE_RATIO * result.noise:
         return
     covariance = colored_covariance(np.asarray(fit.slopes)[used], np.asarray(fit.residual)[used])
     values, errors = fit.unknowns.friction, Friction(*np.sqrt(np.diagonal(covariance))[4:])
     needed = []
     for name in missing:
         value, error = float(getattr(values, name)), float(getattr(errors, name))
-        if abs(value) > _CLEARLY * error and (name == "torque" or value > 0.0):
+        if abs(value) > _MIN_STANDARD_ERRORS * error and (name == "torque" or value > 0.0):
             needed.append(name)
     if needed:
         words, options = (

@@ -23,7 +23,7 @@ _NAMES = {"time": ("time", "t", "zeit", "время"), "angle": ("angle", "phi",
 
 _SI = {"time": "s", "angle": "rad"}
 
-_EXAMPLES = {"time": "s, ms, us or min", "angle": "rad, mrad, deg, gon or turn"}
+_ALLOWED_UNITS = {"time": "s, ms, us or min", "angle": "rad, mrad, deg, gon or turn"}
 
 
 class Record(Readable):
@@ -176,5 +176,5 @@ def _columns(table: TextTable, requested: Sequence[str] | None, angle_unit: str 
 def _factor(unit: str, what: str, field: str) -> float:
     factor = unit_factor(unit, _SI[what])
     if factor is None:
-        raise InputError(field, f"is {quoted(unit)}, which is not a unit of {what} here; write {_EXAMPLES[what]}")
+        raise InputError(field, f"is {quoted(unit)}, which is not a unit of {what} here; write {_ALLOWED_UNITS[what]}")
     return factor

@@ -304,21 +304,21 @@ def swing_states(
         event=None if margin is None else diffrax.Event(margin, root_finder=optx.Bisection(1e-12, 1e-12, flip=True)),
     )
     assert solution.ts is not None and solution.ys is not None
-    (f, slip), ((end,), (end_slip,)) = solution.ys
+    (f, rates), ((end,), (end_rate,)) = solution.ys
     stopped = solution.result == diffrax.RESULTS.event_occurred
     last = solution.ts[1][0]
     if dry is not None and free is not None:
         last, stopped = jnp.where(free, last, times[0]), stopped | ~free
-        last, rest = _motion_to_rest(pendulum, friction, dry, times, last, (end, end_slip))
+        last, rest = _motion_to_rest(pendulum, friction, dry, times, last, (end, end_rate))
         is_after_stop = stopped & ~jnp.isfinite(f)
-        f, slip = (jnp.where(is_after_stop, value, before) for value, before in zip(rest, (f, slip), strict=True))
+        f, rates = (jnp.where(is_after_stop, value, before) for value, before in zip(rest, (f, rates), strict=True))
     finished = stopped | (solution.result == diffrax.RESULTS.successful)
     is_usable = exists & finished
     return Swing(
         status=_status(exists, finished, stopped),
         time=times,
         angle=jnp.where(is_usable, f, jnp.nan),
-        rate=jnp.where(is_usable, slip, jnp.nan),
+        rate=jnp.where(is_usable, rates, jnp.nan),
         stopped_at=jax.lax.stop_gradient(jnp.where(stopped, last, jnp.nan)),
         width=jnp.full_like(frequency, jnp.nan) if width is None else width,
         steps=solution.stats["num_steps"],
@@ -349,8 +349,8 @@ def _margin_to_rest(pendulum: BearingPendulum, friction: Friction, dry: Array, w
     """
 
     def moving(t: RealScalarLike, y: _Pair, args: None, **_: object) -> Array:
-        f, slip = y
-        slow = jnp.abs(slip) - 3.0 * width
+        f, rate = y
+        slow = jnp.abs(rate) - 3.0 * width
         lean = jnp.tan(f)
         if friction.torque is not None:  # gravity without the part that balances the torque
             lean = lean - friction.torque / (pendulum.mass * pendulum.g * pendulum.length * jnp.cos(f))
@@ -369,17 +369,17 @@ def _rates(
     """
 
     def rates(t: RealScalarLike, y: _Pair, args: None) -> _Pair:
-        f, slip = y
-        torque = -pendulum.mass * pendulum.g * pendulum.length * jnp.sin(f) - friction.viscous * slip
+        f, rate = y
+        torque = -pendulum.mass * pendulum.g * pendulum.length * jnp.sin(f) - friction.viscous * rate
         if friction.air is not None:
-            torque = torque - friction.air * jnp.abs(slip) * slip
+            torque = torque - friction.air * jnp.abs(rate) * rate
         if friction.torque is not None:
             torque = torque + friction.torque
         dry = friction.dry
         if dry is None or width is None or free is None:
-            return slip, torque / pendulum.total_inertia
-        torque = torque - dry_lever(dry, pendulum.diameter, slip, width) * jnp.abs(pendulum.radial_load(f, slip))
-        return jnp.where(free, slip, 0.0), jnp.where(free, torque / pendulum.total_inertia, 0.0)
+            return rate, torque / pendulum.total_inertia
+        torque = torque - dry_lever(dry, pendulum.diameter, rate, width) * jnp.abs(pendulum.radial_load(f, rate))
+        return jnp.where(free, rate, 0.0), jnp.where(free, torque / pendulum.total_inertia, 0.0)
 
     return rates
 
@@ -392,13 +392,13 @@ def _motion_to_rest(
     The motion continues from the state `y` at the time `last`. With the exact sign of dry friction it is a harmonic motion
     about that boundary of the dead zone which lies behind the moving pendulum.
     """
-    (end, end_slip), frequency = y, pendulum.frequency
-    direction = jnp.where(end_slip < 0.0, -1.0, 1.0)
+    (end, end_rate), frequency = y, pendulum.frequency
+    direction = jnp.where(end_rate < 0.0, -1.0, 1.0)
     centre = -direction * pendulum.dead_zone(dry)
     if friction.torque is not None:
         rest = pendulum.rest_angle(friction.torque)
         centre, frequency = centre + rest, frequency * jnp.sqrt(jnp.cos(rest))
-    radius = jnp.hypot(end - centre, end_slip / frequency)
-    last = last + jnp.arctan2(jnp.abs(end_slip) / frequency, jnp.abs(end - centre)) / frequency
+    radius = jnp.hypot(end - centre, end_rate / frequency)
+    last = last + jnp.arctan2(jnp.abs(end_rate) / frequency, jnp.abs(end - centre)) / frequency
     phase = frequency * jnp.maximum(last - times, 0.0)
     return last, (centre + direction * radius * jnp.cos(phase), direction * radius * frequency * jnp.sin(phase))

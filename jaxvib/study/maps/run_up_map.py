@@ -132,8 +132,8 @@ def run_up_map(
     - `until`: end time, s or text; the regime is that of the last turns of the run (see `simulate`); typical: 5 to 20 s
     - `drag`: values of the drag b_W of all loads, N s/m; default: the value of the scene; typical: 5 to 20 values from 0.05 to
       5 N s/m
-    - `starts`: number of sets of random angles, uniform over the circle; typical: 32 to 1000. A share differs from
-      its limit for many starts by less than about 1 / sqrt(starts), with a probability of 95 %
+    - `starts`: number of sets of random angles, uniform over the circle; typical: 32 to 1000. A share
+      differs from its value for infinitely many starts by less than about 1 / sqrt(starts), with a probability of 95 %
     - `seed` of the random angles
     - `angles` (sets, count), rad: sets of angles in place of random ones. Without `starts` and `angles` there is one set, at
       the bottom of the track with the `separation` of `simulate`

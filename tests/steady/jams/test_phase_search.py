@@ -90,9 +90,9 @@ def test_more_starts_than_fit_are_refused():
     fit = []
     for loads in (2, 6):
         scene = jv.Scene(MACHINE, jv.pendulums(count=loads, mass=0.05, radius=0.08, drag=0.04), SCENE.drive)
-        with pytest.raises(jv.InputError, match="at most fit") as error:
+        with pytest.raises(jv.InputError, match=r"at most \d+ fit") as error:
             jv.phase_jams(scene, starts=10**12)
-        fit.append(int(str(error.value).split("; ")[1].split()[0]))
+        fit.append(int(str(error.value).split("; ")[1].split()[2]))
     np.testing.assert_allclose(fit[0] / fit[1], 3.0, rtol=1e-3)
 
 

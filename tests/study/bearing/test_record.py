@@ -122,9 +122,9 @@ def test_wrong_records(tmp_path):
         jv.identify(ROD, jv.Record(t, 0.1 * np.cos(np.pi * t / 3.0)))
     with pytest.raises(jv.InputError, match=r"records\[0\] is .*; it must be a MeasuredRun"):
         jv.identify(ROD, (t, t))
-    with pytest.raises(jv.InputError, match=r"instrument is 2.0; the relative uncertainty of J"):
+    with pytest.raises(jv.InputError, match=r"instrument is 2.0; it is the relative uncertainty of J"):
         jv.identify(ROD, jv.Record(t, 0.01 * t), instrument=2.0)
-    with pytest.raises(jv.InputError, match=r"instrument is -1.0; the relative uncertainty of J"):
+    with pytest.raises(jv.InputError, match=r"instrument is -1.0; it is the relative uncertainty of J"):
         jv.ten_periods(ROD, jv.Record(t, 0.01 * t), instrument=-1.0)
     with pytest.raises(jv.InputError, match=r"pendulum.bearing is missing"):
         jv.identify(jv.BearingPendulum(0.3, 0.2), jv.Record(t, 0.01 * t), dry=True)
