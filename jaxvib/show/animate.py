@@ -71,11 +71,11 @@ def animate(
       four periods of an orbit
     - `seconds`: duration of the animation; at most 600 frames are possible; typical: 5 to 10; default: a duration with which
       the rotor turns by about a tenth of a turn between frames
-    - `fps`: frames per second; typical: 20 (the default). Drawing takes most of the computing time, in proportion to the number
-      of frames, `seconds` times `fps`
+    - `fps`: frames per second, 1 to 50; typical: 20 (the default). Drawing takes most of the computing time, in proportion to
+      the number of frames, `seconds` times `fps`
     - `magnify`: magnification of displacements relative to the circle of the loads; a note in the frame states it; typical: 1
       to 50; default: a factor with which the largest displacement is clearly visible
-    - `width` of the frame, inches (100 pixels each); typical: 6.4 (the default)
+    - `width` of the frame, 1 to 50 inches (100 pixels each); typical: 6.4 (the default)
 
     **Returns** a matplotlib animation, whose `save` writes further files. Repeated calls give identical files.
 
