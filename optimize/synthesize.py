@@ -37,7 +37,7 @@ from optimize.result import Limit, Outcome, Row, Synthesis, SynthesisStatus, amp
 from optimize.search.find import Options, Searcher, SearchResult, choose, require_searcher
 from optimize.search.polish import FEASIBILITY_TOLERANCE
 from optimize.search.problem import Problem, evaluate_quantities, problem_of, scenes_of
-from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours
+from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours, numbers_to_free
 from optimize.space import DesignSpace
 
 _CONVERGED_DECREASE = 1e-6
@@ -51,6 +51,9 @@ _INITIAL_SPREAD = 1e-3
 
 _SAME_MOTION = 1e-2
 """Difference of amplitudes, relative to the largest, below which a run has settled in the working regime."""
+
+_MIN_SHOWN_SHORTFALL = 1e-3
+"""Smallest relative violation of a demand for which parameters that would help are named."""
 
 Progress = Callable[[str, float], None]
 
@@ -146,7 +149,7 @@ def synthesize(
     reports = _values_of_all((*(q for _, q in named), objective, *demand_sides), initial_space.scene, neighbour_scenes, problem)
     limits = limits_of(problem, demands, result, reports[1, len(named) + 1 :].reshape(-1, 2))
     if throw and status is SynthesisStatus.contradictory:
-        raise _unmet(limits)
+        raise _unmet(limits, space, scene, [*(held.quantity for held in space.held), *(demand.quantity for demand in demands)])
     report("integrating the best machine" if verify else "computing quantities", 0.9)
     verify = verify and not why_unverified
     run, unverified = (None, why_unverified) if why_unverified else _run(scene, motion, verify)
@@ -186,9 +189,17 @@ def _report(progress: Progress | None, search_share: float, what: str, share: fl
         call_user(progress, "progress", what, shown)
 
 
-def _unmet(limits: tuple[Limit, ...]) -> ComputationError:
+def _unmet(limits: Sequence[Limit], space: DesignSpace, scene: Scene, quantities: Sequence[Quantity]) -> ComputationError:
+    """Return the error for a best design that does not meet all limits, the first of which are those of `quantities`."""
     unmet = "; ".join(f"{x.what}: {x.shortfall()}" for x in limits if x.violation)
     hint = f" (not met by the nearest machine: {unmet}); widen the bounds or relax a demand"
+    effects = [
+        f"on {quantity.words}: {numbers}"
+        for limit, quantity in zip(limits, quantities, strict=False)
+        if _MIN_SHOWN_SHORTFALL < limit.violation < math.inf
+        and (numbers := numbers_to_free(space, scene, quantity, limit.limit))
+    ]
+    hint += f", or free other parameters (effects {'; '.join(effects)})" if effects else ""
     return failure(SynthesisStatus.contradictory, hint)
 
 

@@ -75,6 +75,17 @@ def test_contradictory_demands_are_named_with_their_excess():
         found(space, NEAREST, subject_to=demands)
 
 
+@pytest.mark.parametrize(("limit", "advice"), [("150 N/mm", "1 % less: +1.8 %"), ("5 N/mm", "1 % more: -1.8 %")])
+def test_contradictory_demands_name_parameters_that_would_help(limit, advice):
+    """The quantity is k1 / m^1.8, with the mass relative to that of the scene."""
+    mass = SCENE.machine.mass[0]
+    quantity = Quantity("share", "N/m", lambda s: s.machine.stiffness[0] / (s.machine.mass[0] / mass) ** 1.8)
+    demand = quantity > limit if limit == "150 N/mm" else quantity < limit
+    with pytest.raises(jv.ComputationError) as error:
+        found(DesignSpace(SCENE, FREE), NEAREST, subject_to=[demand])
+    assert str(error.value).endswith(f"or free other parameters (effects on share: machine.mass ({advice}))")
+
+
 def both_ways(name, function):
     return [plain(f"{sign} {name}", lambda x, y, sign=sign: sign * function(x, y)) for sign in (1.0, -1.0)]
 
