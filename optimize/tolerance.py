@@ -16,8 +16,8 @@ from jaxvib.machine.files import suggest_name
 from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, present_numbers, put_numbers, put_present
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Bounds, count, number
-from optimize.quantities.cases import Sampled, require_single_tolerances
-from optimize.quantities.quantity import Demand, Quantity
+from optimize.quantities.cases import Robust, Sampled, require_single_tolerances
+from optimize.quantities.quantity import Demand, Quantity, walk
 
 _SHORT_NAMES = {
     "stiffness": re.compile(r"machine\.(link_|supports\[\d+\]\.)?stiffness(_up)?(\[\d+\])?"),
@@ -31,6 +31,9 @@ _SHORT_NAMES = {
 _PERCENT = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*%")
 _RANGE = re.compile(r"(.+?)\.\.(.+)")
 _MATERIAL = re.compile(r"material(?:\[(\d+)\])?")
+
+_STATISTIC = re.compile(r"\b(worst|expected|\d+% quantile of) ")
+"""Pattern of the names of statistics over machines."""
 
 _DEFAULT_SAMPLES = 128
 
@@ -114,9 +117,16 @@ def tolerance_ranges(
         worst = np.nan if not existing.size else np.min(existing) if at_least else np.max(existing)
         design = float(quantity(scene))
         ranges.append(
-            ToleranceRange(item.words, quantity.unit, design, float(low), float(high), float(worst), float(np.mean(is_met)))
+            ToleranceRange(_words(item), quantity.unit, design, float(low), float(high), float(worst), float(np.mean(is_met)))
         )
     return ranges
+
+
+def _words(item: Quantity | Demand) -> str:
+    """Return the name of a quantity or demand for a single machine, without the name of a statistic over machines."""
+    quantity = item.quantity if isinstance(item, Demand) else item
+    is_statistic = any(isinstance(part, Robust) for part in walk(quantity))
+    return _STATISTIC.sub("", item.words) if is_statistic else item.words
 
 
 def _value(quantity: Quantity, scene: Scene) -> float:

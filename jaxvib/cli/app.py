@@ -176,8 +176,11 @@ def tolerance_table(ranges: Sequence[ToleranceRange], tolerances: Sequence[str])
     rows = []
     for entry in ranges:
         unit, factor = shown_unit(entry.unit, max(abs(entry.design), abs(entry.high)))
-        values = [f"{factor * x:.4g}" for x in (entry.design, entry.low, entry.high, entry.worst)]
-        rows.append([f"{entry.words}, {unit}".rstrip(", "), *values, f"{100.0 * entry.share:.3g} %"])
+        span, words = (entry.low, entry.high), entry.words
+        if words.startswith("negative "):  # a quantity that is maximized
+            factor, span, words = -factor, span[::-1], words.removeprefix("negative ")
+        values = [f"{factor * x:.4g}" for x in (entry.design, *span, entry.worst)]
+        rows.append([f"{words}, {unit}".rstrip(", "), *values, f"{100.0 * entry.share:.3g} %"])
     head = ["leading order", "design", "95 % from", "to", "worst", "machines where it exists, or the demand is met"]
     return table(f"machines with {', '.join(tolerances)}", head, rows)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,11 @@ from jaxvib.cli.app import TOLERANCE, Output, app, require_tolerances, shared, t
 from jaxvib.cli.output import fields_of, note, write_file
 
 if TYPE_CHECKING:
-    from optimize import Demand, Design, Quantity, Synthesis
+    from optimize import Demand, Design, Quantity, Synthesis, ToleranceRange
+
+
+_MOST_MACHINES = 0.95
+"""Share of machines that should meet a demand; a smaller share is named."""
 
 
 @app.command("optimize")
@@ -78,7 +83,9 @@ def optimize(
         **({"chosen": chosen} if chosen else {}),
         **({"tolerances": [ranges_of_quantity._asdict() for ranges_of_quantity in ranges]} if tolerances else {}),
     }
-    parts = [*chosen, *([tolerance_table(ranges, tolerances)] if tolerances else [])]
+    parts = [*chosen]
+    if tolerances:
+        parts += [tolerance_table(ranges, tolerances), *_few_machines_texts(ranges, loaded.subject_to)]
     output.done(document, lambda: "\n".join([_text(best), *parts]), "optimize", best)
 
 
@@ -102,13 +109,24 @@ def _draw_working_regime(output: Output, design: Design, best: Synthesis) -> Non
 
 
 def _quantities_with_ranges(design: Design) -> list[Quantity | Demand]:
-    """Return the quantities and demands whose ranges within tolerances are shown: objective, foundation force, held quantities,
-    demands."""
+    """Return the quantities and demands whose ranges within tolerances are shown, each once: objective, foundation force, held
+    quantities, demands."""
     from optimize import foundation_force
 
-    mode = design.objective.mode
-    force = [foundation_force(mode=mode)] if mode is not None or design.space.scene.machine.places == "plane" else []
-    return [design.objective, *force, *(held.quantity for held in design.space.held), *design.subject_to]
+    objective = design.objective
+    is_moving = objective.mode is not None or design.space.scene.machine.places == "plane"
+    force = [foundation_force(mode=objective.mode)] if is_moving and objective.simplified.name != "foundation_force" else []
+    return [objective, *force, *(held.quantity for held in design.space.held), *design.subject_to]
+
+
+def _few_machines_texts(ranges: Sequence[ToleranceRange], demands: Sequence[Demand]) -> list[str]:
+    """Return a text for each demand that fewer than 95 % of the machines within tolerances meet. The ranges of the demands are
+    the last ones."""
+    return [
+        f"only {100.0 * each.share:.3g} % of these machines meet this demand: {each.words}"
+        for each in ranges[len(ranges) - len(demands) :]
+        if each.share < _MOST_MACHINES
+    ]
 
 
 def _document(best: Synthesis) -> dict:

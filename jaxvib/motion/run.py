@@ -22,7 +22,7 @@ from jaxvib.machine.carrier import on_body, read_place
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import start_notes
-from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory, turning_masses
+from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory, duration_text, turning_masses
 from jaxvib.motion.analysis.points import (
     PointMotion,
     absent_vibration,
@@ -193,7 +193,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """
         self.require_single()
         if not self._has_end:
-            cost = f"{int(self.evaluations)} evaluations, {float(self.seconds):.3g} s"
+            cost = f"{int(self.evaluations)} evaluations in {float(self.seconds):.3g} s"
             return f"{self.message}: amplitudes, speeds and forces are unknown after {int(self.steps)} steps\n  {cost}"
         error = f"estimated error of the states in the window, phase included, {float(self.error):.1e}"
         error = "error not estimated" if np.isnan(self.error) else error
@@ -216,9 +216,9 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         return "\n".join(
             [
                 *first,
-                f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
+                f"{end}: {duration_text(self.scene, self.window.time[-1])}, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
-                f"  {error}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
+                f"  {error}; {int(self.evaluations)} evaluations in {float(self.seconds):.3g} s",
                 *([] if self.window.time.dtype.itemsize >= 8 else [_SINGLE_PRECISION]),
                 *([] if self.settled else [self._window_text()]),
                 f"  {self.speeds_text(self.scene, self.window.rotor_speeds)}",

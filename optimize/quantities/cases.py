@@ -189,7 +189,8 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
         raise InputError("changes", f"is {quoted(changes)}; it must be a dictionary such as {{'drive.speed': '1200 rpm'}}")
     values = tuple((key, read_value(key, value)) for key, value in changes.items())
     case = Changed(name, values)
-    return Under(f"{quantity.words} ({name})", quantity.unit, of=quantity.of, case=case, parts=(quantity,))
+    words = f"{quantity.words} ({name})"
+    return Under(words, quantity.unit, mode=quantity.mode, of=quantity.of, case=case, parts=(quantity,))
 
 
 def _robust(
@@ -208,6 +209,7 @@ def _robust(
     return Robust(
         f"{words} {quantity.words}",
         quantity.unit,
+        mode=quantity.mode,
         of=quantity.of,
         case=case,
         parts=(quantity,),

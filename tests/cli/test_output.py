@@ -8,7 +8,10 @@ import pytest
 from matplotlib.figure import Figure
 
 import jaxvib as jv
+from jaxvib.cli.app import tolerance_table
+from jaxvib.cli.optimize import _few_machines_texts, _quantities_with_ranges
 from jaxvib.cli.output import Output
+from optimize import Design, DesignSpace, ToleranceRange, amplitude, foundation_force, worst
 
 
 def full_disk(*arguments, **_):
@@ -45,3 +48,26 @@ def test_a_report_has_the_requested_title(tmp_path, title, heading):
     page = (tmp_path / "report.html").read_text()
     assert f"<h1>{heading}</h1>" in page and ("<p>A. Author</p>" in page) == (title is not None)
     assert "<code>jaxvib simulate</code>" in page
+
+
+def test_ranges_of_a_maximized_quantity_are_positive():
+    text = tolerance_table([ToleranceRange("negative stroke", "m", -0.034, -0.035, -0.033, -0.032, 1.0)], ["mass=1%"])
+    row = next(line for line in text.splitlines() if "stroke" in line)
+    assert [cell.strip() for cell in row.strip("│ ").split("│")] == ["stroke, mm", "34", "33", "35", "32", "100 %"]
+
+
+@pytest.mark.parametrize(
+    ("share", "says"), [(0.95, []), (0.603, ["only 60.3 % of these machines meet this demand: b at most 1 m"])]
+)
+def test_demands_that_few_machines_meet_are_named(share, says):
+    ranges = [ToleranceRange(name, "m", 1.0, 1.0, 1.0, 1.0, x) for name, x in (("a", 0.1), ("b at most 1 m", share))]
+    assert _few_machines_texts(ranges, [amplitude(mode=1) < 1.0]) == says
+
+
+@pytest.mark.parametrize(("objective", "count"), [(foundation_force(mode=1), 1), (amplitude(mode=1), 2)])
+def test_ranges_name_the_foundation_force_once(objective, count):
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
+    space = DesignSpace(scene, free={"machine.stiffness": (1e4, 1e5)})
+    for each in (objective, worst(objective, {"machine.mass": 0.1})):
+        assert len(_quantities_with_ranges(Design(space, each, (), {}))) == count

@@ -16,6 +16,7 @@ from jaxvib.equations.dynamics import Dynamics
 from jaxvib.equations.model import Model
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
+from jaxvib.machine.drives.drive import SpinUp
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import NODES, between, extremum_value, locate_extrema, step_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
@@ -144,6 +145,12 @@ class AbstractMeasured(Readable):
         if np.ptp(magnitudes) <= _MAX_SPREAD_OF_MEAN * np.max(magnitudes):
             each = f"{speed_text(self.omega, 6)} (each: {each})"
         return f"{turning_masses(scene)} turn at {each}{rotor}"
+
+
+def duration_text(scene: Scene, end: Array) -> str:
+    """Return the time at which a run ends, and the duration of its spin-up, as text."""
+    spin_ups = [float(each.drive.duration) for each in scene.exciters if isinstance(each.drive, SpinUp)]
+    return f"{float(end):.6g} s" + (f" (spin-up during the first {max(spin_ups):.4g} s)" if spin_ups else "")
 
 
 def turning_masses(scene: Scene) -> str:

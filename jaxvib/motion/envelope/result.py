@@ -20,7 +20,7 @@ from jaxvib.machine.effects.terms import ContactFriction, RotorImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.motion.analysis.measure import AbstractMeasured, only_exciter_value
+from jaxvib.motion.analysis.measure import AbstractMeasured, duration_text, only_exciter_value
 from jaxvib.motion.analysis.points import absent_vibration, measures_text, require_vibration
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.results.fields import in_unit, part
@@ -190,7 +190,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         return "\n".join(
             [
                 *first,
-                f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
+                f"{end}: {duration_text(self.scene, self.window.time[-1])}, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  {self.speeds_text(self.scene, self.window.rotor_speeds)}",
                 f"  {self.amplitude_text(self.scene)}",

@@ -343,6 +343,12 @@ def run_of(status="done", drift=1e-4, trajectory=None):
     )
 
 
+def test_summary_states_the_duration_of_a_spin_up():
+    run = run_of()
+    run = eqx.tree_at(lambda r: r.scene.exciters[0].drive, run, jv.SpinUp(60.0, "2.5 s"))
+    assert ": 5 s (spin-up during the first 2.5 s), 31 steps" in run.summary()
+
+
 def test_summary_of_a_run():
     lines = run_of().summary().splitlines()
     assert lines[0] == "the averaged run reached its end: 5 s, 31 steps (4 rejected), settled (drift 1.0e-04)"

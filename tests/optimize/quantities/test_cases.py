@@ -9,7 +9,7 @@ from scenes import scene
 from scipy.stats import norm
 
 import jaxvib as jv
-from optimize import DesignSpace, Quantity, expected, jam_frequency, largest, quantile, under, worst
+from optimize import DesignSpace, Quantity, amplitude, expected, jam_frequency, largest, quantile, total, under, worst
 from optimize.quantities.evaluation import Evaluation
 from optimize.search.problem import evaluate, find_speeds, problem_of
 
@@ -109,3 +109,12 @@ def test_cases_add_no_springs():
     assert float(under(budget, "x", {"machine.stiffness": 2.0})(chain)) == 2.0 * 11001.0
     assert float(under(budget, "x", {"machine.stiffness": 2.0, "machine.stiffness[1]": 3.0})(chain)) == 2.0 * 11001.0 + 30.0
     assert float(under(Quantity("d", "", lambda s: s.loads.drag), "x", {"loads.drag": 7.0})(chain)) == 7.0
+
+
+@pytest.mark.parametrize(
+    "change", [lambda q: worst(q, {"machine.mass": 0.1}), lambda q: under(q, "loaded", {"machine.mass": 70.0})]
+)
+def test_a_quantity_of_other_machines_has_the_mode_of_its_quantity(change):
+    """The search verifies its best machine in this mode."""
+    assert change(amplitude(mode=1)).mode == (-change(-amplitude(mode=1))).mode == 1
+    assert change(total("machine.stiffness")).mode is None
