@@ -371,11 +371,22 @@ def test_file_and_back_is_bit_for_bit(result, tmp_path):
     path = result.save(tmp_path / "answer")
     assert path.suffix == ".npz"
     alike(jv.load(path), result)
+    assert (jv.load(path) == result) is True
     with jax.enable_x64(False):  # single precision, which could not hold them
         alike(type(result).load(path), result)
     other = "Orbit" if type(result) is jv.Jam else "Jam"
     with pytest.raises(jv.InputError, match=f"it contains a result of class .*, not {other}|not a result"):
         (jv.Orbit if type(result) is jv.Jam else jv.Jam).load(path)
+
+
+def test_results_are_equal_if_all_fields_are():
+    def with_speeds(change):
+        return eqx.tree_at(lambda m: m.omega, RESULTS["JamModes"](), change(RESULTS["JamModes"]().omega))
+
+    one = with_speeds(lambda omega: omega.at[0].set(jnp.nan))
+    assert one == with_speeds(lambda omega: omega.at[0].set(jnp.nan))
+    assert one != with_speeds(lambda omega: omega) and one != with_speeds(lambda omega: omega[1:]) and one != "modes"
+    assert bool(jax.jit(lambda a: with_speeds(lambda _: a) == with_speeds(lambda _: 1.0 * a))(one.omega[1:]))
 
 
 def test_every_result_class_is_final_and_is_in_this_file():

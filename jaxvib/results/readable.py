@@ -20,7 +20,8 @@ value are shown."""
 
 
 class Readable(eqx.Module):
-    """Base of results, of their parts and of other objects with arrays: `repr` shows values with units.
+    """Base of results, of their parts and of other objects with arrays: `repr` shows values with units, and `==` is True if all
+    fields are equal, with NaN equal to NaN.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> jv.State(jnp.array([0.0012, -0.0004]), jnp.zeros(2), angle=(jnp.arange(100.0),), rate=(jnp.full(100, 60.0),))
@@ -41,6 +42,19 @@ class Readable(eqx.Module):
         if summary is not None and is_single(self):
             return summary()
         return "\n".join([f"{type(self).__name__}:", *_lines(self)])
+
+    def __eq__(self, other: object) -> Any:
+        """Return True if the other object has the same class and equal fields; a traced value in traced objects."""
+        if type(other) is not type(self):
+            return NotImplemented
+        (leaves, structure), (leaves_of_other, structure_of_other) = jax.tree.flatten(self), jax.tree.flatten(other)
+        if structure != structure_of_other:
+            return False
+        if not (_has_values(self) and _has_values(other)):
+            return eqx.tree_equal(self, other)
+        return all(map(_is_equal, leaves, leaves_of_other))
+
+    __hash__ = eqx.Module.__hash__
 
 
 @np.errstate(over="ignore")
@@ -65,7 +79,13 @@ def values_text(values: object, unit: str = "") -> str:
     return f"{array.shape} {name}from {factor * np.min(span):.5g} to {factor * np.max(span):.5g} {shown}".rstrip()
 
 
-def _has_values(tree: eqx.Module) -> bool:
+def _is_equal(one: object, other: object) -> bool:
+    """Return True if two leaves have the same type, shape and values; NaN equals NaN."""
+    first, second = np.asarray(one), np.asarray(other)
+    return first.dtype == second.dtype and np.array_equal(first, second, equal_nan=first.dtype.kind in "fc")
+
+
+def _has_values(tree: Any) -> bool:
     """Return True if no number in the tree is traced."""
     try:
         for leaf in jax.tree.leaves(tree):

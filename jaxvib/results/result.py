@@ -31,6 +31,7 @@ class Result(Readable):
     - as text and figure: `summary()`, which is also the representation, and `plot()`
     - as data: plain values `as_dict()`, a table `to_pandas()`, a labelled dataset `to_xarray()`
     - in a file: `save(path)`, `load(path)`
+    - comparison: `==` is True if all fields are equal (of two runs also the computing time), with NaN equal to NaN
 
     The contents of data and files follow from the fields: the metadata of each field contain its unit and the names of its axes
     (`jaxvib.results.fields`). A result class is final: no other class inherits from it.
@@ -92,7 +93,10 @@ class Result(Readable):
 
     @final
     def as_dict(self) -> "dict[str, fields.Plain]":
-        """Return the result as plain Python values, ready for JSON, see `jaxvib.results.fields.as_dict`."""
+        """Return the result as plain Python values, ready for JSON, see `jaxvib.results.fields.as_dict`.
+
+        These values do not determine the result: the way to store a result and to read it back is `save` and `load`.
+        """
         return fields.as_dict(self)
 
     @final
