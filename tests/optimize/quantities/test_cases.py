@@ -114,7 +114,7 @@ def test_cases_add_no_springs():
 @pytest.mark.parametrize(
     "change", [lambda q: worst(q, {"machine.mass": 0.1}), lambda q: under(q, "loaded", {"machine.mass": 70.0})]
 )
-def test_a_quantity_of_other_machines_has_the_mode_of_its_quantity(change):
+def test_statistics_have_the_mode_of_their_quantity(change):
     """The search verifies its best machine in this mode."""
     assert change(amplitude(mode=1)).mode == (-change(-amplitude(mode=1))).mode == 1
     assert change(total("machine.stiffness")).mode is None
