@@ -8,10 +8,12 @@ bounds, units and names of parameters.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 import numbers
 import os
+import sys
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -126,18 +128,71 @@ def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> 
     annotations = {}
     for name, parameter in signature.parameters.items():
         kind = Any if parameter.annotation is parameter.empty else parameter.annotation
-        names = dict(inspect.unwrap(function).__globals__)
-        for _ in range(6):  # the value of an alias may be a string too, and some names are imported by type checkers only
-            if not isinstance(kind, str):
-                break
-            try:
-                kind = eval(kind, names)  # safe, because annotations are code of this package
-            except NameError as error:
-                names[error.name or ""] = Any
-            except (TypeError, AttributeError):
-                kind = Any
-        annotations[name] = Any if isinstance(kind, str) else kind
+        annotations[name] = _resolved(kind, inspect.unwrap(function).__globals__)
     return annotations
+
+
+def _resolved(kind: Any, names: Mapping[str, Any]) -> Any:
+    """Return an annotation without strings, and `Any` for one that only type checkers can resolve."""
+    names = dict(names)
+    for _ in range(6):  # the value of an alias may be a string too, and some names are imported by type checkers only
+        if not isinstance(kind, str):
+            break
+        try:
+            kind = eval(kind, names)  # safe, because annotations are code of this package
+        except NameError as error:
+            names[error.name or ""] = Any
+        except (TypeError, AttributeError):
+            kind = Any
+    return Any if isinstance(kind, str) else kind
+
+
+def require_fields(part: Any, place: str) -> None:
+    """Check the fields of a dataclass, and of those in it, against their annotations.
+
+    Numbers may have any value and shape, and may be traced. **Raises** `InputError` for other objects.
+
+    **Arguments**: `part`, an instance of a dataclass; `place`: its name in messages.
+
+    >>> import equinox as eqx, jaxvib as jv
+    >>> require_fields(eqx.tree_at(lambda motor: motor.speed, jv.ConstantSpeed(60.0), 1j), "drive")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: drive.speed is 1j, which is not a number; give a number in SI units
+    """
+    for name, kind in _kinds_of_fields(type(part)).items():
+        value, field, kinds = getattr(part, name), f"{place}.{name}", _alternatives(kind)
+        if any(map(_is_array, kinds)):
+            if not _is_number(value) and not (value is None and type(None) in kinds):
+                raise InputError(field, f"is {quoted(value)}, which is not a number; give a number in SI units")
+        elif any(typing.get_origin(each) is tuple for each in kinds) and isinstance(value, (list, np.ndarray)):
+            raise InputError(field, f"is {quoted(value)}; it must be a tuple")
+        else:
+            _require(value, kind, field)
+        entries = {f"{field}[{k}]": each for k, each in enumerate(value)} if isinstance(value, tuple) else {field: value}
+        for inner, each in entries.items():
+            if dataclasses.is_dataclass(each):
+                require_fields(each, inner)
+
+
+@functools.lru_cache(256)
+def _kinds_of_fields(owner: type) -> dict[str, Any]:
+    """Return the annotations of the fields of a dataclass."""
+    kinds = {}
+    for field in dataclasses.fields(owner):
+        base = next(each for each in owner.__mro__ if field.name in inspect.get_annotations(each))
+        kinds[field.name] = _resolved(field.type, vars(sys.modules[base.__module__]))
+    return kinds
+
+
+def _is_number(value: Any) -> bool:
+    """Return True for a number or an array of numbers that can be converted to floating-point numbers, and for traced ones."""
+    if not is_real(value) or np.ma.is_masked(value):
+        return False
+    try:
+        return isinstance(value, jax.Array) or np.asarray(value, dtype=float) is not None
+    except (TypeError, ValueError, OverflowError):
+        return False
 
 
 class _ByName(type):

@@ -379,6 +379,10 @@ def shapes_of(machine: Machine, at: Place = None) -> tuple[Carrier, Mount]:
     except InputError:
         machine.mount(at)  # raises the same error, which then names the place
         raise
+    except (TypeError, ValueError, IndexError) as error:
+        if not type(machine).__module__.startswith("jaxvib."):  # an error in a user's class
+            raise
+        raise InputError("machine", f"has an array of a shape that its constructor does not allow ({error})") from error
 
 
 def shape_and_dtype(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:

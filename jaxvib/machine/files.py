@@ -25,7 +25,7 @@ from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS
 from jaxvib.machine.loads import Loads, ball_mass, balls, pendulums, rollers
 from jaxvib.machine.numbers import PLAIN, NumberSpec, number_specs, with_display_units
-from jaxvib.machine.scene import Exciter, Scene, unbalance
+from jaxvib.machine.scene import Exciter, Scene, require_parts, unbalance
 from jaxvib.machine.structures.plane_body import body, plane_body, plane_network, support
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.structures.rotor import planar_rotor, rotor
@@ -439,6 +439,7 @@ def _si_numbers(spec: NumberSpec, value: Any) -> Any:
 
 
 def _scene_tables(scene: Scene, write: _Write) -> Tables:
+    require_parts(scene)
     tables: Tables = {"machine": _part_table("machine", scene.machine, write)}
     if len(scene.exciters) == 1 and scene.exciters[0].is_plain and scene.exciters[0].place is None:
         tables |= {"loads": _part_table("loads", scene.loads, write), "drive": _part_table("drive", scene.drive, write)}

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import is_real
+from jaxvib.boundary import is_real, require_fields
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine, Mount, Place, on_body, read_place, shapes_of
 from jaxvib.machine.drives.drive import Directed, Drive
@@ -249,6 +249,7 @@ class Scene(Part):
         exciters: Sequence[Exciter] | None = None,
     ):
         _require_part("machine", machine, Machine, "two_mass(...)")
+        require_fields(machine, "machine")
         effects = read_effects(effects)
         shared = tuple(effect for effect in effects if _acts_on_machine(effect))
         rotating = tuple(effect for effect in effects if not _acts_on_machine(effect))
@@ -261,7 +262,8 @@ class Scene(Part):
             exciters = (Exciter(loads, drive, effects=rotating),)
         else:
             exciters = _read_exciters(exciters, loads, drive, rotating)
-        for exciter in exciters:
+        for k, exciter in enumerate(exciters):
+            require_fields(exciter, f"exciters[{k}]")
             require_machine(machine, exciter.place)
         self.machine, self.exciters, self.effects = machine, exciters, shared
         for term in terms_of(self.all_effects, SupportForce):
@@ -371,6 +373,7 @@ class Scene(Part):
         >>> scene.replace(effects=(jv.Gravity(),)).all_effects[0].kind
         'gravity'
         """
+        require_parts(self)
         old = self.exciter
         all_parts = {"machine": self.machine, "loads": old.loads, "drive": old.drive, "effects": self.all_effects} | parts
         exciter = old.with_parts(all_parts.pop("loads"), all_parts.pop("drive"))
@@ -379,6 +382,19 @@ class Scene(Part):
     def prefix_of(self, k: int) -> str:
         """Return the prefix of the names of the parts of exciter `k`: "exciters[1].", or "" if there is one exciter."""
         return f"exciters[{k}]." if len(self.exciters) > 1 else ""
+
+
+def require_parts(scene: Scene) -> None:
+    """**Raises** `InputError` for an object of another class in place of a part or a number of the scene, which
+    `equinox.tree_at` does not check."""
+    try:
+        require_fields(scene, "scene")
+    except InputError as error:
+        one = isinstance(scene.exciters, tuple) and len(scene.exciters) == 1
+        name = error.field.replace("scene.exciters[0].", "scene.") if one else error.field
+        raise InputError(name, error.problem) from error
+    if not scene.exciters:
+        raise InputError("scene.exciters", "is empty; at least one Exciter is needed")
 
 
 def _require_anticlockwise(exciter: Exciter) -> Exciter:
@@ -487,6 +503,12 @@ def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
 def _require_comparable(
     count: int, platforms: np.ndarray | float | None, mass: np.ndarray | float, drag: np.ndarray | float | None, speed: float
 ) -> None:
+    for name, value in (("mass", mass), ("drag", drag)):
+        if value is not None and np.shape(value) not in ((), (count,)):
+            raise InputError(f"loads.{name}", f"is an array of shape {np.shape(value)}; the shape {(count,)} or () is needed")
+    if np.shape(speed):
+        raise InputError("drive.speed", f"is an array of shape {np.shape(speed)}; a single number is needed")
+    speed = float(speed)
     each = np.broadcast_to(np.asarray(mass, dtype=float), (count,))
     if platforms is not None:
         whole, total = float(np.sum(platforms)), float(np.sum(each))

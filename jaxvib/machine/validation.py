@@ -17,13 +17,12 @@ from jax import Array
 from jaxvib.boundary import call_user
 from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted, within
-from jaxvib.machine.carrier import Machine
+from jaxvib.machine.carrier import Machine, read_place
 from jaxvib.machine.drives.controlled import SwitchedOff
-from jaxvib.machine.drives.drive import Drive, Motor
-from jaxvib.machine.effects.base import Effect, static_imbalances, total_gravity
+from jaxvib.machine.drives.drive import Motor
+from jaxvib.machine.effects.base import static_imbalances, total_gravity
 from jaxvib.machine.files import rebuild_part
-from jaxvib.machine.loads import Loads
-from jaxvib.machine.scene import MAX_USUAL_SPEED, Exciter, Scene, read_unbalance, require_comparable
+from jaxvib.machine.scene import MAX_USUAL_SPEED, Exciter, Scene, read_unbalance, require_comparable, require_parts
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.units import conditions_of_traced_values
@@ -55,7 +54,7 @@ def validate_scene(scene: Scene) -> Scene:
     precision = float_dtype()
     if _VALID_SCENES.get((id(scene), precision)) is scene:
         return scene
-    _require_parts(scene)
+    require_parts(scene)
     leaves, structure = jax.tree_util.tree_flatten_with_path(scene)
     one = ".exciters[0]" if len(scene.exciters) == 1 else "-"
     arrays = [_number(f"scene{jax.tree_util.keystr(path).removeprefix(one)}", leaf) for path, leaf in leaves]
@@ -72,22 +71,6 @@ def validate_scene(scene: Scene) -> Scene:
                 _require_valid(_SceneKey(numbers, scene))
         _VALID_SCENES[id(scene), precision] = scene
     return scene
-
-
-def _require_parts(scene: Scene) -> None:
-    """**Raises** `InputError` for an object of another class in place of a part of the scene."""
-    for name, value, kind in (("exciters", scene.exciters, Exciter), ("effects", scene.effects, Effect)):
-        if not isinstance(value, tuple) or not all(isinstance(each, kind) for each in value):
-            raise InputError(f"scene.{name}", f"is {quoted(value)}; it must be a tuple of objects of the class {kind.__name__}")
-    if not scene.exciters:
-        raise InputError("scene.exciters", "is empty; at least one Exciter is needed")
-    parts: list[tuple[str, object, type]] = [("machine", scene.machine, Machine)]
-    for k, exciter in enumerate(scene.exciters):
-        parts.append((f"{scene.prefix_of(k)}drive", exciter.drive, Drive))
-        parts += [] if exciter.loads is None else [(f"{scene.prefix_of(k)}loads", exciter.loads, Loads)]
-    for name, value, kind in parts:
-        if not isinstance(value, kind):
-            raise InputError(name, f"is {quoted(value)}; it must be an object of the class {kind.__name__}")
 
 
 def require_double(scene: Scene, purpose: str) -> Scene:
@@ -353,7 +336,12 @@ def _rebuild(scene: Scene) -> None:
             _rebuild_part(exciter.drive, "drive")
             if (exciter.loads is not None, exciter.unbalance is not None) != tuple(x in exciter.carries for x in _CARRIED):
                 raise InputError("carries", f"is {exciter.carries}, but the exciter has other parts; create a new Exciter")
+            for name in ("unbalance", "unbalance_mass"):
+                if shape := np.shape(0.0 if (value := getattr(exciter, name)) is None else value):
+                    raise InputError(name, f"is an array of shape {shape}; the shape () is needed")
             read_unbalance(exciter.drive, exciter.unbalance, exciter.unbalance_mass)
+            read_place(exciter.at)
+            scene.machine.mounting(exciter.place)
             for effect in exciter.effects:
                 _rebuild_part(effect, f"effects.{effect.kind}")
     for effect in scene.effects:

@@ -53,8 +53,8 @@ def moving_svg(scene: Scene, jam: Jam) -> str:
     >>> moving_svg(scene, jv.jam_modes(scene).select(1)).count("<animate") > 10
     True
     """
-    scene = jax.device_get(scene)  # see `regime_svg`
-    view = view_of(drawable_scene(scene))
+    scene = jax.device_get(drawable_scene(scene))  # see `regime_svg`
+    view = view_of(scene)
     if not np.isfinite(jam.omega) or not np.isfinite(jam.displacement).all():
         raise ComputationError("absent", f"jam mode {int(jam.mode)} cannot be shown: {jam.message}")
     rotors = [(pose,) for pose in _rotor_poses(scene.exciters[0], np.zeros(scene.loads.count))]
@@ -82,8 +82,8 @@ def regime_svg(scene: Scene, regime: SynchronousRegime, points: Sequence[tuple[f
     >>> regime_svg(scene, jv.working_regime(scene), [(0.0, 0.0)]).count("<animate") > 10
     True
     """
-    scene = jax.device_get(scene)  # the drawing computes with single numbers, for which JAX arrays are slow
-    view = view_of(drawable_scene(scene))
+    scene = jax.device_get(drawable_scene(scene))  # the drawing computes with single numbers, for which JAX arrays are slow
+    view = view_of(scene)
     rotors = [*zip(*(_rotor_poses(scene.exciters[k], phases) for k, phases in _phases_of(scene, regime)), strict=True)]
     first = scene.exciters[0]
     has_unbalance = any(exciter.loads is None for exciter in scene.exciters)
@@ -157,6 +157,6 @@ def sketch_svg(scene: Scene) -> str:
     >>> "M = " in sketch_svg(jv.scene_from_toml(TEMPLATES["planar_rotor"]))
     True
     """
-    scene = jax.device_get(scene)  # see `regime_svg`
-    view, pose = view_of(drawable_scene(scene)), at_rest(scene)
+    scene = jax.device_get(drawable_scene(scene))  # see `regime_svg`
+    view, pose = view_of(scene), at_rest(scene)
     return svg(view.limits, [view.parts(pose, 0.0)], [view.texts(pose, 0.0)], caption(scene), _PERIOD_SECONDS, 0.0)

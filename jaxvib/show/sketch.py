@@ -14,6 +14,7 @@ from jaxvib.draw.machine.parts import Part, Text, draw_part
 from jaxvib.draw.style import COLORS, panels
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.show.view import View
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import at_rest, caption
@@ -59,7 +60,7 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
     >>> [text.get_text() for text in jv.sketch(scene).axes[0].texts][:2]
     ['40 N/mm\\n30 N s/m', 'M1 = 50 kg']
     """
-    view = view_of(drawable_scene(scene))
+    view = view_of(scene := drawable_scene(scene))
     pose, title = at_rest(scene), caption(scene)
     if deck is None and any(exciter.unbalance is None for exciter in scene.exciters):
         title += "\ngrey dot: mark on the rotor"
@@ -110,12 +111,10 @@ def _draw_deck(axis: Axes, view: View, deck: Deck, limits: Limits) -> None:
     axis.text(right, bottom, note, ha="right", va="bottom", fontsize="x-small", color="#555555")
 
 
-def drawable_scene(scene: object) -> Scene:
-    """Return the scene. **Raises** `InputError` for an object that is not a scene, and for a scene with traced numbers."""
-    if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
+def drawable_scene(scene: Scene) -> Scene:
+    """Return `validate_scene(scene)`. **Raises** `InputError` for a scene with traced numbers as well."""
     require_known(scene, "scene", "a drawing", "draw it outside")
-    return scene
+    return validate_scene(scene)
 
 
 def set_drawing_limits(axis: Axes, limits: Limits) -> None:

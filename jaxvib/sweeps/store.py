@@ -113,7 +113,7 @@ class Store:
             seals.seal_layout(part)
             os.rename(part, path)
         except OSError as error:
-            if not (path / seals.FOLDER).exists():
+            if not os.path.exists(path / seals.FOLDER):  # False for a name that is too long, unlike `Path.exists`
                 raise cannot_write(path, error) from error
         finally:
             shutil.rmtree(part, ignore_errors=True)

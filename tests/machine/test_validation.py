@@ -14,6 +14,7 @@ import jaxvib as jv
 from jaxvib.machine import validation as module
 from jaxvib.machine.files import SCREENS
 from jaxvib.machine.validation import implausible_numbers, lifting_torques, start_notes, validate_scene, weight_notes
+from jaxvib.show.moving import sketch_svg
 
 
 def changed(where, value, s=None):
@@ -259,18 +260,47 @@ def test_equal_motors_that_cannot_start_have_one_note():
 @pytest.mark.parametrize(
     ("where", "value", "says"),
     [
-        (lambda s: s.machine, None, "machine is None; it must be an object of the class Machine"),
-        (lambda s: s.exciters[0].drive, None, "drive is None; it must be an object of the class Drive"),
-        (lambda s: s.exciters[0].drive, "dc", "drive is 'dc'; it must be an object of the class Drive"),
-        (lambda s: s.exciters[0].loads, 1.0, "loads is 1.0; it must be an object of the class Loads"),
+        (lambda s: s.machine, None, "scene.machine is None; it must be a Machine, for example two_mass(...)"),
+        (lambda s: s.machine.stiffness, None, "scene.machine.stiffness is None, which is not a number; give"),
+        (
+            lambda s: s.machine.stiffness,
+            [4e4, [1.0]],
+            "scene.machine.stiffness is [40000.0, [1.0]], which is not",
+        ),
+        (lambda s: s.exciters[0].drive, None, "scene.drive is None; it must be a Drive, for example ConstantSpeed"),
+        (lambda s: s.exciters[0].drive, "dc", "scene.drive is 'dc'; it must be a Drive"),
+        (lambda s: s.exciters[0].drive.speed, 1j, "scene.drive.speed is 1j, which is not a number; give"),
+        (lambda s: s.exciters[0].loads, 1.0, "scene.loads is 1.0; it must be a Loads, for example balls(...)"),
         (lambda s: s.exciters, (), "scene.exciters is empty; at least one Exciter is needed"),
-        (lambda s: s.exciters, None, "scene.exciters is None; it must be a tuple of objects of the class Exciter"),
-        (lambda s: s.exciters, (1,), "scene.exciters is (1,); it must be a tuple of objects of the class Exciter"),
-        (lambda s: s.effects, None, "scene.effects is None; it must be a tuple of objects of the class Effect"),
-        (lambda s: s.effects, (1,), "scene.effects is (1,); it must be a tuple of objects of the class Effect"),
-        (lambda s: s.loads.drag, 10**400, "scene.loads.drag is a whole number of 1329 bits, which is not a number"),
+        (lambda s: s.exciters, None, "scene.exciters is None; it must be a list of values"),
+        (lambda s: s.exciters, (1,), "scene.exciters[0] is 1; it must be an Exciter"),
+        (lambda s: s.effects, None, "scene.effects is None; it must be a list of values"),
+        (lambda s: s.effects, [], "scene.effects is []; it must be a tuple"),
+        (lambda s: s.effects, (1,), "scene.effects[0] is 1; it must be an Effect"),
+        (lambda s: s.loads.drag, 10**400, "scene.loads.drag is a whole number of 1329 bits, which is not a number; give"),
+        (lambda s: s.loads.drag, range(10**9), "scene.loads.drag is range(0, 1000000000), which is not a number; give"),
     ],
 )
 def test_other_objects_in_place_of_parts_are_refused(where, value, says):
+    scene = changed(where, value)
+    for use in (validate_scene, jv.sketch, sketch_svg, jv.scene_to_toml, lambda scene: scene.replace(effects=())):
+        with pytest.raises(jv.InputError, match=f"^{re.escape(says)}"):
+            use(scene)
+    assert "scene" in repr(scene).lower() and scene._repr_html_().startswith("<pre>")
+
+
+@pytest.mark.parametrize(
+    ("part", "where", "value", "says"),
+    [
+        ("machine", lambda machine: machine.mass, 1j, "machine.mass is 1j, which is not a number"),
+        ("machine", lambda machine: machine.mass, 9.0, "machine has an array of a shape that its constructor does not allow"),
+        ("loads", lambda loads: loads.drag, "1", "exciters[0].loads.drag is '1', which is not a number"),
+        ("loads", lambda loads: loads.drag, np.ones(9), "loads.drag is an array of shape (9,); the shape"),
+        ("drive", lambda drive: drive.speed, np.ones(2), "drive.speed is an array of shape (2,); a single number is needed"),
+    ],
+)
+def test_parts_changed_by_tree_at_are_refused_in_a_scene(part, where, value, says):
+    parts = {name: getattr(scene(), name) for name in ("machine", "loads", "drive")}
+    parts[part] = eqx.tree_at(where, parts[part], value)
     with pytest.raises(jv.InputError, match=f"^{re.escape(says)}"):
-        validate_scene(changed(where, value))
+        jv.Scene(**parts)

@@ -151,7 +151,7 @@ class Part(eqx.Module):
         specs = number_specs(type(self))
         names = [field.name for field in dataclasses.fields(self) if field.name != "kind"]
         values = {name: getattr(self, name) for name in names}
-        present = {name: value for name, value in values.items() if value is not None and np.shape(value) != (0,)}
+        present = {name: value for name, value in values.items() if value is not None and not _is_empty(value)}
         shown = [f"{name}={_shown(value, specs.get(name, PLAIN))}" for name, value in present.items()]
         name = getattr(self, "kind", type(self).__name__)
         if any(isinstance(value, Part) for value in values.values()):
@@ -167,9 +167,15 @@ class Part(eqx.Module):
             raise TypeError(f"{problem}; as a key use a text such as jv.scene_to_toml(scene)") from None
 
 
+def _is_empty(value: object) -> bool:
+    return value == () if isinstance(value, tuple) else getattr(value, "shape", None) == (0,)
+
+
 def _shown(value: object, spec: NumberSpec) -> str:
+    if isinstance(value, tuple):
+        return f"({', '.join(_shown(each, spec) for each in value)}{',' * (len(value) == 1)})"
     if not hasattr(value, "dtype"):
-        return repr(value)
+        return repr(value) if isinstance(value, eqx.Module) else quoted(value, longest=300)
     text = when_known(lambda known: repr(with_display_units(spec, known)), value)
     return eqx.tree_pformat(value) if text is None else text
 
