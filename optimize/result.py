@@ -207,10 +207,18 @@ class Synthesis(Result):
         """Return the design before, after and verified, the active limits and the influences as text."""
         lines = [f"{objective_text(self.objective)}: {self.message}", self.counts_text()]
         lines += [" ".join(line) for line in _align_columns(self.columns())]
-        if self.unverified:
-            lines.append(f"  not verified: {self.unverified}")
+        lines += [f"  {line}" for line in self.verification()]
         lines += self.findings()
         return "\n".join(line.rstrip() for line in lines)
+
+    def verification(self) -> list[str]:
+        """Return lines about the verification: what it shows, or why there is none."""
+        if self.verified is None:
+            return [f"not verified: {self.unverified}"]
+        return [
+            "verified: the full equations keep this motion if they start near it; this does not show that",
+            "a start from rest reaches it: simulate the found machine with start rest and spin_up",
+        ]
 
     def counts_text(self) -> str:
         """Return the numbers of starts, designs and equal results as text."""

@@ -97,11 +97,13 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
     has_friction = has_term(scene.all_effects, ContactFriction)
     limits = None if has_friction else jax.device_get(jv.drag_limits(scene))
     ranges = ranges_within(scene, [int(jam.mode) for jam in remaining], tolerances)
+    balanced = _is_balance_stable(scene)
     document = {
         "rotor_speed": scene.drive.speed,
         "resonances": modes_found.resonances,
         "judged": STABILITY_CRITERION,
         "modes": [_mode_document(jam, growth[int(jam.mode)]) for jam in jams],
+        "balanced_motion_stable": balanced,
         "unresolved": modes_found.unresolved,
         "measures": [{"mode": mode, **entry.document()} for mode, entry in measures.items()],
         "folds": [{"omega": modes_found.folds.omega[k], "rotor_speed": modes_found.folds.rotor_speed[k]} for k in folds],
@@ -126,16 +128,42 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
         lines += [text] if (text := modes_found.unresolved_text()) else []
         if tolerances:
             lines.append(tolerance_table(ranges, tolerances))
-        for mode, entry in measures.items():
-            lines.append(indented(f"mode {mode}:", entry))
+        lines += _reached_lines(scene, output, [f"mode {mode}" for mode in measures], balanced)
+        lines += [indented(f"mode {mode}:", entry) for mode, entry in measures.items()]
         if folds:
-            pairs = [
-                [f"{scale * modes_found.folds.omega[k]:.5g}", f"{scale * modes_found.folds.rotor_speed[k]:.5g}"] for k in folds
-            ]
+            ends = (modes_found.folds.omega, modes_found.folds.rotor_speed)
+            pairs = [[f"{scale * end[k]:.5g}" for end in ends] for k in folds]
             lines.append(table("folds: two jams merge", [f"loads, {unit}", f"rotor, {unit}"], pairs))
         return "\n".join([*lines, *_drag_lines(scene, limits), *_left_out(scene)])
 
     output.done(document, text, "modes", modes_found)
+
+
+def _is_balance_stable(scene: jv.Scene) -> bool | None:
+    """Return True if the loads can balance the rotor and this motion is stable; None if its stability cannot be computed."""
+    try:
+        states = jv.balanced_states(scene)
+        return any(states.stability(k).stable for k in range(len(states.angles)))
+    except InputError:
+        return None
+
+
+def _reached_lines(scene: jv.Scene, output: Output, jams: list[str], balanced: bool | None) -> list[str]:
+    """Return lines about several motions that are stable at the speed of the scene, one of which the loads reach.
+
+    **Arguments**: `jams`: names of the stable jams; `balanced`: see `_is_balance_stable`.
+    """
+    motions = jams + (["balanced loads"] if balanced else [])
+    if not jams and balanced:
+        return [f"balanced loads are stable: the loads spread and balance the rotor (jaxvib balance {output.scene})"]
+    if len(motions) < 2:
+        return []
+    start = "spin_up" if scene.drive.constant else "rest"
+    return [
+        f"several motions are stable: {', '.join(motions)}",
+        "which one the machine reaches depends on its start:",
+        f"  jaxvib simulate {output.scene} --until 100s --start {start}",
+    ]
 
 
 def _drag_document(limits: jv.DragLimits | None) -> list[dict[str, Any]]:
@@ -193,15 +221,16 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     import jax  # slow imports, which --help does not need
 
     from jaxvib.results.status import sentence
-    from jaxvib.steady.jams.phases import degrees
 
     result, limits = jv.phase_jams(scene), jax.device_get(jv.drag_limits(scene, phases=True))
     output.figure("phases.png", lambda: result.plot())
     jams = [result.select(k) for k in range(result.omega.shape[0])]
     measures = [measures_of(scene, jam) if jam.stable else None for jam in jams]
+    balanced = _is_balance_stable(scene)
     document = {
         "rotor_speed": scene.drive.speed,
         "judged": "by the growth rate of small disturbances, for light loads that move independently",
+        "balanced_motion_stable": balanced,
         "phase_jams": [
             {
                 **fields_of(jam, "omega", "stable", "growth"),
@@ -218,25 +247,17 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
         from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
 
         unit, scale = speed_unit()
-        rows = [
-            [
-                f"{scale * float(jam.omega):.5g}",
-                "stable" if jam.stable else "unstable",
-                sentence(jam.pattern),
-                " ".join(f"{degrees(float(a)):.4g}" for a in jam.phase),
-                f"{float(jam.foundation_force):.4g}",
-            ]
-            for jam in jams
-        ]
+        rows = [_phase_row(jam, scale) for jam in jams]
         rotor = speed_text(scene.drive.speed)
         head = [unit, "", "pattern of the loads", "phases, degrees", "foundation force, N"]
         title = f"light-load jams with unequal phases; rotor {rotor}"
+        stable_jams = [f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam in jams if jam.stable]
+        reached = _reached_lines(scene, output, [f"the jam at {each}" for each in stable_jams], balanced)
         if not rows:
-            return "\n".join([f"no jam at {rotor}", *_drag_lines(scene, limits)])
-        stable_text = ", ".join(f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam in jams if jam.stable)
+            return "\n".join([f"no jam at {rotor}", *reached, *_drag_lines(scene, limits)])
         conclusion = (
-            f"loads can stay jammed at {stable_text}"
-            if stable_text
+            f"loads can stay jammed at {', '.join(stable_jams)}"
+            if stable_jams
             else "none of them is stable: light loads cannot stay jammed"
         )
         measure_texts = [
@@ -245,10 +266,24 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
             if measures_of_jam is not None
         ]
         drags = _drag_lines(scene, limits)
-        lines = [conclusion, table(title, head, rows), *_force_lines(scene), *measure_texts, *drags, *_left_out(scene)]
-        return "\n".join(lines)
+        rows_of_force = [table(title, head, rows), *_force_lines(scene)]
+        return "\n".join([conclusion, *reached, *rows_of_force, *measure_texts, *drags, *_left_out(scene)])
 
     output.done(document, text, "modes", result)
+
+
+def _phase_row(jam: jv.PhaseJam, scale: float) -> list[str]:
+    """Return a jam as a row of the table; `scale` converts rad/s to the display unit."""
+    from jaxvib.results.status import sentence  # slow imports, which --help does not need
+    from jaxvib.steady.jams.phases import degrees
+
+    return [
+        f"{scale * float(jam.omega):.5g}",
+        "stable" if jam.stable else "unstable",
+        sentence(jam.pattern),
+        " ".join(f"{degrees(float(a)):.4g}" for a in jam.phase),
+        f"{float(jam.foundation_force):.4g}",
+    ]
 
 
 def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None:
@@ -260,6 +295,7 @@ def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None
     jams = {k: jv.jam_orbit(scene, mode=k, throw=False) for k in numbers}
     existing = {k: jam for k, jam in jams.items() if math.isfinite(jam.rotor_speed)}
     measures = {k: measures_of(scene, jam) for k, jam in existing.items() if jam.stable}
+    balanced = _is_balance_stable(scene)
     diagram = jv.branches(scene, exact=True)
     output.figure("branches.png", lambda: diagram.plot())
     output.csv(csv, diagram, "point")
@@ -267,6 +303,7 @@ def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None
         "rotor_speed": scene.drive.speed,
         "resonances": light.resonances,
         "judged": "by Floquet multipliers of the full equations",
+        "balanced_motion_stable": balanced,
         "modes": [
             {
                 "mode": k,
@@ -302,6 +339,7 @@ def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None
             f"rotor {speed_text(scene.drive.speed)}",
             table("exact jams; amplitudes and force are zero to peak", head, rows),
             *(f"mode {k}: {jam.message}" for k, jam in jams.items() if k not in existing),
+            *_reached_lines(scene, output, [f"mode {k}" for k in measures], balanced),
             *(indented(f"mode {k}:", each) for k, each in measures.items()),
         ]
         if points:

@@ -147,9 +147,6 @@ def _text(best: Synthesis) -> str:
 
     heads, *rows = best.columns()
     quantities = table(objective_text(best.objective), heads, rows)
-    verification = "verified by the full equations, integrated until the motion settled"
-    if best.verified is None:
-        verification = f"not verified: {best.unverified}"
     return "\n".join(
-        [f"{best.message}\n{best.counts_text()}", quantities, *(line.strip() for line in best.findings()), verification]
+        [f"{best.message}\n{best.counts_text()}", quantities, *(line.strip() for line in best.findings()), *best.verification()]
     )

@@ -214,6 +214,8 @@ class JamModes(AbstractJam):
         is_known = any(map(math.isfinite, growth.values()))
         notes += [f"stable: {STABILITY_OF_FREE_LOADS if is_known else STABILITY_CRITERION}"]
         notes += ["(summary(scene) computes whether they stay together)"] if scene is None else []
+        stable = [k for k in growth if bool(self.stable[self.row(k)]) and not growth[k] > 0.0]
+        notes += ["several modes are stable: simulate(..., start='spin_up') shows which is reached"] if len(stable) > 1 else []
         return "\n".join([f"rotor {rotor}; resonances {resonances}", *rows, *notes])
 
     @validated
@@ -307,6 +309,8 @@ def jam_modes(scene: Scene) -> JamModes:
       piece that falls from it, and mode 2 nd + 1 is beyond the last resonance. Mode 3 is therefore the jam just below the
       second resonance, even if the first one is damped so much that modes 1 and 2 have vanished
     - Rising pieces (odd modes) are stable by slope, falling ones are not
+    - If several modes are stable, or one mode and the balanced motion (`balanced_states(scene).stability()`), the start of the
+      machine decides which one it reaches: `simulate(scene, until, start="spin_up")`
     - If the branch has more peaks than resonances, the smallest ones are ignored: those whose rotor speed is hardly above that
       of the neighbouring minimum
     - An imbalance of the rotor (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force rotates at the rotor

@@ -1,0 +1,121 @@
+"""The command `modes`."""
+
+import json
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from scenes import scene
+
+import jaxvib as jv
+from jaxvib.cli.modes import _left_out
+from jaxvib.machine.files import TEMPLATES
+
+
+def test_modes_json_has_the_promised_keys(typed):
+    code, out, err = typed("modes", "machine.toml", "--json")
+    document = json.loads(out)
+    assert code == 0 and err.startswith("note: the acceleration is 10.1 g")
+    tables = {"modes", "measures", "folds", "drag_limits"}
+    assert set(document) == {"rotor_speed", "resonances", "judged", "balanced_motion_stable", "unresolved", *tables}
+    assert set(document["drag_limits"][0]) == {"resonances", "drag", "factor", "omega"}
+    keys = {"mode", "omega", "stable", "growth_of_free_loads", "status", "amplitude", "foundation_force"}
+    assert set(document["modes"][0]) == keys and document["judged"] == "by slope, for light loads that stay together"
+    assert set(document["folds"][0]) == {"omega", "rotor_speed"}
+    modes = jv.jam_modes(scene("two_mass", speed=150.0))
+    assert [m["mode"] for m in document["modes"]] == modes.mode_numbers()
+    for m in document["modes"]:
+        np.testing.assert_allclose(m["amplitude"], modes.select(m["mode"]).amplitude, rtol=1e-12)
+
+
+def test_modes_writes_table_and_figure(typed, tmp_path):
+    code, out, _ = typed("modes", "machine.toml", "--out", "figures")
+    assert code == 0 and "mode" in out and "stable" in out and "wrote" in out
+    assert " yes " in out and " no " in out and "no: the loads spread" in out and max(map(len, out.splitlines())) <= 110
+    assert "several motions are stable: mode 3, balanced loads\n" in out and "machine.toml --until 100s --start spin_up" in out
+    assert (tmp_path / "figures" / "branches.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "figures" / "modes.json").read_text())["rotor_speed"] == 150.0
+
+
+def test_modes_name_a_resonance_without_a_peak(typed, tmp_path):
+    plain = scene("two_mass", speed=150.0)
+    damped = eqx.tree_at(lambda s: s.machine.damping, plain, 30.0 * plain.machine.damping)
+    jv.save_scene(damped, tmp_path / "damped.toml")
+    said = "modes 1, 2 exist at no rotor speed: resonance 1 has no peak of its own"
+    assert said in typed("modes", "damped.toml")[1] and said in jv.jam_modes(damped).summary()
+    assert json.loads(typed("modes", "damped.toml", "--json")[1])["unresolved"] == [1, 2]
+    assert "at no rotor speed" not in typed("modes", "machine.toml")[1] + jv.jam_modes(plain).summary()
+
+
+def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
+    machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+    rotor = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
+    jv.save_scene(rotor, tmp_path / "rotor.toml")
+    code, out, err = typed("modes", "rotor.toml", "--out", "o", "--json")
+    document = json.loads(out)
+    keys = {"rotor_speed", "judged", "balanced_motion_stable", "phase_jams", "drag_limits"}
+    assert code == 0 and err == "" and set(document) == keys
+    np.testing.assert_allclose([jam["omega"] for jam in document["phase_jams"]], [412.8, 199.4, 164.6], atol=0.05)
+    assert [jam["pattern"] for jam in document["phase_jams"] if jam["stable"]] == ["together"]
+    assert (tmp_path / "o" / "phases.png").stat().st_size > 10_000
+    out = typed("modes", "rotor.toml")[1]
+    assert "loads can stay jammed at 1572.1 rpm (all together)" in out
+    assert "several motions are stable: the jam at 1572.1 rpm (all together), balanced loads" in out
+    assert "jaxvib simulate rotor.toml --until 100s --start spin_up" in out
+    assert "zero to peak, root sum square of both directions\n  (sqrt(2) times" in out
+    (tmp_path / "stations.toml").write_text(TEMPLATES["rotor"])
+    for words in (("modes", "--exact"), ("criterion",)):
+        code, out, err = typed(words[0], "stations.toml", *words[1:])
+        assert (code, out) == (2, "") and "machine.stations differ; this function needs loads that run at one point" in err
+    one_plane = TEMPLATES["rotor"].replace("stations = [0.28, 0.25, -0.25, -0.28]", "stations = 0.1")
+    (tmp_path / "one_plane.toml").write_text(one_plane)
+    code, _, err = typed("modes", "one_plane.toml", "--exact")
+    assert code == 2 and "machine.kind is 'rotor'; jam modes are not defined with gyroscopic coupling; use phase_jams" in err
+    code, _, err = typed("whirl", "stations.toml", "--speed", "-5 rad/s")
+    assert code == 2 and "--speed is -5 rad/s; it must be at least 0" in err
+
+
+def test_modes_of_a_rotor_that_has_no_jams_say_so(typed, tmp_path):
+    machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=0.0)
+    rotor = jv.Scene(machine, jv.pendulums(count=1, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed("60 rpm"))
+    jv.save_scene(rotor, tmp_path / "rotor.toml")
+    assert typed("modes", "rotor.toml")[:2] == (0, "no jam at 60 rpm\n")
+    damped = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=4.0), jv.ConstantSpeed(460.0))
+    damped = eqx.tree_at(lambda s: s.machine.damping, damped, jnp.asarray([843.0]))
+    jv.save_scene(damped, tmp_path / "damped.toml")
+    assert "balanced loads are stable: the loads spread and balance the rotor" in typed("modes", "damped.toml")[1]
+
+
+def test_exact_modes_json_has_the_promised_keys(typed):
+    code, out, err = typed("modes", "machine.toml", "--exact", "--json")
+    document = json.loads(out)
+    assert code == 0 and err.startswith("note: the acceleration is 10.1 g")
+    assert set(document) == {"rotor_speed", "resonances", "judged", "balanced_motion_stable", "modes", "special", "missing"}
+    assert set(document["special"][0]) == {"omega", "rotor_speed", "kind"}
+    assert {"fold"} <= {point["kind"] for point in document["special"]}
+    jams = {each["mode"]: each for each in document["modes"]}
+    measured = jv.vibration_measures(jv.load_scene("machine.toml"), jv.jam_orbit(jv.load_scene("machine.toml"), mode=3))
+    np.testing.assert_allclose(jams[3]["measures"]["stroke"], measured.stroke, rtol=1e-9)
+    assert {k for k, each in jams.items() if "measures" in each} == {k for k, each in jams.items() if each["stable"]}
+
+
+def test_modes_note_that_an_imbalance_is_left_out(typed, tmp_path):
+    plain = scene("two_mass", speed=150.0)
+    shaken = jv.Scene(plain.machine, plain.loads, plain.drive, (jv.StaticImbalance("5 g m"),))
+    jv.save_scene(shaken, tmp_path / "shaken.toml")
+    said = "amplitudes and forces are those of the loads only:\n  the static imbalance adds a vibration at the rotor speed"
+    assert said in typed("modes", "shaken.toml")[1]
+    assert said not in typed("modes", "machine.toml")[1]
+    assert said in typed("modes", "shaken.toml", "--phases")[1]
+    text = TEMPLATES["rotor"].replace("# moment_imbalance", "moment_imbalance")
+    assert "the static imbalance and moment imbalance add a vibration" in _left_out(jv.scene_from_toml(text))[1]
+    code, _, err = typed("modes", "shaken.toml", "--exact")
+    assert code == 2 and "effects.static_imbalance excites the machine at the rotor speed as well" in err
+    assert typed("modes", "shaken.toml", "--exact", "--without", "static_imbalance")[0] == 0
+    code, _, err = typed("modes", "shaken.toml", "--without", "stop")
+    assert code == 2 and "--without is 'stop'; the scene's effects are: static_imbalance" in err
+
+
+def test_modes_speed_option_replaces_the_scene_s(typed):
+    _, out, _ = typed("modes", "machine.toml", "--json", "--speed", "600 rpm")
+    np.testing.assert_allclose(json.loads(out)["rotor_speed"], 20 * np.pi, rtol=1e-15)
