@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, loaded_scene, shared
+from jaxvib.cli.app import Output, command, loaded_scene
 from jaxvib.errors import InputError, written
 
 if TYPE_CHECKING:
     from jaxvib.motion.start import Start
 
 
-@app.command("animate")
-@click.argument("source", type=click.Path(path_type=Path))
+@command("animate", "source")
 @click.option("--until", help="Duration of the simulation, if SOURCE is a scene file, such as 20s.")
 @click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), help="Initial state of the simulation [rest].")
 @click.option(
@@ -28,20 +27,12 @@ if TYPE_CHECKING:
 @click.option(
     "--seconds", help="Duration of the animation, s; at most 600 frames [that of about 11 frames for each turn of the rotor]."
 )
-@click.option("--fps", type=int, default=20, show_default=True, help="Frames per second.")
+@click.option("--fps", type=int, default=20, help="Frames per second.")
 @click.option(
     "--magnify", type=float, help="Magnification of the displacements relative to the circle of the loads [automatic]."
 )
-@click.option("--width", type=float, default=6.4, show_default=True, help="Width of the animation, in hundreds of pixels.")
-@click.option(
-    "--format",
-    "kind",
-    type=click.Choice(["gif", "html", "both"]),
-    default="both",
-    show_default=True,
-    help="Format of the file.",
-)
-@shared
+@click.option("--width", type=float, default=6.4, help="Width of the animation, in hundreds of pixels.")
+@click.option("--format", "kind", type=click.Choice(["gif", "html", "both"]), default="both", help="Format of the file.")
 def animate(
     source: Path, until: str | None, start: Start | None, mode: int | None, kind: str, output: Output, **options: Any
 ) -> None:
@@ -76,9 +67,7 @@ def animate(
     output.done(document, lambda: f"{animation.count} frames from {first:.6g} to {last:.6g} s", "animate")
 
 
-@app.command("sketch")
-@click.argument("scene", type=click.Path(path_type=Path))
-@shared
+@command("sketch")
 def sketch(scene: Path, output: Output) -> None:
     """Draw SCENE with the values of its parameters: sketch.png, in --out or the current folder."""
     figure = jv.sketch(loaded_scene(scene))

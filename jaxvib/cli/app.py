@@ -298,7 +298,7 @@ def _is_command(decorator: ast.expr, name: str) -> bool:
     return isinstance(decorator, ast.Call) and name in [x.value for x in decorator.args if isinstance(x, ast.Constant)]
 
 
-@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=True)
+@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"], "show_default": True}, no_args_is_help=True)
 @click.version_option(package_name="jaxvib")
 def app() -> None:
     """Simulate and design vibration machines that work on the Sommerfeld effect.
@@ -309,44 +309,56 @@ def app() -> None:
     """
 
 
-_SOURCES = ("scene", "design", "study", "store", "record", "recording", "identification")
-"""Names of the argument that is the main file of a command."""
-
-
-def shared(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options --json, --out, --report, --title, --author and --unit to a command, which receives them as an
-    `Output`."""
-
-    @click.option("--json", "as_json", is_flag=True, help="Print only one JSON document on stdout.")
-    @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Write figures and data into this folder.")
-    @click.option(
-        "--report",
+_COMMON_OPTIONS = (
+    click.Option(["--json", "as_json"], is_flag=True, help="Print only one JSON document on stdout."),
+    click.Option(["--out"], type=click.Path(path_type=Path, file_okay=False), help="Write figures and data into this folder."),
+    click.Option(
+        ["--report"],
         type=click.Path(path_type=Path, dir_okay=False),
         help="Write a report with inputs, results and figures to this file (.html).",
-    )
-    @click.option("--title", help="Title of the report [name of the command and of its file].")
-    @click.option("--author", help="Author of the report.")
-    @click.option(
-        "--unit",
+    ),
+    click.Option(["--title"], help="Title of the report [name of the command and of its file]."),
+    click.Option(["--author"], help="Author of the report."),
+    click.Option(
+        ["--unit"],
         type=click.Choice(["rpm", "Hz", "rad/s", "SI"], case_sensitive=False),
         default="rpm",
-        show_default=True,
         help="Unit of speeds; SI: all numbers in SI units. JSON documents are always in SI units.",
-    )
-    @functools.wraps(command)  # also copies the command's own options, which click stores on the function
-    def wrapped(
-        as_json: bool, out: Path | None, report: Path | None, title: str | None, author: str | None, unit: str, **rest: Any
-    ) -> None:
-        from jaxvib.display import display_units  # slow import, which --help does not need
+    ),
+)
 
-        display_units(speed="rad/s" if unit == "SI" else unit, si=unit == "SI")  # pyright: ignore[reportArgumentType]
-        source = next((rest[name] for name in _SOURCES if rest.get(name) is not None), None)
-        heading = title if title or source is None else f"{command.__name__.replace('_', '-')}: {source.stem}"
-        output = Output(as_json, out, report, rest.get("scene"), title=heading, author=author)
-        with output.waiting():
-            command(output=output, **rest)
 
-    return wrapped
+def command(
+    name: str, source: str | None = "scene", *, required: bool = True, **settings: Any
+) -> Callable[[Callable[..., None]], click.Command]:
+    """Declare a command with the path of its main file as its first argument, and the options --json, --out, --report, --title,
+    --author and --unit, which it receives as an `Output`.
+
+    **Arguments**: `name` of the command; `source`: name of the argument of the main file, None for a command without one;
+    `required`: False if the file can be omitted; `settings` of `click.Command`.
+    """
+
+    def declare(function: Callable[..., None]) -> click.Command:
+        @functools.wraps(function)  # also copies the command's own options, which click stores on the function
+        def run_command(
+            as_json: bool, out: Path | None, report: Path | None, title: str | None, author: str | None, unit: str, **rest: Any
+        ) -> None:
+            from jaxvib.display import display_units  # slow import, which --help does not need
+
+            display_units(speed="rad/s" if unit == "SI" else unit, si=unit == "SI")  # pyright: ignore[reportArgumentType]
+            path = rest.get(source or "")
+            heading = title if title or path is None else f"{name}: {path.stem}"
+            output = Output(as_json, out, report, rest.get("scene"), title=heading, author=author)
+            with output.waiting():
+                function(output=output, **rest)
+
+        made = app.command(name, **settings)(run_command)
+        if source is not None:
+            made.params.insert(0, click.Argument([source], type=click.Path(path_type=Path), required=required))
+        made.params += _COMMON_OPTIONS
+        return made
+
+    return declare
 
 
 _NO_ARGUMENTS: type[click.UsageError] | tuple[()] = getattr(click.exceptions, "NoArgsIsHelpError", ())
@@ -401,15 +413,15 @@ def _repeat_hint(arguments: list[str], error: click.UsageError) -> str:
     return f"; repeat the option for each value: {used[0]} ... {used[0]} ..." if used else ""
 
 
+def _parameters(arguments: list[str]) -> list[click.Parameter]:
+    """Return the arguments and options of the command in a command line."""
+    called = app.commands.get(arguments[0]) if arguments else None
+    return [] if called is None else called.params
+
+
 def _with_option_names(arguments: list[str], error: InputError) -> InputError:
     """Return an error with the names of options of the command line in place of the arguments of a function."""
-    command = app.commands.get(arguments[0]) if arguments else None
-    options = (
-        []
-        if command is None
-        else [option_of_command for option_of_command in command.params if isinstance(option_of_command, click.Option)]
-    )
-    names = {option_of_command.name: option_of_command.opts[-1] for option_of_command in options}
+    names = {each.name: each.opts[-1] for each in _parameters(arguments) if isinstance(each, click.Option)}
     field, problem = names.get(error.field, error.field), error.problem
     if field == "drive.speed" and "--speed" in arguments:
         field = "--speed"
@@ -421,8 +433,7 @@ def _with_option_names(arguments: list[str], error: InputError) -> InputError:
 def _remedy_hint(arguments: list[str], error: InputError) -> str:
     """Return a hint to the option that removes an unsupported effect or replaces an unsupported drive; "" for other errors."""
     table, _, name = error.field.partition(".")
-    command = app.commands.get(arguments[0]) if arguments else None
-    options = [] if command is None else [option.name for option in command.params]
+    options = [each.name for each in _parameters(arguments)]
     if table == "effects" and name.isidentifier() and "without" in options:
         return f" (--without {name})"
     return " (--speed gives one)" if table == "drive" and name in ("", "kind") and "speed" in options else ""

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, loaded_scene, shared
+from jaxvib.cli.app import Output, command, loaded_scene
 from jaxvib.cli.document import (
     SEPARATION,
     chosen_steps,
@@ -33,9 +33,8 @@ _FILES = ("design", *(f"{kind.replace('_', '-')}-design" for kind in SCREENS), "
 _MACHINES = tuple(kind.replace("_", "-") for kind in (*TEMPLATES, *SCREENS))
 
 
-@app.command("new", context_settings={"token_normalize_func": lambda word: word.replace("_", "-").lower()})
+@command("new", None, context_settings={"token_normalize_func": lambda word: word.replace("_", "-").lower()})
 @click.argument("kind", metavar="KIND", type=click.Choice([*_MACHINES, *_FILES]))
-@shared
 def new(kind: str, output: Output) -> None:
     """Print a commented scene file of a KIND of machine, or a file for `optimize`, `sweep`, `identify` or `plan`.
 
@@ -65,10 +64,9 @@ def new(kind: str, output: Output) -> None:
 new.help = f"{inspect.cleandoc(new.help or '')}\n\nMachines: {', '.join(_MACHINES)}."
 
 
-@app.command("simulate")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("simulate")
 @click.option("--until", required=True, help="End time, such as 20s or '0.5 min'.")
-@click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), default="rest", show_default=True, help=_START_HELP)
+@click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), default="rest", help=_START_HELP)
 @click.option("--mode", type=int, help="Number of the jam mode, with --start jam.")
 @SEPARATION
 @click.option("--spin-up", help="Duration of the spin-up, with --start spin_up [half of --until].")
@@ -78,7 +76,6 @@ new.help = f"{inspect.cleandoc(new.help or '')}\n\nMachines: {', '.join(_MACHINE
 @click.option("--window", is_flag=True, help="Save only the measurements over the last turns, and no trajectory.")
 @deck_options
 @csv_options
-@shared
 def simulate(
     scene: Path, tolerance: float | None, accuracy: float | None, window: bool, csv: Path | None, output: Output, **options: Any
 ) -> None:

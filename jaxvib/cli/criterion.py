@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import SPEED, SPEED_TYPE, WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import SPEED, SPEED_TYPE, WITHOUT, Output, command, loaded_scene, table
 from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
@@ -19,11 +19,9 @@ if TYPE_CHECKING:
     from jaxvib.steady.balance.states import BalancedStability
 
 
-@app.command("criterion")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("criterion")
 @click.option("--check", is_flag=True, help="Also compute the speeds at which balanced motion is stable by the full equations.")
 @WITHOUT
-@shared
 def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output) -> None:
     """List the rotor speeds at which the loads of SCENE gather, and those at which they spread and balance the rotor, according
     to the empirical criterion."""
@@ -85,8 +83,7 @@ def _ends(span: Sequence[float | None], scale: float) -> list[str]:
     return ["no end" if end is None else f"{scale * end:.6g}" for end in span]
 
 
-@app.command("balance")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("balance")
 @SPEED
 @click.option(
     "--between",
@@ -95,9 +92,8 @@ def _ends(span: Sequence[float | None], scale: float) -> list[str]:
     metavar="LOW HIGH",
     help="Also find the stable ranges of each arrangement between two rotor speeds, such as '300 rpm' '1500 rpm'.",
 )
-@click.option("--points", type=int, default=200, show_default=True, help="Number of speeds for --between.")
+@click.option("--points", type=int, default=200, help="Number of speeds for --between.")
 @WITHOUT
-@shared
 def balance(
     scene: Path,
     speed: str | None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from jaxvib.cli.app import Output, app, shared
+from jaxvib.cli.app import Output, command
 from jaxvib.errors import InputError, quoted
 
 if TYPE_CHECKING:
@@ -17,10 +17,9 @@ if TYPE_CHECKING:
 _WIDTH = 80
 
 
-@app.command("describe")
+@command("describe", None)
 @click.argument("group", metavar="[GROUP|NAME]", required=False)
 @click.argument("name", required=False)
-@shared
 def describe(group: str | None, name: str | None, output: Output) -> None:
     """List the contents of scene files: machines, loads, drives, effects, their arguments with units, defaults and meanings.
 

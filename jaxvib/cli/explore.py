@@ -12,7 +12,7 @@ from jaxvib.cli.app import app, loaded_scene
 
 @app.command("explore")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--port", type=click.IntRange(1, 65535), default=2718, show_default=True, help="Network port of this computer.")
+@click.option("--port", type=click.IntRange(1, 65535), default=2718, help="Network port of this computer.")
 @click.option("--no-browser", is_flag=True, help="Do not open a browser; only print the address of the page.")
 def explore(scene: Path, port: int, no_browser: bool) -> None:
     """Open a local page with sliders for SCENE; the diagrams follow the sliders, and the machine can be saved as TOML.

@@ -14,11 +14,10 @@ from jaxvib.cli.app import (
     TOLERANCE,
     WITHOUT,
     Output,
-    app,
+    command,
     loaded_scene,
     ranges_within,
     require_tolerances,
-    shared,
     table,
     tolerance_table,
 )
@@ -27,8 +26,7 @@ from jaxvib.cli.output import csv_options, fields_of
 from jaxvib.errors import InputError
 
 
-@app.command("modes")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("modes")
 @SPEED
 @click.option("--exact", is_flag=True, help="Compute exact periodic motions of the full equations instead of light-load jams.")
 @click.option(
@@ -37,7 +35,6 @@ from jaxvib.errors import InputError
 @WITHOUT
 @TOLERANCE
 @csv_options
-@shared
 def modes(
     scene: Path,
     speed: str | None,

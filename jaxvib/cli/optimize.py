@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from jaxvib.cli.app import TOLERANCE, Output, app, require_tolerances, shared, table, tolerance_table
+from jaxvib.cli.app import TOLERANCE, Output, command, require_tolerances, table, tolerance_table
 from jaxvib.cli.output import fields_of, note, write_file
 
 if TYPE_CHECKING:
@@ -19,8 +19,7 @@ _MOST_MACHINES = 0.95
 """Share of machines that should meet a demand; a smaller share is named."""
 
 
-@app.command("optimize")
-@click.argument("design", type=click.Path(path_type=Path))
+@command("optimize", "design")
 @click.option("--starts", type=int, help="Number of random starts [as in DESIGN].")
 @click.option("--seed", type=int, help="Seed of the random starts [as in DESIGN].")
 @click.option(
@@ -31,7 +30,6 @@ _MOST_MACHINES = 0.95
 )
 @click.option("--no-verify", is_flag=True, help="Skip the verification by an exact periodic motion and time integration.")
 @TOLERANCE
-@shared
 def optimize(
     design: Path,
     starts: int | None,

@@ -8,22 +8,19 @@ from typing import Any, Literal
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import SPEED_TYPE, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import SPEED_TYPE, Output, command, loaded_scene, table
 from jaxvib.cli.output import csv_options
 
 
-@app.command("whirl")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("whirl")
 @click.option("--speed", type=SPEED_TYPE, help="Rotor speed, such as '3000 rpm' [the speed of the drive].")
 @click.option(
     "--loads",
     type=click.Choice(["fixed", "none"]),
     default="fixed",
-    show_default=True,
     help="'fixed': the masses of the loads are fixed to the rotor; 'none': without the loads.",
 )
 @csv_options
-@shared
 def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: Path | None, output: Output) -> None:
     """List the whirl frequencies of the rotor in SCENE, forward, backward or straight (the axis moves on a straight line), and
     its critical speeds; --out adds the Campbell diagram."""

@@ -6,18 +6,15 @@ import bisect
 import textwrap
 from pathlib import Path
 
-import click
-
 import jaxvib as jv
 from jaxvib.cli.app import (
     TOLERANCE,
     WITHOUT,
     Output,
-    app,
+    command,
     loaded_scene,
     ranges_within,
     require_tolerances,
-    shared,
     table,
     tolerance_table,
 )
@@ -26,13 +23,11 @@ from jaxvib.cli.output import csv_options, fields_of
 from jaxvib.errors import InputError
 
 
-@app.command("regimes")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("regimes")
 @WITHOUT
 @deck_options
 @TOLERANCE
 @csv_options
-@shared
 def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], csv: Path | None, output: Output) -> None:
     """List the synchronous regimes of SCENE: motions in which all exciters turn at one speed; --out adds a figure of
     phases."""

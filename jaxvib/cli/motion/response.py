@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, command, loaded_scene, table
 from jaxvib.cli.document import deck_options, indented, measures_of
 from jaxvib.cli.output import csv_options
 
@@ -18,19 +18,17 @@ if TYPE_CHECKING:
     from jaxvib.steady.response import AbstractResponse
 
 
-@app.command("response")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("response")
 @click.option("--most", type=SPEED_TYPE, help="Highest speed, such as '2000 rpm' [4/3 of the working speed].")
 @click.option(
     "--phases",
     help="Fixed phases of the unbalances of several exciters, as if gears connected them, such as '0 deg, 180 deg' [those of "
     "the first stable synchronous regime].",
 )
-@click.option("--points", type=int, default=500, show_default=True, help="Number of speeds.")
+@click.option("--points", type=int, default=500, help="Number of speeds.")
 @WITHOUT
 @deck_options
 @csv_options
-@shared
 def response(
     scene: Path, most: str | None, phases: str | None, points: int, without: tuple[str, ...], csv: Path | None, output: Output
 ) -> None:

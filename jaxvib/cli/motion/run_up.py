@@ -8,21 +8,19 @@ from typing import Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import WITHOUT, Output, command, loaded_scene, table
 from jaxvib.cli.document import SEPARATION, chosen_steps
 from jaxvib.cli.output import csv_options, fields_of
 from jaxvib.errors import InputError
 
 
-@app.command("run-up")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("run-up")
 @click.option("--until", required=True, help="End time, such as 20s.")
 @click.option(
     "--least", is_flag=True, help="Also find the smallest factor of all torques with which all exciters pass the resonances."
 )
 @WITHOUT
 @csv_options
-@shared
 def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
     """Compute the run-up of the motors of SCENE from rest by averaged equations, and list the resonances that catch exciters.
 
@@ -36,16 +34,14 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
     output.done(document, found.summary, "run_up", found)
 
 
-@app.command("run-up-map")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("run-up-map")
 @click.option("--until", required=True, help="End time of each run-up, such as 6s.")
 @click.option("--drag", "drags", multiple=True, help="Drag of the loads, such as '0.5 N s/m'; repeatable [value of SCENE].")
 @click.option("--starts", type=int, help="Number of random sets of initial angles [one set: loads side by side at the bottom].")
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random angles.")
+@click.option("--seed", type=int, default=0, help="Seed of the random angles.")
 @SEPARATION
 @click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-7].")
-@click.option("--batch", type=int, default=16, show_default=True, help="Number of run-ups that advance together on each core.")
-@shared
+@click.option("--batch", type=int, default=16, help="Number of run-ups that advance together on each core.")
 def run_up_map(scene: Path, drags: tuple[str, ...], tolerance: float | None, output: Output, **options: Any) -> None:
     """Compute run-ups of SCENE from rest for each drag and each set of initial angles, and report the final regimes."""
     from jaxvib.units import number

@@ -13,11 +13,10 @@ from jaxvib.cli.app import (
     TOLERANCE,
     WITHOUT,
     Output,
-    app,
+    command,
     loaded_scene,
     ranges_within,
     require_tolerances,
-    shared,
     tolerance_table,
 )
 from jaxvib.cli.document import (
@@ -40,8 +39,7 @@ _START_AT_FULL_SPEED = click.option("--start", type=click.Choice(["rest", "jam"]
 _MODE = click.option("--mode", type=int, help="Number of the jam mode near which the run starts.")
 
 
-@app.command("settle")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("settle")
 @_START_AT_FULL_SPEED
 @_MODE
 @SEPARATION
@@ -49,11 +47,10 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode near which
     "--drift", type=float, help="Largest drift (relative change) of a settled motion [1e-6, or a change without a trend]."
 )
 @click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-9].")
-@click.option("--segments", type=int, default=200, show_default=True, help="Largest number of segments of the run.")
+@click.option("--segments", type=int, default=200, help="Largest number of segments of the run.")
 @SPEED
 @TOLERANCE
 @deck_options
-@shared
 def settle(
     scene: Path,
     speed: str | None,
@@ -94,8 +91,7 @@ def _modes_of(run: jv.Run) -> list[int] | None:
     return [mode]
 
 
-@app.command("envelope")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("envelope")
 @click.option("--until", required=True, help="End time, such as 20s or '10 min'.")
 @_START
 @_MODE
@@ -105,7 +101,6 @@ def _modes_of(run: jv.Run) -> list[int] | None:
 @WITHOUT
 @deck_options
 @csv_options
-@shared
 def envelope(
     scene: Path, tolerance: float | None, without: tuple[str, ...], csv: Path | None, output: Output, **options: Any
 ) -> None:
@@ -120,15 +115,13 @@ def envelope(
     output.done(document, lambda: run.summary(measures), "envelope", run)
 
 
-@app.command("growth")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("growth")
 @click.option("--until", required=True, help="Duration of the whole run, such as 60s.")
 @_START_AT_FULL_SPEED
 @_MODE
 @SEPARATION
 @SPEED
-@click.option("--segments", type=int, default=40, show_default=True, help="Number of equal parts of the run, at least 8.")
-@shared
+@click.option("--segments", type=int, default=40, help="Number of equal parts of the run, at least 8.")
 def growth(scene: Path, speed: str | None, output: Output, **options: Any) -> None:
     """Measure the growth of small disturbances of a motion of SCENE.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, command, loaded_scene, table
 from jaxvib.cli.output import fields_of
 from jaxvib.errors import InputError
 
@@ -30,19 +30,15 @@ _OMEGA = click.option(
     metavar="FROM TO",
     help="Range of load speeds, such as '20 rad/s' '60 rad/s'.",
 )
-_POINTS_OPTION = click.option(
-    "--points", type=int, default=300, show_default=True, help="Number of load speeds of each diagram."
-)
+_POINTS_OPTION = click.option("--points", type=int, default=300, help="Number of load speeds of each diagram.")
 
 
-@app.command("stability-map")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("stability-map")
 @_VARY
 @click.option("--value", "values", multiple=True, required=True, help="Value of the parameter with its unit; repeatable.")
 @_OMEGA
 @_POINTS_OPTION
 @WITHOUT
-@shared
 def stability_map(
     scene: Path,
     vary: str,
@@ -85,8 +81,7 @@ def _special_text(points: list[dict], scale: float) -> str:
     return ", ".join(f"{p['kind'].replace('_', ' ')} {scale * p['omega']:.5g}" for p in points) or "nowhere"
 
 
-@app.command("onset")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("onset")
 @_VARY
 @click.option("--kind", required=True, help="Kind: fold, torus (torus bifurcation), period_doubling or symmetry.")
 @click.option(
@@ -94,9 +89,8 @@ def _special_text(points: list[dict], scale: float) -> str:
 )
 @_OMEGA
 @_POINTS_OPTION
-@click.option("--accuracy", type=float, default=1e-3, show_default=True, help="Relative accuracy of the value.")
+@click.option("--accuracy", type=float, default=1e-3, help="Relative accuracy of the value.")
 @WITHOUT
-@shared
 def onset(
     scene: Path,
     vary: str,

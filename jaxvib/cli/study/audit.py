@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import WITHOUT, Output, command, loaded_scene, table
 from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,9 +17,8 @@ if TYPE_CHECKING:
     from jaxvib.study.audit.operation_counts import OperationCount
 
 
-@app.command("audit")
-@click.argument("scene", type=click.Path(path_type=Path), required=False)
-@click.option("--accuracy", default="1%", show_default=True, help="Relative change below which an effect is negligible.")
+@command("audit", required=False)
+@click.option("--accuracy", default="1%", help="Relative change below which an effect is negligible.")
 @click.option("--mode", type=int, help="Number of the jam mode [second-highest of those that are stable by slope].")
 @click.option(
     "--until",
@@ -31,18 +30,13 @@ if TYPE_CHECKING:
     type=click.Choice(["rest", "turning"]),
     help="Compare a run from this initial state in place of a jam; turning: loads evenly spread, at the rotor speed.",
 )
-@click.option(
-    "--add-missing/--no-add-missing", default=True, show_default=True, help="Also add each effect that the scene does not have."
-)
+@click.option("--add-missing/--no-add-missing", default=True, help="Also add each effect that the scene does not have.")
 @click.option(
     "--tiers/--no-tiers",
     default=True,
-    show_default=True,
     help="Compare all tiers: leading order, averaged equations, exact orbit, full equations.",
 )
-@click.option(
-    "--repeats", type=click.IntRange(min=0), default=3, show_default=True, help="Number of timings; the fastest is reported."
-)
+@click.option("--repeats", type=click.IntRange(min=0), default=3, help="Number of timings; the fastest is reported.")
 @click.option(
     "--operations",
     "count_operations",
@@ -50,7 +44,6 @@ if TYPE_CHECKING:
     help="Without SCENE: count the operations of effects, drives, machines and loads.",
 )
 @WITHOUT
-@shared
 def audit(
     scene: Path | None,
     accuracy: str,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import Output, command, loaded_scene, table
 from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
@@ -19,29 +19,24 @@ if TYPE_CHECKING:
     from jaxvib.motion.start import Rotation
 
 
-@app.command("capture")
-@click.argument("scene", type=click.Path(path_type=Path))
+@command("capture")
 @click.option(
     "--from",
     "low",
     type=float,
     default=-1.0,
-    show_default=True,
     help="Lowest initial speed of the balls relative to the rotor, divided by the rotor speed: -1 for balls at rest, 0 for "
     "balls that turn with the rotor.",
 )
-@click.option("--to", "high", type=float, default=0.0, show_default=True, help="Highest initial speed, as for --from.")
-@click.option("--speeds", type=click.IntRange(min=2), default=32, show_default=True, help="Number of initial speeds.")
+@click.option("--to", "high", type=float, default=0.0, help="Highest initial speed, as for --from.")
+@click.option("--speeds", type=click.IntRange(min=2), default=32, help="Number of initial speeds.")
 @click.option(
     "--starts",
     type=click.IntRange(min=1),
     default=1,
-    show_default=True,
     help="Number of initial states at each speed; all but the first are perturbed.",
 )
-@click.option(
-    "--turns", type=click.IntRange(min=1), default=2000, show_default=True, help="Duration of each run, in turns of the rotor."
-)
+@click.option("--turns", type=click.IntRange(min=1), default=2000, help="Duration of each run, in turns of the rotor.")
 @click.option(
     "--resolution", type=float, help="Resolution of the threshold, divided by the rotor speed [spacing of the speeds]."
 )
@@ -49,11 +44,9 @@ if TYPE_CHECKING:
     "--rotation",
     type=click.Choice(["rolling", "none"]),
     default="rolling",
-    show_default=True,
     help="Initial rotation of the balls: rolling, or none, so that they slide at first (needs the effect sliding).",
 )
 @click.option("--all", "show_all", is_flag=True, help="List every initial speed.")
-@shared
 def capture(
     scene: Path,
     low: float,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import SPEED, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import SPEED, Output, command, loaded_scene, table
 from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
@@ -20,9 +20,8 @@ _SOLVERS = ("default", "Tsit5", "Dopri8")
 """Names in `jaxvib.study.accuracy.work_precision`, repeated here because its import is slow."""
 
 
-@app.command("cost")
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--quantity", type=click.Choice(_QUANTITIES), default="amplitude", show_default=True, help="Computed quantity.")
+@command("cost")
+@click.option("--quantity", type=click.Choice(_QUANTITIES), default="amplitude", help="Computed quantity.")
 @click.option("--mode", type=int, help="Number of the jam mode [second-highest of those that are stable by slope].")
 @click.option(
     "--until",
@@ -32,11 +31,8 @@ _SOLVERS = ("default", "Tsit5", "Dopri8")
 @click.option(
     "--solver", "solvers", type=click.Choice(_SOLVERS), multiple=True, help="Method of time integration; repeatable [all]."
 )
-@click.option(
-    "--repeats", type=click.IntRange(min=1), default=3, show_default=True, help="Number of timings; the fastest is reported."
-)
+@click.option("--repeats", type=click.IntRange(min=1), default=3, help="Number of timings; the fastest is reported.")
 @SPEED
-@shared
 def cost(
     scene: Path,
     quantity: Quantity,

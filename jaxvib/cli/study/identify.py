@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import Output, command, table
 from jaxvib.cli.output import DECIMAL_COMMA, fields_of, write_file
 from jaxvib.errors import InputError
 
@@ -49,8 +49,7 @@ def _with_options(tables: Tables, given: Mapping[str, str | bool | None]) -> Tab
     return result
 
 
-@app.command("identify")
-@click.argument("record", type=click.Path(path_type=Path))
+@command("identify", "record")
 @_with_number_options
 @click.option("--columns", "record__columns", help="Names of the columns of time and angle, such as 't,phi'.")
 @click.option(
@@ -62,7 +61,6 @@ def _with_options(tables: Tables, given: Mapping[str, str | bool | None]) -> Tab
 @click.option("--air/--no-air", "identify__air", default=None, help="Identify the quadratic drag of the air as well.")
 @click.option("--torque/--no-torque", "identify__torque", default=None, help="Identify a constant torque as well.")
 @DECIMAL_COMMA
-@shared
 def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Identify parameters of a machine from recorded runs, or the friction of a bearing from a recorded swing.
 

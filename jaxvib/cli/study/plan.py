@@ -7,15 +7,13 @@ from pathlib import Path
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import Output, command, table
 from jaxvib.cli.output import fields_of
 from jaxvib.errors import InputError
 
 
-@app.command("plan")
-@click.argument("identification", type=click.Path(path_type=Path))
+@command("plan", "identification")
 @click.option("--fit", type=click.Path(path_type=Path), help="File fit.npz of `jaxvib identify`, in place of a new fit.")
-@shared
 def plan(identification: Path, fit: Path | None, output: Output) -> None:
     """Rank the candidate runs of an IDENTIFICATION file by how much they reduce the expected errors of the unknown parameters
     per minute of test.

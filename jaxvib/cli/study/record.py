@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import Output, command, table
 
 if TYPE_CHECKING:
     from jaxvib.exchange.recordings.overview import ChannelOverview
@@ -20,13 +20,11 @@ _VIBRATIONS = frozenset({"acceleration", "velocity", "displacement", "force"})
 """Kinds of channels in the table of vibrations."""
 
 
-@app.command("record")
-@click.argument("recording", type=click.Path(path_type=Path))
+@command("record", "recording")
 @click.option("--pulses", help="Name of the channel with the pulses of a tachometer.")
-@click.option("--per-turn", type=click.IntRange(min=1), default=1, show_default=True, help="Pulses per turn of the rotor.")
+@click.option("--per-turn", type=click.IntRange(min=1), default=1, help="Pulses per turn of the rotor.")
 @click.option("--speed", help="Name of the channel with the rotor speed [the first in rpm or rad/s].")
 @click.option("--rate", help="Sampling rate in place of the times in the file, such as '2 kHz'.")
-@shared
 def record(recording: Path, pulses: str | None, per_turn: int, speed: str | None, rate: str | None, output: Output) -> None:
     """Describe a RECORDING (CSV, TDMS, UFF, MAT, WAV, MF4): its channels with their units, rates, gaps and clipped readings,
     RMS and main frequency of vibrations, and the rotor speed over time. --out adds the figure."""

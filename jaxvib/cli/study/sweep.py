@@ -8,21 +8,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import Output, command, table
 from jaxvib.errors import InputError, optional_module, quoted
 
 if TYPE_CHECKING:
     from jaxvib.sweeps.sweep import Progress, Sweep
 
 
-@app.command("sweep")
-@click.argument("study", type=click.Path(path_type=Path))
+@command("sweep", "study")
 @click.option("--store", type=click.Path(path_type=Path), help="Folder to write [name of STUDY with the ending .zarr].")
-@click.option("--resume/--no-resume", default=True, show_default=True, help="Continue the study if its store exists already.")
+@click.option("--resume/--no-resume", default=True, help="Continue the study if its store exists already.")
 @click.option("--workers", type=click.IntRange(min=1), help="Number of processes on this computer (Dask).")
 @click.option("--scheduler", metavar="ADDRESS", help="Address of a Dask scheduler, such as tcp://10.0.0.1:8786.")
-@click.option("--timeout", default="30 s", show_default=True, help="Longest time until the scheduler and its workers answer.")
-@shared
+@click.option("--timeout", default="30 s", help="Longest time until the scheduler and its workers answer.")
 def sweep(
     study: Path, store: Path | None, resume: bool, workers: int | None, scheduler: str | None, timeout: str, output: Output
 ) -> None:
@@ -53,17 +51,12 @@ def sweep(
     _print_result(result, output, "sweep")
 
 
-@app.command("show")
-@click.argument("store", type=click.Path(path_type=Path))
+@command("show", "store")
 @click.option("--measure", help="Name of the array to show [the regime if it was measured, otherwise the first array].")
 @click.option("--over", nargs=2, metavar="X Y", help="Names of the two axes of the map.")
 @click.option(
-    "--theory/--no-theory",
-    default=True,
-    show_default=True,
-    help="Draw the lines on which exact jams have a fold or lose their stability.",
+    "--theory/--no-theory", default=True, help="Draw the lines on which exact jams have a fold or lose their stability."
 )
-@shared
 def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory: bool, output: Output) -> None:
     """Summarize a STORE of `jaxvib sweep`; --out adds the figures that fit the study: map.png, shares.png, distribution.png,
     tornado.png."""
