@@ -10,7 +10,16 @@ from typing import Any
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import Tables, Templates, build_part, load_scene, misplaced_name, read_toml, suggest_name
+from jaxvib.machine.files import (
+    Tables,
+    Templates,
+    build_part,
+    load_scene,
+    read_toml,
+    require_fields,
+    require_tables,
+    suggest_name,
+)
 from jaxvib.machine.numbers.named import find_number
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.startup import start
@@ -72,9 +81,7 @@ def load_design(path: str | Path) -> Design:
     """
     start()  # before the first arrays of the process, which this function may create
     tables = read_toml(path)
-    for name in tables:
-        if name not in _SECTIONS:
-            raise misplaced_name(name, tables, "design", _SECTIONS)
+    require_tables(tables, "design", _SECTIONS)
     has_recipe = "recipe" in tables
     for name in ("scene",) if has_recipe else ("scene", "free", "objective"):
         if name not in tables and not (name == "free" and "choices" in tables):
@@ -130,19 +137,14 @@ def _design_from_tables(scene: Scene, tables: Tables, folder: Path) -> Design:
 def _search_options(table: Tables) -> Tables:
     """Return the validated arguments of `synthesize` in a table [search]."""
     search = dict(table)
-    allowed = ["starts", "seed", "iterations", "rate", "polishing", "searcher"]
+    require_fields(search, ["starts", "seed", "iterations", "rate", "polishing", "searcher"], "search")
     for name, value in search.items():
-        if name not in allowed:
-            raise InputError(f"search.{name}", f"is not a field here; {suggest_name(name, allowed)}")
         if name == "searcher":
             require_searcher(value)
-            continue
-        if name == "rate":
-            search[name] = float(number(value, "", "search.rate", low=0.0, open_low=True))
-            if not search[name] < 1.0:
-                raise InputError("search.rate", f"is {search[name]:g}; it must be less than 1")
-            continue
-        count(value, f"search.{name}", low=0 if name in ("seed", "polishing") else 1)
+        elif name == "rate":
+            search[name] = float(number(value, "", "search.rate", low=0.0, open_low=True, high=1.0, open_high=True))
+        else:
+            count(value, f"search.{name}", low=0 if name in ("seed", "polishing") else 1)
     return search
 
 

@@ -6,7 +6,7 @@ import difflib
 import inspect
 import re
 import tomllib
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Collection, Container, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -152,25 +152,30 @@ _COMMANDS = {"design": "optimize", "study": "sweep", "identification": "identify
 """Commands that take a file, by its kind."""
 
 
-def misplaced_name(name: str, tables: Tables, kind: str, allowed: list[str]) -> InputError:
-    """Return the error for an unknown `name` in a file of a `kind`.
+def require_tables(tables: Tables, kind: str, allowed: list[str]) -> None:
+    """**Raises** `InputError` for a name in a file of a `kind` that is not allowed.
 
-    The error suggests a similar name or, if more names of the file belong to another kind of file, states that kind.
+    The message suggests a similar name or, if more names of the file belong to another kind of file, states that kind.
 
-    >>> str(misplaced_name("machine", {"machine": {}}, "design", ["free"])).split(";")[0]
-    'machine is not part of a design file: this is a scene file, for commands such as modes and regimes'
+    >>> require_tables({"machine": {}}, "design", ["free"])
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: machine is not part of a design file: this is a scene file, for commands such as modes and ...
     """
+    name = next((each for each in tables if each not in allowed), None)
+    if name is None:
+        return
     present = {each: sum(mark in tables for mark in marks) for each, marks in _MARKS.items()}
     found = max(present, key=lambda each: (present[each], each == kind))
     own, other = (f"{'an' if each == 'identification' else 'a'} {each} file" for each in (kind, found))
     if found == kind or not present[found]:
         is_outside = kind == "scene" and not isinstance(tables[name], (Mapping, list))
         advice = "write it below the header of its table, such as [machine]" if is_outside else suggest_name(name, allowed)
-        return InputError(name, f"is not part of {own}; {advice}")
+        raise InputError(name, f"is not part of {own}; {advice}")
     taken = f"`jaxvib {_COMMANDS[found]}`" if found in _COMMANDS else "commands such as modes and regimes"
     new = f"`jaxvib new {'sweep' if kind == 'study' else kind}` prints {own}"
     advice = "give the scene file that it refers to" if kind == "scene" else new
-    return InputError(name, f"is not part of {own}: this is {other}, for {taken}; {advice}")
+    raise InputError(name, f"is not part of {own}: this is {other}, for {taken}; {advice}")
 
 
 @validated
@@ -270,9 +275,7 @@ def scene_from_toml(text: str) -> Scene:
 
 def scene_from_tables(tables: Tables) -> Scene:
     """Return the scene that the tables of a scene file describe, see `scene_from_toml`."""
-    for name in tables:
-        if name not in (*SECTIONS, "effects", "exciters"):
-            raise misplaced_name(name, tables, "scene", [*SECTIONS, "effects", "exciters"])
+    require_tables(tables, "scene", [*SECTIONS, "effects", "exciters"])
     several = "exciters" in tables
     parts = {}
     for name in ("machine",) if several else SECTIONS:
@@ -339,6 +342,14 @@ def build_kind(table: object, section: str, kinds: Mapping[str, Callable[..., T]
     return build_part(kinds[kind], {k: v for k, v in table.items() if k != "kind"}, section)
 
 
+def require_fields(table: Mapping[str, object], allowed: Collection[str], section: str) -> None:
+    """**Raises** `InputError` for a field that is not allowed in a table, which the message names as `section.name`."""
+    for name in table:
+        if name not in allowed:
+            field = f"{section}.{name}" if section else name
+            raise InputError(field, f"is not a field here; {suggest_name(name, list(allowed), table)}")
+
+
 def build_part(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
     """Return the part that the constructor `build` makes of the fields of a table.
 
@@ -349,9 +360,7 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
     """
     parameters = inspect.signature(build).parameters
     prefix = f"{section}." if section else ""
-    for name in values:
-        if name not in parameters:
-            raise InputError(prefix + name, f"is not a field here; {suggest_name(name, list(parameters), values)}")
+    require_fields(values, parameters, section)
     needed = [name for name, parameter in parameters.items() if parameter.default is parameter.empty]
     for name in needed:
         if name not in values:

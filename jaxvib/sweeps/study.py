@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeAlias, cast
 
 from jaxvib.errors import ComputationError, InputError, quoted, require_one_of
-from jaxvib.machine.files import load_scene, misplaced_name, read_toml, suggest_name
+from jaxvib.machine.files import load_scene, read_toml, require_fields, require_tables
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.batch import BatchPlan
@@ -212,9 +212,7 @@ def load_study(path: str | Path) -> Study:
     (40, 40)
     """
     tables = read_toml(path)
-    for name in tables:
-        if name not in _FIELDS:
-            raise misplaced_name(name, tables, "study", _FIELDS)
+    require_tables(tables, "study", _FIELDS)
     for name in ("scene", "axes", "measure"):
         if name not in tables:
             raise InputError(name, "is missing; a study file needs scene, [axes] and [[measure]]")
@@ -226,10 +224,7 @@ def load_study(path: str | Path) -> Study:
     if not isinstance(tables["measure"], list) or not tables["measure"]:
         raise InputError("measure", "is not a list of tables; write [[measure]] for each quantity")
     run = dict(tables.get("run", {}))
-    for name in run:
-        if name not in ("until", "start", "mode", "steps"):
-            advice = suggest_name(name, ["until", "start", "mode", "steps"], run)
-            raise InputError(f"run.{name}", f"is not a field here; {advice}")
+    require_fields(run, ["until", "start", "mode", "steps"], "run")
     named_measures = [_measure(table, f"measure[{k}]", Path(path)) for k, table in enumerate(tables["measure"])]
     measure: Measures = [m for _, m in named_measures]
     if any(name for name, _ in named_measures):
@@ -263,9 +258,7 @@ def _measure(table: object, field: str, path: Path) -> tuple[str, Measure | str]
 
 def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
     """Return a user's quantity: a function of a scene, in a module that Python can import."""
-    for key in table:
-        if key not in ("function", "unit"):
-            raise InputError(f"{field}.{key}", f"is not a field here; {suggest_name(key, ['function', 'unit', 'name'])}")
+    require_fields(table, ["function", "unit", "name"], field)
     module, _, function = str(table["function"]).partition(":")
     try:
         user_function = getattr(importlib.import_module(module), function)

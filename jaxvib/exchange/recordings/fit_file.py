@@ -12,7 +12,7 @@ from jaxvib.identification.further_runs.planned import PlannedRun
 from jaxvib.identification.problem import MOTIONS
 from jaxvib.identification.records.channel import Channel
 from jaxvib.identification.run import MeasuredRun
-from jaxvib.machine.files import DRIVES, Tables, build_kind, build_part, load_scene, misplaced_name, suggest_name
+from jaxvib.machine.files import DRIVES, Tables, build_kind, build_part, load_scene, require_fields, require_tables
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number
 
@@ -51,9 +51,7 @@ def fit_from_tables(tables: Tables, folder: Path) -> FitInput:
         ...
     jaxvib.errors.InputError: runs is not part of an identification file; did you mean 'run'? allowed: ...
     """
-    for name in tables:
-        if name not in FIT_TABLES:
-            raise misplaced_name(name, tables, "identification", FIT_TABLES)
+    require_tables(tables, "identification", FIT_TABLES)
     machine = tables.get("machine")
     if not isinstance(machine, Mapping) or set(machine) != {"file"} or not isinstance(machine["file"], str):
         raise InputError(
@@ -85,9 +83,7 @@ def _entries(tables: Mapping[str, object], name: str, within_table: str | None =
 
 
 def _run(table: Mapping[str, object], k: int, channels: list[Channel], folder: Path) -> MeasuredRun:
-    for name in table:
-        if name not in _RUN_FIELDS:
-            raise InputError(f"run[{k}].{name}", f"is not a field here; {suggest_name(name, list(_RUN_FIELDS), table)}")
+    require_fields(table, _RUN_FIELDS, f"run[{k}]")
     file = table.get("file")
     if not isinstance(file, str):
         raise InputError(f"run[{k}].file", f"is {'missing' if file is None else quoted(file)}; write the path of a recording")
@@ -102,9 +98,7 @@ def _run(table: Mapping[str, object], k: int, channels: list[Channel], folder: P
 def _candidate(table: Mapping[str, object], k: int, channels: list[Mapping[str, object]], first: MeasuredRun) -> PlannedRun:
     """Return a planned run. Its channels are those of the file, some of them moved to other places, and new ones."""
     field = f"candidate[{k}]"
-    for name in table:
-        if name not in _CANDIDATE_FIELDS:
-            raise InputError(f"{field}.{name}", f"is not a field here; {suggest_name(name, _CANDIDATE_FIELDS, table)}")
+    require_fields(table, _CANDIDATE_FIELDS, field)
     for name in ("name", "drive", "duration"):
         if name not in table:
             raise InputError(f"{field}.{name}", "is missing; a candidate needs a name, a drive and a duration")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import Tables, build_part, misplaced_name, suggest_name
+from jaxvib.machine.files import Tables, build_part, require_fields, require_tables
 from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum
 from jaxvib.units import Number, number
@@ -41,17 +41,14 @@ def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
     jaxvib.errors.InputError: record.form is not a field here; did you mean 'from'? allowed: ...
     """
     names = ["record", "pendulum", "identify"]
+    require_tables(tables, "measurement", names)
     for name, table in tables.items():
-        if name not in names:
-            raise misplaced_name(name, tables, "measurement", names)
         if not isinstance(table, Mapping):
             raise InputError(name, f"is {quoted(table)}; it must be a table; write [{name}]")
     pendulum = build_part(BearingPendulum, tables.get("pendulum", {}), "pendulum")
     options = build_part(_options, tables.get("identify", {}), "identify")
     record_table = tables.get("record", {})
-    for name in record_table:
-        if name not in _FIELDS:
-            raise InputError(f"record.{name}", f"is not a field here; {suggest_name(name, list(_FIELDS))}")
+    require_fields(record_table, _FIELDS, "record")
     record = build_part(_record, {_FIELDS[name]: value for name, value in record_table.items()}, "record")(folder)
     return Measurement(pendulum, record, options)
 
