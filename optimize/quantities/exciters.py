@@ -75,6 +75,10 @@ def _ellipse(evaluation: Evaluation, tier: Tier, at: Point, body: int, slope: fl
     return evaluation.working(tier).ellipse(at, body, slope=slope)
 
 
+def _field_of_ellipse(evaluation: Evaluation, tier: Tier, at: Point, body: int, name: str, slope: float = 0.0) -> Array:
+    return getattr(_ellipse(evaluation, tier, at, body, slope), name)
+
+
 @validated
 def throw_stroke(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
     """Return the stroke of a point, m peak to peak: the length of the long axis of its path, "double amplitude" in data sheets.
@@ -111,11 +115,7 @@ def throw_angle(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier 
     >>> (throw_angle() > "40 deg").words
     'throw angle at (0, 0) m at least 40 deg'
     """
-    return _point_quantity("throw_angle", "rad", _throw_angle, "throw angle", at, body, tier)
-
-
-def _throw_angle(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:
-    return _ellipse(evaluation, tier, at, body).direction
+    return _point_quantity("throw_angle", "rad", _field_of_ellipse, "throw angle", at, body, tier, "direction")
 
 
 @validated
@@ -132,11 +132,7 @@ def throw_number(*, at: Sequence[Number] = (0.0, 0.0), slope: Number = 0.0, body
     ''
     """
     along = number_in(read_slope(slope), "rad", "slope")
-    return _point_quantity("throw_number", "", _throw_number, "throw number", at, body, tier, along)
-
-
-def _throw_number(evaluation: Evaluation, tier: Tier, at: Point, body: int, slope: float) -> Array:
-    return _ellipse(evaluation, tier, at, body, slope).throw_number
+    return _point_quantity("throw_number", "", _field_of_ellipse, "throw number", at, body, tier, "throw_number", along)
 
 
 @validated
@@ -225,7 +221,7 @@ def motion_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier: Ti
     >>> (motion_spread([(-1.0, 0.1), (1.0, 0.1)]) < 0.05).words
     'spread of the motions over the deck at most 0.05'
     """
-    return _deck_quantity("motion_spread", _motion_spread, "spread of the motions over the deck", points, body, tier)
+    return _deck_quantity("motion_spread", "spread of the motions over the deck", points, body, tier)
 
 
 @validated
@@ -240,24 +236,19 @@ def amplitude_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier:
     >>> amplitude_spread([(-1.0, 0.1), (1.0, 0.1)]).unit
     ''
     """
-    return _deck_quantity("amplitude_spread", _amplitude_spread, "spread of amplitudes over the deck", points, body, tier)
+    return _deck_quantity("amplitude_spread", "spread of amplitudes over the deck", points, body, tier)
 
 
-def _deck_quantity(
-    name: str, function: Callable[..., Array], text: str, points: Sequence[Sequence[Number]], body: int, tier: Tier
-) -> Quantity:
+def _deck_quantity(name: str, text: str, points: Sequence[Sequence[Number]], body: int, tier: Tier) -> Quantity:
+    """Return the quantity that is a property of the `Deck`."""
     if not isinstance(points, (list, tuple)) or len(points) < 2:
         raise InputError("points", f"is {quoted(points)}; it must be a list of at least two points (x, y)")
     places = tuple(read_point(point, f"points[{k}]") for k, point in enumerate(points))
-    return RegimeQuantity(name, "", function, tier=tier, text=text, settings=(places, count(body, "body", low=0)))
+    return RegimeQuantity(name, "", _field_of_deck, tier=tier, text=text, settings=(places, count(body, "body", low=0), name))
 
 
-def _motion_spread(evaluation: Evaluation, tier: Tier, points: tuple[Point, ...], body: int) -> Array:
-    return evaluation.working(tier).deck(points, body).motion_spread
-
-
-def _amplitude_spread(evaluation: Evaluation, tier: Tier, points: tuple[Point, ...], body: int) -> Array:
-    return evaluation.working(tier).deck(points, body).amplitude_spread
+def _field_of_deck(evaluation: Evaluation, tier: Tier, points: tuple[Point, ...], body: int, name: str) -> Array:
+    return getattr(evaluation.working(tier).deck(points, body), name)
 
 
 def synchronization_margin() -> Quantity:
@@ -376,7 +367,7 @@ def deck_points(quantities: Iterable[Quantity]) -> list[Point] | None:
         match part.settings:
             case ((float(x), float(y)), 0, *_):
                 points_of_deck[x, y] = None
-            case (tuple() as points, 0):
+            case (tuple() as points, 0, *_):
                 points_of_deck |= dict.fromkeys(points)
     return list(points_of_deck) if regime_quantities else None
 

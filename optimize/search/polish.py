@@ -181,13 +181,7 @@ def draw_starts(
         good = point.exists() & (off < FEASIBILITY_TOLERANCE)
         on_held.append(point.take(np.flatnonzero(good)))
         off_held.append(before.take(np.flatnonzero(~good)))
-    starts_on_held, starts_off_held = _concatenated(on_held), _concatenated(off_held)
-    return Starts(
-        None if starts_on_held is None else starts_on_held.take(np.arange(len(starts_on_held.z))[:starts]),
-        drawn,
-        existing,
-        None if starts_off_held is None else starts_off_held.take(np.arange(len(starts_off_held.z))[:starts]),
-    )
+    return Starts(_first_of(on_held, starts), drawn, existing, _first_of(off_held, starts))
 
 
 def _onto_held(problem: Problem, point: Point) -> Point:
@@ -201,11 +195,10 @@ def _onto_held(problem: Problem, point: Point) -> Point:
     return point
 
 
-def _concatenated(points: list[Point]) -> Point | None:
+def _first_of(points: list[Point], count: int) -> Point | None:
+    """Return the first `count` designs of all points; None if there is no design."""
     points = [p for p in points if len(p.z)]
-    if not points:
-        return None
-    return jax.tree.map(lambda *each: np.concatenate(each), *points)
+    return jax.tree.map(lambda *each: np.concatenate(each)[:count], *points) if points else None
 
 
 def polish(problem: Problem, point: Point, steps: int, report: Callable[[float, Point], None]) -> Polished:
