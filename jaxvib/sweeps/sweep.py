@@ -261,48 +261,34 @@ def run_study(
     if not os.path.exists(path):
         Store.create(path, new_study)
     opened = Store(path, writable=True)
-    with opened.locked():
-        return _compute_missing(opened, new_study, begun, workers, scheduler, timeout, report)
-
-
-def _compute_missing(
-    opened: Store,
-    new_study: Study,
-    begun: float,
-    workers: int | None,
-    scheduler: str | None,
-    timeout: Number,
-    report: Report | None,
-) -> Sweep:
-    """Compute the missing and the damaged chunks of a store that this process has locked."""
     has_functions = any(measure not in RUN_MEASURES.values() for measure in new_study.measures)
     if has_functions and not new_study.program.startswith(PYTHON) and traced_program(new_study)[1] != new_study.program:
         problem = "has a function that has changed since the study was created, or that gives another program in each call"
         raise InputError("measure", f"{problem} (a clock, random numbers, a file); pass such numbers as constants")
-    opened.require_same(new_study)
-    states = opened.states(writing=True)
-    damaged = np.flatnonzero(states == ChunkState.damaged)
-    for chunk in damaged:
-        opened.clear(int(chunk))
-    finished = states == ChunkState.finished
-    sizes = np.asarray([_cases_of_chunk(new_study, chunk) for chunk in range(finished.size)])
-    add = _reporter(new_study.grid.cases, int(np.sum(sizes[finished])), report)
-    todo = np.flatnonzero(~finished).tolist()
-    if todo:
-        if workers is None and scheduler is None:
-            source = in_parallel(lambda chunk: compute(new_study, chunk), todo)
-        else:
-            from jaxvib.sweeps.cluster import on_a_cluster  # needs Dask
+    with opened.locked():
+        opened.require_same(new_study)
+        states = opened.states(writing=True)
+        damaged = np.flatnonzero(states == ChunkState.damaged)
+        for chunk in damaged:
+            opened.clear(int(chunk))
+        finished = states == ChunkState.finished
+        sizes = np.asarray([_cases_of_chunk(new_study, chunk) for chunk in range(finished.size)])
+        add = _reporter(new_study.grid.cases, int(np.sum(sizes[finished])), report)
+        todo = np.flatnonzero(~finished).tolist()
+        if todo:
+            if workers is None and scheduler is None:
+                source = in_parallel(lambda chunk: compute(new_study, chunk), todo)
+            else:
+                from jaxvib.sweeps.cluster import on_a_cluster  # needs Dask
 
-            source = on_a_cluster(new_study, todo, workers=workers, scheduler=scheduler, timeout=timeout)
-        with contextlib.closing(source):
-            for chunk, cases in source:
-                opened.write(new_study, chunk, cases)
-                add(int(sizes[chunk]))
-    states[:] = ChunkState.finished
-    return _sweep_result(
-        opened, states, int(np.sum(sizes[~finished])), time.perf_counter() - begun, int(np.sum(sizes[damaged]))
-    )
+                source = on_a_cluster(new_study, todo, workers=workers, scheduler=scheduler, timeout=timeout)
+            with contextlib.closing(source):
+                for chunk, cases in source:
+                    opened.write(new_study, chunk, cases)
+                    add(int(sizes[chunk]))
+        states[:] = ChunkState.finished
+        spent, computed = time.perf_counter() - begun, int(np.sum(sizes[~finished]))
+        return _sweep_result(opened, states, computed, spent, int(np.sum(sizes[damaged])))
 
 
 def _reporter(cases: int, done: int, report: Report | None) -> Callable[[int], None]:
