@@ -149,7 +149,7 @@ def _source_files(scene: Scene, state: State, name: str, fmi: Fmi, drive: DriveB
     identifier = identifier if re.match("[A-Za-z]", identifier) else f"machine_{identifier}"
     body = _model_source(scene, equations, programs, variables)
     c_folder = Path(__file__).parent / "c"
-    files = {f"sources/{c_file}": (c_folder / c_file).read_bytes() for c_file in ("machine.h", f"fmi{fmi[0]}.c")}
+    files = {f"sources/{c_file}": (c_folder / c_file).read_bytes() for c_file in ("machine.h", "fmi.h", f"fmi{fmi[0]}.c")}
 
     def description(token: str) -> str:
         tool, about = f"jaxvib {version('jaxvib')}", _describe_scene(scene)

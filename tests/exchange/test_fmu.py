@@ -525,7 +525,7 @@ def test_without_a_compiler_the_source_alone_is_written(tmp_path, monkeypatch):
     assert not unit.has_binary and unit.message.startswith("source only: a C compiler (CC, cc, gcc or clang) was not found")
     assert validate_fmu(str(unit.path)) == []
     assert zipfile.ZipFile(unit.path).namelist() == [
-        "modelDescription.xml", "sources/fmi2.c", "sources/machine.h", "sources/model.h"
+        "modelDescription.xml", "sources/fmi.h", "sources/fmi2.c", "sources/machine.h", "sources/model.h"
     ]  # fmt: skip
 
 

@@ -5,34 +5,26 @@
 
 #include "machine.h"
 
-#if defined _WIN32 || defined __CYGWIN__
-#define EXPORT __declspec(dllexport)
-#elif __GNUC__ >= 4
-#define EXPORT __attribute__((visibility("default")))
-#else
-#define EXPORT
-#endif
-#define PASTE2(a, b) a##b
-#define PASTE(a, b) PASTE2(a, b)
 #ifdef FMI3_FUNCTION_PREFIX
-#define FMI(name) PASTE(FMI3_FUNCTION_PREFIX, fmi3##name)
+#define FMI(name) PASTE(FMI3_FUNCTION_PREFIX, PASTE(fmi3, name))
 #else
-#define FMI(name) fmi3##name
+#define FMI(name) PASTE(fmi3, name)
 #endif
 
 typedef enum { Ok, Warning, Discard, Error, Fatal } Status;
 typedef uint32_t Reference;
+typedef bool Bool;
+typedef uint8_t Byte;
 typedef void (*Logger)(void *environment, Status status, const char *category, const char *message);
+
+#include "fmi.h"
 
 static void log_text(Machine *m, const char *text) {
     Logger logger = *(Logger *)&m->logger;
     if (logger) logger(m->environment, Error, "logStatusError", text);
 }
 
-static Status judged(int done) { return done ? Ok : Error; }
-
 EXPORT const char *FMI(GetVersion)(void) { return "3.0"; }
-EXPORT Status FMI(SetDebugLogging)(void *m, bool on, size_t n, const char *const categories[]) { return Ok; }
 
 EXPORT void *FMI(InstantiateModelExchange)(const char *name, const char *token, const char *resources, bool visible,
                                            bool logging, void *environment, Logger logger) {
@@ -48,18 +40,10 @@ EXPORT void *FMI(InstantiateScheduledExecution)(const char *name, const char *to
                                                 void *lock, void *unlock) {
     return NULL;
 }
-EXPORT void FMI(FreeInstance)(void *m) { destroy(m); }
 
 EXPORT Status FMI(EnterInitializationMode)(void *m, bool has_tolerance, double tolerance, double start, bool has_stop,
                                            double stop) {
     set_time(m, start);
-    return Ok;
-}
-EXPORT Status FMI(ExitInitializationMode)(void *m) { return judged(update(m)); }
-EXPORT Status FMI(EnterEventMode)(void *m) { return Ok; }
-EXPORT Status FMI(Terminate)(void *m) { return Ok; }
-EXPORT Status FMI(Reset)(void *m) {
-    reset(m);
     return Ok;
 }
 EXPORT Status FMI(EnterConfigurationMode)(void *m) { return Ok; }
@@ -114,38 +98,6 @@ EXPORT Status FMI(GetVariableDependencies)(void *m, Reference r, size_t a[], Ref
 }
 EXPORT Status FMI(ActivateModelPartition)(void *m, Reference clock, double time) { return Error; }
 
-EXPORT Status FMI(GetFMUState)(Machine *m, void **state) {
-    if (!*state) *state = malloc(sizeof m->data);
-    if (!*state) return Error;
-    memcpy(*state, &m->data, sizeof m->data);
-    return Ok;
-}
-EXPORT Status FMI(SetFMUState)(Machine *m, void *state) {
-    if (!state) return Error;
-    memcpy(&m->data, state, sizeof m->data);
-    return Ok;
-}
-EXPORT Status FMI(FreeFMUState)(void *m, void **state) {
-    if (state) free(*state), *state = NULL;
-    return Ok;
-}
-EXPORT Status FMI(SerializedFMUStateSize)(void *m, void *state, size_t *size) {
-    *size = sizeof(Data);
-    return Ok;
-}
-EXPORT Status FMI(SerializeFMUState)(void *m, void *state, uint8_t bytes[], size_t size) {
-    if (!state || size < sizeof(Data)) return Error;
-    memcpy(bytes, state, sizeof(Data));
-    return Ok;
-}
-EXPORT Status FMI(DeserializeFMUState)(void *m, const uint8_t bytes[], size_t size, void **state) {
-    if (size != sizeof(Data)) return Error;
-    if (!*state) *state = malloc(sizeof(Data));
-    if (!*state) return Error;
-    memcpy(*state, bytes, sizeof(Data));
-    return Ok;
-}
-
 EXPORT Status FMI(GetDirectionalDerivative)(void *m, const Reference unknown[], size_t unknowns, const Reference known[],
                                             size_t knowns, const double seed[], size_t seeds, double sensitivity[],
                                             size_t sensitivities) {
@@ -163,42 +115,6 @@ EXPORT Status FMI(UpdateDiscreteStates)(void *m, bool *need_update, bool *termin
                                         bool *states_changed, bool *next_time_defined, double *next_time) {
     *need_update = *terminate = *nominals_changed = *states_changed = *next_time_defined = false;
     return judged(update(m));
-}
-EXPORT Status FMI(EnterContinuousTimeMode)(void *m) { return judged(update(m)); }
-EXPORT Status FMI(CompletedIntegratorStep)(void *m, bool no_return, bool *enter_event_mode, bool *terminate) {
-    *enter_event_mode = *terminate = false;
-    return Ok;
-}
-EXPORT Status FMI(SetTime)(void *m, double time) {
-    set_time(m, time);
-    return Ok;
-}
-EXPORT Status FMI(SetContinuousStates)(void *m, const double states[], size_t n) {
-    if (n != STATES) return Error;
-    set_states(m, states);
-    return Ok;
-}
-EXPORT Status FMI(GetContinuousStateDerivatives)(Machine *m, double rates[], size_t n) {
-    if (n != STATES) return Error;
-    if (!update(m)) return Discard;
-    memcpy(rates, m->data.values + AT_RATES, n * sizeof(double));
-    return Ok;
-}
-EXPORT Status FMI(GetEventIndicators)(Machine *m, double indicators[], size_t n) {
-    if (n != INDICATORS) return Error;
-    if (!update(m)) return Discard;
-    memcpy(indicators, m->data.values + AT_INDICATORS, n * sizeof(double));
-    return Ok;
-}
-EXPORT Status FMI(GetContinuousStates)(Machine *m, double states[], size_t n) {
-    if (n != STATES) return Error;
-    memcpy(states, m->data.values + AT_STATES, n * sizeof(double));
-    return Ok;
-}
-EXPORT Status FMI(GetNominalsOfContinuousStates)(void *m, double nominals[], size_t n) {
-    if (n != STATES) return Error;
-    memcpy(nominals, NOMINALS, n * sizeof(double));
-    return Ok;
 }
 EXPORT Status FMI(GetNumberOfEventIndicators)(void *m, size_t *n) {
     *n = INDICATORS;
