@@ -18,27 +18,24 @@ from collections.abc import Callable, Iterator
 from typing import Any
 from unittest import mock
 
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.extend import core
+from parts.common import busy, machine_line, published, thrown
+from parts.loads import apart
+from parts.loads import scene as balls
+
 import jaxvib as jv
+from jaxvib.motion.integration import system
+from jaxvib.motion.integration.system import PackedSystem
+from jaxvib.ode import dopri8, dopri8_loop, replay, scalarize
+from jaxvib.ode.dopri8_loop import LoopDopri8
 
 jv.prepare_cpu()
-
-import diffrax  # noqa: E402
-import equinox as eqx  # noqa: E402
-import jax  # noqa: E402
-
 jax.config.update("jax_enable_x64", True)
-
-import jax.numpy as jnp  # noqa: E402
-from jax import Array  # noqa: E402
-from jax.extend import core  # noqa: E402
-from parts.common import busy, machine_line, published, thrown  # noqa: E402
-from parts.loads import apart  # noqa: E402
-from parts.loads import scene as balls  # noqa: E402
-
-from jaxvib.motion.integration import system  # noqa: E402
-from jaxvib.motion.integration.system import PackedSystem  # noqa: E402
-from jaxvib.ode import dopri8, dopri8_loop, replay, scalarize  # noqa: E402
-from jaxvib.ode.dopri8_loop import LoopDopri8  # noqa: E402
 
 BATCH_SIZE, STEP = 64, 0.2
 

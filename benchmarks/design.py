@@ -25,15 +25,10 @@ from collections.abc import Callable
 import jax
 import numpy as np
 from parts.common import machine_line
+from parts.design_free import SIZES, gradient_cost, race
 
-jax.config.update("jax_enable_x64", True)
-
-import jaxvib as jv  # noqa: E402
-
-jv.prepare_cpu()
-from parts.design_free import SIZES, gradient_cost, race  # noqa: E402
-
-from optimize import (  # noqa: E402
+import jaxvib as jv
+from optimize import (
     DesignSpace,
     Quantity,
     expected,
@@ -44,7 +39,10 @@ from optimize import (  # noqa: E402
     support_frequency_squared,
     synthesize,
 )
-from optimize.recipes import anti_resonance  # noqa: E402
+from optimize.recipes import anti_resonance
+
+jax.config.update("jax_enable_x64", True)
+jv.prepare_cpu()
 
 FORCE = force_per_amplitude(mode=3)
 FREE = {"machine.stiffness": (0.01, 0.3), "machine.link_stiffness": (0.1, 1.0)}

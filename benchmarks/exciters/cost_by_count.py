@@ -10,16 +10,14 @@ from __future__ import annotations
 import os
 import time
 
-os.environ["JAXVIB_AUTOMATIC"] = "off"  # no program comes from a cache
+import jax
+import jax.numpy as jnp
 
 import jaxvib as jv
+from jaxvib.runtime.operations import count_operations
 
+os.environ["JAXVIB_AUTOMATIC"] = "off"  # no program comes from a cache
 jv.prepare_cpu()
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-
-from jaxvib.runtime.operations import count_operations  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 

@@ -12,15 +12,14 @@ import argparse
 import os
 import time
 
-os.environ["JAXVIB_AUTOMATIC"] = "off"  # no program comes from a cache
+import equinox as eqx
+import jax
+import numpy as np
 
 import jaxvib as jv
 
+os.environ["JAXVIB_AUTOMATIC"] = "off"  # no program comes from a cache
 jv.prepare_cpu()
-
-import equinox as eqx  # noqa: E402
-import jax  # noqa: E402
-import numpy as np  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 

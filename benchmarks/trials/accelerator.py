@@ -22,23 +22,21 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
 
-jv.prepare_cpu()
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-
-jax.config.update("jax_enable_x64", True)
-
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from parts.common import best, cpu_name, first, published, thrown, versions  # noqa: E402
+from parts.common import best, cpu_name, first, published, thrown, versions
 
-from jaxvib.equations.linear import jammed_model  # noqa: E402
-from jaxvib.steady.jams.folds import rotor_speed_at  # noqa: E402
+from jaxvib.equations.linear import jammed_model
+from jaxvib.steady.jams.folds import rotor_speed_at
+
+jv.prepare_cpu()
+jax.config.update("jax_enable_x64", True)
 
 Call = Callable[[], Any]
 

@@ -16,17 +16,17 @@ import time
 import zipfile
 from pathlib import Path
 
+import jax
+
 import jaxvib as jv
 
-jv.prepare_cpu()
-
-import jax  # noqa: E402
-
-jax.config.update("jax_enable_x64", True)
-
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from parts import native  # noqa: E402
-from parts.common import best, flat, machine_line, published, thrown  # noqa: E402
+
+from parts import native
+from parts.common import best, flat, machine_line, published, thrown
+
+jv.prepare_cpu()
+jax.config.update("jax_enable_x64", True)
 
 STEPS = 20000
 NATIVE_STAGES = 12

@@ -44,6 +44,7 @@ from jaxvib.results.status import status_name
 
 sys.path[:0] = [str(pathlib.Path(__file__).parents[2] / "tests" / name) for name in ("helpers", "validation")]
 
+import mutations  # noqa: E402
 from hard_cases.reference_integration import multipliers, run_out  # noqa: E402
 from hard_cases.reference_model import ReferenceModel, light_modes, light_speed, number_of, reference_model  # noqa: E402
 from hard_cases.shared import away, compared_state, end_of_run, light_force_slope, state_of  # noqa: E402
@@ -73,49 +74,6 @@ def not_counted(function: Callable) -> Callable:
 
 run_out, multipliers = map(not_counted, (run_out, multipliers))
 
-WORDS = (
-    *("nan", "inf", "1e400", "-1", "0", "1e-320", "true"),
-    *('""', "[]", "{}", "[[]]", '"1 m"', '"-3 rpm"', '"1 (m"', "99999999999999999999"),
-    "'x'",
-    "0x10",
-    "1_0",
-    "1979-05-27",
-    *("[1, 2]", "{a=1}", "\\u0000", "é", '"""', "[machine]", "kind =", "="),
-)
-
-
-def mutated(text: str, rng: np.random.Generator) -> str:
-    """A text with one to four changes of characters, numbers, lines or words."""
-    for _ in range(rng.integers(1, 5)):
-        lines = text.split("\n")
-        k = int(rng.integers(len(lines)))
-        words = lines[k].split(" ")
-        where = int(rng.integers(len(words)))
-        kind = int(rng.integers(7))
-        if kind == 0 and text:
-            at = int(rng.integers(len(text)))
-            text = text[:at] + chr(int(rng.integers(0, 256))) + text[at + 1 :]
-            continue
-        if kind == 1 and text:
-            at = int(rng.integers(len(text)))
-            text = text[:at] + text[at + int(rng.integers(1, 6)) :]
-            continue
-        if kind == 2:
-            lines[k] = ""
-        elif kind == 3:
-            lines.insert(int(rng.integers(len(lines))), lines[k])
-        elif kind == 4:
-            words[where] = str(rng.choice(WORDS))
-            lines[k] = " ".join(words)
-        elif kind == 5:
-            words[where] = f"{10.0 ** rng.uniform(-30, 30):.3g}"
-            lines[k] = " ".join(words)
-        else:
-            words[where] = words[where] + str(rng.choice(WORDS))
-            lines[k] = " ".join(words)
-        text = "\n".join(lines)
-    return text
-
 
 def record(rng: np.random.Generator) -> str:
     """A recorded swing as a CSV file."""
@@ -127,16 +85,12 @@ def record(rng: np.random.Generator) -> str:
 def read_file(seed: int, folder: pathlib.Path, texts: dict[str, str]) -> str:
     """Outcome of reading one mutated file."""
     rng = np.random.default_rng([seed, 2])
-    names = [*texts, "record"]
-    name = names[int(rng.integers(len(names)))]
-    if name == "record":
-        path = folder / "record.csv"
-        path.write_text(mutated(record(rng), rng), encoding="utf-8", errors="surrogatepass")
-        jv.read_record(path)
-    else:
-        path = folder / "scene.toml"
-        path.write_text(mutated(texts[name], rng), encoding="utf-8", errors="surrogatepass")
-        jv.load_scene(path)
+    name = rng.choice([*texts, "record"])
+    text, file, read = (
+        (record(rng), "record.csv", jv.read_record) if name == "record" else (texts[name], "scene.toml", jv.load_scene)
+    )
+    (folder / file).write_text(mutations.mutated_text(text, mutations.seeded(seed)), encoding="utf-8", errors="surrogatepass")
+    read(folder / file)
     return "read"
 
 
