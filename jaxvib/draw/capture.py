@@ -17,10 +17,6 @@ def threshold_chart(
 
     **Arguments** (n speeds): `speed` (n,): initial speed relative to the rotor, divided by the rotor speed; `fraction` (n,) of
     captured starts; `error` (n,): its standard error, or None; `threshold`: in the unit of `speed`, NaN for none.
-
-    >>> import numpy as np
-    >>> len(threshold_chart(np.array([-0.5, -0.1]), np.array([0.0, 1.0]), np.array([0.1, 0.1]), -0.3).axes)
-    1
     """
     figure, (axis,) = panels(1, size=(7.0, 3.4), ax=ax)
     label = "fraction"
@@ -44,10 +40,6 @@ def curve_chart(
     **Arguments** (n values): `value` (n,) of the parameter; `threshold` (n,), NaN if not all starts at the highest speed were
     captured; `uncertainty` (n,); `least` (n,): the lowest initial speed from which a start was captured. Speeds are relative to
     the rotor, divided by the rotor speed.
-
-    >>> import numpy as np
-    >>> len(curve_chart(np.arange(2.0), np.array([-0.5, np.nan]), np.array([0.1, np.nan]), np.array([-0.6, -0.2])).axes)
-    1
     """
     figure, (axis,) = panels(1, size=(7.0, 3.4), ax=ax)
     axis.fill_between(value, threshold, 0.0, color=COLORS[0], alpha=0.12, lw=0.0, label="all starts captured")
@@ -72,10 +64,6 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     - `across` (T, N): angle in the cross-section of the tube, rad; 0 is the bottom, pi/2 the outer equator
     - `rate` (T, N): speed relative to the rotor, divided by the rotor speed
     - `time` (T,): time, s
-
-    >>> import numpy as np
-    >>> len(torus_paths(*np.zeros((3, 4, 2)), np.arange(4.0)).axes)
-    2
     """
     figure, (paths, speeds) = panels(2, size=(7.0, 3.4), ax=ax)
     late = max(1, round(0.9 * time.size))

@@ -307,12 +307,7 @@ def convergence(history: np.ndarray, *, best: int, label: str, ax: Axes | None =
 
 
 def front_chart(x: np.ndarray, y: np.ndarray, *, x_label: str, y_label: str, ax: Axes | None = None) -> Drawn:
-    """Draw a Pareto front: P points, each with its number, of two minimized quantities `x` (P,) and `y` (P,).
-
-    >>> figure = front_chart(np.array([2.0, 1.0]), np.array([1.0, 3.0]), x_label="power, W", y_label="force, N")
-    >>> figure.axes[0].get_ylabel()
-    'force, N'
-    """
+    """Draw a Pareto front: P points, each with its number, of two minimized quantities `x` (P,) and `y` (P,)."""
     figure, (axis,) = panels(1, size=(6.5, 4.4), ax=ax)
     order = np.lexsort((y, x))
     axis.plot(x[order], y[order], "o-", color=COLORS[0], mfc="white", ms=5.0, label="front; numbers: its machines")
@@ -344,11 +339,6 @@ def regime_chart(
     - `drag` (n,), N s/m
     - `shares`: for each regime, the fraction (n,) of the starts that end in it
     - `omega` (n, starts), `rotor_speed`: load speed of each start and rotor speed, rad/s, drawn in `unit`
-
-    >>> import numpy as np
-    >>> figure = regime_chart(np.array([1.0, 2.0]), {"jammed": np.array([1.0, 0.5])}, np.ones((2, 3)), 2.0)
-    >>> len(figure.axes)
-    2
     """
     figure, (top, bottom) = panels(2, size=(7.5, 2.8), share_x=True, ax=ax)
     unit, scale = speed_unit(unit)

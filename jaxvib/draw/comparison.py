@@ -58,11 +58,6 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], error_levels: Sequence[
     """Draw the relative error over the time in seconds, a panel for each title, two in a row.
 
     A name has the same colour and marker in all panels, which share a legend. Dotted lines mark the `error_levels`.
-
-    >>> lines = {"exact": np.array([[1e-3, 1e-4], [2e-3, 1e-8]])}
-    >>> figure = cost_chart({"": CostPanel(lines, 1e-9, "amplitude", lines["exact"][1:])}, [1e-6])
-    >>> figure.axes[0].get_ylabel()
-    'relative error of amplitude'
     """
     names = list(dict.fromkeys(name for panel in panels_by_title.values() for name in panel.lines))
     # Colours repeat after 8 lines and markers after 7; therefore no two of the first 56 lines look the same.

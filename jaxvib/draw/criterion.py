@@ -39,11 +39,6 @@ def agreement_maps(
     - `height` (H,): load mass relative to that of the scene, on a log scale
     - `predicted` (H, S): True if the criterion predicts balancing
     - `maps`: a panel for each (title, exact), `exact` (H, S) True if the loads balance
-
-    >>> import numpy as np
-    >>> figure = agreement_maps(np.array([1.0, 2.0]), np.array([0.1, 1.0]), np.eye(2) > 0, [("", np.eye(2) > 0)])
-    >>> figure.axes[0].get_xlabel()
-    'rotor speed, rpm'
     """
     colours = ListedColormap([colour for _, colour in _KINDS])
     norm = BoundaryNorm(np.arange(len(_KINDS) + 1) - 0.5, len(_KINDS))

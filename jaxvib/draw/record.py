@@ -15,10 +15,6 @@ def swing_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: 
 
     `time` (n,) is in s, `angle` and `fitted` (n,) are in rad. The difference, record minus fit, is compared with twice the
     `noise`, rad.
-
-    >>> import numpy as np
-    >>> len(swing_chart(np.arange(3.0), np.zeros(3), np.ones(3), 0.1).axes)
-    2
     """
     degrees = 180.0 / np.pi
     figure, (top, bottom) = panels(2, size=(9.0, 2.6), share_x=True, ax=ax)
@@ -44,12 +40,7 @@ def recording_chart(
     *,
     ax: Onto = None,
 ) -> Drawn:
-    """Draw one panel for each signal (label, times s, values), and a last one for the `speed` (times s, rad/s) of the rotor.
-
-    >>> import numpy as np
-    >>> len(recording_chart([("frame, g", np.arange(9.0), np.ones(9))], (np.arange(9.0), np.ones(9))).axes)
-    2
-    """
+    """Draw one panel for each signal (label, times s, values), and a last one for the `speed` (times s, rad/s) of the rotor."""
     figure, axes = panels(len(signals) + (speed is not None), size=(9.0, 1.9), share_x=True, ax=ax)
     for axis, (label, time, values) in zip(axes, signals, strict=False):
         axis.plot(*_extremes(time, values), color=COLORS[0], lw=0.6)
@@ -81,10 +72,6 @@ def fit_chart(
 
     `time` (n,) is in s, `readings` and `fitted` (n, channels) are in SI units, `noise` (channels,) is that of the channels
     `names`.
-
-    >>> import numpy as np
-    >>> len(fit_chart(np.arange(3.0), np.zeros((3, 1)), np.ones((3, 1)), np.ones(1), ["frame"]).axes)
-    2
     """
     figure, (top, bottom) = panels(2, size=(9.0, 2.8), share_x=True, ax=ax)
     for k, name in enumerate(names):

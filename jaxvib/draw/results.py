@@ -46,11 +46,6 @@ def modes_chart(
       coordinate
     - `resonances`: resonances, rad/s, drawn as horizontal lines
     - `names`, `units` (nd,): names of the coordinates and their units, "m" or "rad"; `units` None: all m
-
-    >>> import numpy as np
-    >>> figure = modes_chart(np.array([1, 2]), np.array([3.0, 4.0]), np.array([True, False]), np.ones((2, 1)), names=["y"])
-    >>> figure.axes[1].get_ylabel()
-    'amplitude, mm, zero to peak'
     """
     unit, scale = speed_unit(unit)
     figure, (top, bottom) = panels(2, size=(6.0, 2.6), share_x=True, ax=ax)
@@ -127,10 +122,6 @@ def phase_circles(
     A black arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel.
     `resultant`: False for masses that turn in different directions, whose mean has no meaning. `weights` and `imbalance`: see
     `draw_circle`. `ax` must contain one axes object for each circle.
-
-    >>> import numpy as np
-    >>> len(phase_circles([("a", np.zeros(2)), ("b", np.ones(2))]).axes)
-    2
     """
     columns = max(len(sets), 1) if ax is not None else min(max(len(sets), 1), 4)
     rows = 1 if ax is not None else -(-max(len(sets), 1) // columns)
@@ -255,12 +246,7 @@ def speeds_chart(
 def signals_chart(
     x: np.ndarray, signals: Sequence[tuple[str, np.ndarray, Sequence[str]]], *, x_label: str, ax: Onto = None
 ) -> Drawn:
-    """Draw one panel for each signal over `x` (n,). A signal is (label with unit, values (n, k), names of its k curves).
-
-    >>> import numpy as np
-    >>> len(signals_chart(np.arange(3.0), [("angle, rad", np.ones((3, 1)), ["load"])], x_label="time, s").axes)
-    1
-    """
+    """Draw one panel for each signal over `x` (n,). A signal is (label with unit, values (n, k), names of its k curves)."""
     figure, axes = panels(len(signals), size=(7.5, 2.2), share_x=True, ax=ax)
     for axis, (label, values, names) in zip(axes, signals, strict=True):
         for k, name in enumerate(names):
@@ -273,12 +259,7 @@ def signals_chart(
 
 
 def points_chart(values: np.ndarray, *, x_label: str, y_label: str, ax: Axes | None = None) -> Drawn:
-    """Draw values (n, k) as points over their index 1 to n.
-
-    >>> import numpy as np
-    >>> points_chart(np.ones((3, 2)), x_label="run", y_label="speed, rad/s").axes[0].get_xlabel()
-    'run'
-    """
+    """Draw values (n, k) as points over their index 1 to n."""
     figure, (axis,) = panels(1, size=(7.0, 3.2), ax=ax)
     for k in range(values.shape[1]):
         mark = MARKERS[k % len(MARKERS)]
@@ -303,12 +284,7 @@ def shares_chart(
 
 
 def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Drawn:
-    """Draw Floquet multipliers (n,) in the complex plane with the unit circle.
-
-    >>> import numpy as np
-    >>> multiplier_chart(np.array([0.5 + 0.1j])).axes[0].get_xlabel()
-    'real part'
-    """
+    """Draw Floquet multipliers (n,) in the complex plane with the unit circle."""
     figure, (axis,) = panels(1, size=(4.0, 4.0), ax=ax)
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     axis.plot(np.cos(turn), np.sin(turn), color=GUIDE, lw=0.9, label="limit of stability")
@@ -369,12 +345,6 @@ def drag_diagram(
     - `jams`: jams (speed, stable) at the drag of the scene; unstable ones are hollow
     - `within`: the drag axis is from `at` / `within` to `at` x `within`; None: automatic range
     - `unit`: unit in which speeds, rad/s, are drawn
-
-    >>> import numpy as np
-    >>> drag, speed = np.array([1.0, 2.0, 1.5]), np.array([5.0, 6.0, 7.0])
-    >>> figure = drag_diagram([("together", drag, speed, drag < 1.8)], 8.0, label="drag, N s/m", at=1.2)
-    >>> figure.axes[0].get_ylabel()
-    'load speed, rpm'
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.6), ax=ax)

@@ -44,11 +44,6 @@ def label_map(
 
     The labels are codes (m, n), which are indices into `names`, or -1 for no label. `lines` contains pairs of x and y for each
     kind of bifurcation.
-
-    >>> import numpy as np
-    >>> figure = label_map(np.arange(2.0), np.arange(3.0), np.eye(3, 2, dtype=int), ["a", "b"], x_label="x", y_label="y")
-    >>> figure.axes[0].get_xlabel()
-    'x'
     """
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
     # A code -1 becomes the index of `NO_RESULT`, which is appended as the last name.
@@ -144,12 +139,7 @@ def value_map(
     log: tuple[bool, bool] = (False, False),
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw a map over x (n,) and y (m,), coloured by values (m, n); NaN is grey.
-
-    >>> import numpy as np
-    >>> len(value_map(np.arange(2.0), np.arange(3.0), np.ones((3, 2)), x_label="x", y_label="y", label="z").axes)
-    2
-    """
+    """Draw a map over x (n,) and y (m,), coloured by values (m, n); NaN is grey."""
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
     axis.set_facecolor("#dddddd")
     drawn = axis.pcolormesh(x, y, values, cmap="viridis", shading="nearest", rasterized=True)
@@ -162,12 +152,7 @@ def value_map(
 def points_over(
     x: np.ndarray, values: np.ndarray, *, x_label: str, y_label: str, log: bool = False, ax: Axes | None = None
 ) -> Drawn:
-    """Draw values (n, k) as points over x (n,).
-
-    >>> import numpy as np
-    >>> points_over(np.arange(3.0), np.ones((3, 2)), x_label="x", y_label="y").axes[0].get_ylabel()
-    'y'
-    """
+    """Draw values (n, k) as points over x (n,)."""
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     for k in range(values.shape[1]):
         axis.plot(x, values[:, k], ".", color=COLORS[k % len(COLORS)], ms=4.0)
@@ -214,12 +199,7 @@ def shares_chart(
 
 
 def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, x_label: str, ax: Axes | None = None) -> Drawn:
-    """Draw a histogram of `counts` (n,) between edges (n + 1,), and the cumulative fraction on a second axis.
-
-    >>> import numpy as np
-    >>> distribution_chart(np.arange(4.0), np.ones(3), x_label="force, N").axes[0].get_xlabel()
-    'force, N'
-    """
+    """Draw a histogram of `counts` (n,) between edges (n + 1,), and the cumulative fraction on a second axis."""
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     axis.bar(edges[:-1], counts, width=np.diff(edges), align="edge", color=COLORS[0], alpha=0.55)
     axis.set(ylabel="cases", xlabel=x_label)

@@ -36,11 +36,6 @@ def campbell_diagram(
     - `critical`: critical speeds (k,), rad/s, and their senses (k,), marked with their values on the line whirl frequency =
       rotor speed
     - `at`: working speed, rad/s; default: none
-
-    >>> import numpy as np
-    >>> n = np.linspace(0.0, 2.0, 5)
-    >>> len(campbell_diagram(n, np.ones((5, 1)), np.full((5, 1), "forward")).axes)
-    1
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)

@@ -51,14 +51,6 @@ def campbell(result: Whirl, at: float) -> str:
     **Arguments**: `result`: whirl frequencies of one scene at several rotor speeds; `at`: the working speed, rad/s.
 
     **Returns** the text of an SVG file.
-
-    >>> import jax; jax.config.update("jax_enable_x64", True)
-    >>> import numpy as np
-    >>> import jaxvib as jv
-    >>> from jaxvib.machine.files import TEMPLATES
-    >>> scene = jv.scene_from_toml(TEMPLATES["planar_rotor"])
-    >>> "whirl frequency, rpm" in campbell(jv.whirl(scene, np.linspace(0.0, 600.0, 31)), at=460.0)
-    True
     """
     scale, rotor_speed = speed_unit("rpm")[1], np.asarray(result.rotor_speed)
     speed, sense = np.asarray(result.speed), result.sense

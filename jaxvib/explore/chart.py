@@ -52,13 +52,6 @@ def chart(result: Branches, max_speed: float) -> str:
     **Arguments**: `result`: the branches of one scene; `max_speed`: the highest rotor speed in the diagram, rad/s.
 
     **Returns** the text of an SVG file.
-
-    >>> import jax; jax.config.update("jax_enable_x64", True)
-    >>> import jaxvib as jv
-    >>> from jaxvib.machine.files import TEMPLATES
-    >>> scene = jv.scene_from_toml(TEMPLATES["one_mass"])
-    >>> "foundation force, N, zero to peak" in chart(jv.branches(scene), max_speed=200.0)
-    True
     """
     scale, at = speed_unit("rpm")[1], float(result.scene.drive.speed)
     result, criterion = result.with_free_loads(_STABILITY_STRIDE)

@@ -45,13 +45,6 @@ def moving_svg(scene: Scene, jam: Jam) -> str:
 
     **Returns** the text of an SVG file, which repeats one period endlessly. **Raises** `ComputationError` for a jam mode that
     does not exist or whose motion is not finite; the message names the mode.
-
-    >>> import jax; jax.config.update("jax_enable_x64", True)
-    >>> import jaxvib as jv
-    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
-    ...                  jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
-    >>> moving_svg(scene, jv.jam_modes(scene).select(1)).count("<animate") > 10
-    True
     """
     scene = jax.device_get(drawable_scene(scene))  # see `regime_svg`
     view = view_of(scene)
@@ -74,13 +67,6 @@ def regime_svg(scene: Scene, regime: SynchronousRegime, points: Sequence[tuple[f
 
     **Returns** the text of an SVG file, which repeats one period endlessly. **Raises** `InputError` for a machine that cannot
     be drawn.
-
-    >>> import jax; jax.config.update("jax_enable_x64", True)
-    >>> import jaxvib as jv
-    >>> from jaxvib.machine.files import SCREENS
-    >>> scene = jv.scene_from_toml(SCREENS["circular_screen"])
-    >>> regime_svg(scene, jv.working_regime(scene), [(0.0, 0.0)]).count("<animate") > 10
-    True
     """
     scene = jax.device_get(drawable_scene(scene))  # the drawing computes with single numbers, for which JAX arrays are slow
     view = view_of(scene)

@@ -45,15 +45,6 @@ def response_chart(
     - `unit` of the speeds; `show`: names of panels; `ax`: axes to draw onto
 
     **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for an unknown panel.
-
-    >>> import numpy as np
-    >>> one = {"speed": np.arange(3.0), "amplitude": np.ones((3, 1)), "phase": np.zeros((3, 1)),
-    ...        "foundation_force": np.ones(3), "torque": np.ones(3), "motor_torque": np.ones(3)}
-    >>> none = {"speed": np.zeros(0), "torque": np.zeros(0)}
-    >>> figure = response_chart(one, {**{name: each[:0] for name, each in one.items()}, "stable": np.zeros(0, bool)}, none,
-    ...                         np.ones(1), names=["y1"], units=["m"], has_motor=True)
-    >>> len(figure.axes)
-    4
     """
     if isinstance(show, str) or not show or any(name not in PARTS for name in show):
         raise InputError("show", f"is {quoted(show)}; it must be a list of {', '.join(PARTS)}")

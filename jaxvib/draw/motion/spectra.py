@@ -98,13 +98,7 @@ def waterfall_chart(
 
 def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes | None = None) -> Drawn:
     """Draw paths of points by name: horizontal and vertical coordinates (nt,), m, drawn in mm or µm, with a marker at the last
-    point of each path.
-
-    >>> import numpy as np
-    >>> t = np.linspace(0.0, 6.0, 50)
-    >>> path_chart({"centre": (np.cos(t), np.sin(t))}).axes[0].get_xlabel()
-    'horizontal, mm'
-    """
+    point of each path."""
     figure, (axis,) = panels(1, size=(5.0, 4.8), ax=ax)
     unit, factor = length_unit(*(each for path in paths.values() for each in path))
     for k, (name, (x, y)) in enumerate(paths.items()):
