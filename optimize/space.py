@@ -91,11 +91,11 @@ class Column(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """Parameter `name` with its allowed `values`, ascending, SI; `start`: its index in the design vector."""
+    """Parameter `name` with its allowed `values`, ascending, SI; `entry`: its index in the design vector."""
 
     name: str
     values: tuple[float, ...]
-    start: int
+    entry: int
 
 
 class DesignSpace(Readable):

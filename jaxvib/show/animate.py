@@ -181,7 +181,7 @@ def _animation(
     figure.set_dpi(100.0)
     set_drawing_limits(stage, view.limits)
     magnify_given = None if magnify is None else float(number(magnify, "", "magnify", low=0.0, open_low=True))
-    magnification = view.magnified(shown_motion.displacement) if magnify_given is None else magnify_given
+    magnification = view.magnification(shown_motion.displacement) if magnify_given is None else magnify_given
     reach = magnification * view.scale
     farthest = float(np.max(np.abs(shown_motion.displacement), initial=0.0)) * view.scale
     if magnification * farthest > (max_shift := _MAX_DRAWN_HEIGHTS * (top - bottom)):

@@ -116,20 +116,20 @@ def _moving(
     totals = displacement @ view.foundation_stiffness.T + velocity @ view.foundation_damping.T
     forces = [view.support_forces(pose) for pose in poses]
     largest_force = max(float(np.max(np.abs(np.concatenate([np.ravel(x) for x in (*forces, *totals)])))), 1e-300)
-    magnified = view.magnified(displacement)
-    reach = magnified * view.scale
+    magnification = view.magnification(displacement)
+    reach = magnification * view.scale
     frames = [
         [*view.parts(pose, reach), *view.arrows(pose, total, 0.7 / largest_force)]
         for pose, total in zip(poses, totals, strict=True)
     ]
     for points, amplitudes in ellipses:
-        paths = [Part(view.scale * path, _PATH) for path in draw_ellipses(points, amplitudes, magnified)]
+        paths = [Part(view.scale * path, _PATH) for path in draw_ellipses(points, amplitudes, magnification)]
         for frame, turn in zip(frames, np.exp(1j * _THETA), strict=True):
             places = view.scale * points + reach * np.real(turn * amplitudes)
             frame += [*paths, *(Part(circle(tuple(at.tolist()), 0.06, 13), _POINT, True) for at in places)]
     slower = _PERIOD_SECONDS * omega / (2.0 * np.pi)
     head = (
-        f"{caption(view.scene)}\n{words}: slowed down {slower:.3g} x, displacements drawn {magnified:.3g} x as large\n"
+        f"{caption(view.scene)}\n{words}: slowed down {slower:.3g} x, displacements drawn {magnification:.3g} x as large\n"
         f"{ARROWS_NOTE}, longest {largest_force:.4g} N"
     )
     return svg(view.limits, frames, [view.texts(pose, reach) for pose in poses], head, _PERIOD_SECONDS, turns)

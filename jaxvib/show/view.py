@@ -67,7 +67,7 @@ class View(abc.ABC):
         **Arguments**: `reach`: number of units of the drawing per metre of displacement.
         """
 
-    def magnified(self, displacement: np.ndarray) -> float:
+    def magnification(self, displacement: np.ndarray) -> float:
         """Return the magnification of displacements (nt, nd) with which the largest displacement is clearly visible.
 
         The factor is relative to the parts that are drawn to scale, and has one digit. The argument `reach` of `parts` is this

@@ -182,7 +182,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
             raise InputError(f"axes.{name}", "has a value twice; give each value once")
         axis = Axis(name, unit, values, float(np.min(values)), float(np.max(values)), False, target)
     for end in (axis.low, axis.high):  # the constructors of the scene's parts check the range of each number
-        validate_scene(put(scene, (target,), jnp.asarray([end])))
+        validate_scene(put_values(scene, (target,), jnp.asarray([end])))
     return axis
 
 
@@ -232,7 +232,7 @@ def require_disjoint(scene: Scene, axes: Sequence[Axis]) -> None:
             owners[entry_of_axis] = axis.name
 
 
-def put(scene: Scene, targets: Sequence[Target], values: Array) -> Scene:
+def put_values(scene: Scene, targets: Sequence[Target], values: Array) -> Scene:
     """Return the scene with the values (axes,) of the axes in a case. Absent springs and dampers stay absent."""
     for k, target in enumerate(targets):
         if target.number is not None:

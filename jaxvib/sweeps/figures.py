@@ -17,7 +17,7 @@ from jaxvib.machine.files import scene_from_toml, suggest_name
 from jaxvib.machine.numbers.named import find_number
 from jaxvib.results.estimate import wilson
 from jaxvib.steady.orbits.diagram import exact_branches
-from jaxvib.sweeps.axes import SAMPLE, axis_of, put
+from jaxvib.sweeps.axes import SAMPLE, axis_of, put_values
 from jaxvib.sweeps.definition import WITH_RESULTS
 from jaxvib.sweeps.store import Store
 
@@ -390,16 +390,16 @@ def _theory_lines(
     for axis in store.record["axes"]:
         if axis not in (x_name, y_name) and not axis.startswith("start."):
             middle = store.read(axis)[store.group[axis].shape[0] // 2]
-            scene = put(scene, (axis_of(scene, axis, [float(middle)]).target,), jnp.asarray([middle]))
+            scene = put_values(scene, (axis_of(scene, axis, [float(middle)]).target,), jnp.asarray([middle]))
     other_axis, values, speeds = (y_name, ys, xs) if x_name == _SPEED else (x_name, xs, ys)
     fixed = other_axis.startswith("start.")
     rows = values[[0, -1]] if fixed else np.quantile(values, np.linspace(0.0, 1.0, _THEORY_ROWS))
     target = axis_of(scene, other_axis, [float(rows[0])]).target
-    scene = put(scene, (axis_of(scene, _SPEED, [float(speeds[-1])]).target,), jnp.asarray([float(np.max(speeds))]))
+    scene = put_values(scene, (axis_of(scene, _SPEED, [float(speeds[-1])]).target,), jnp.asarray([float(np.max(speeds))]))
     kinds_of_rows: list[dict[str, list[float]]] = []
     for value in rows[:1] if fixed else rows:
         try:
-            special = exact_branches(put(scene, (target,), jnp.asarray([float(value)]))).special
+            special = exact_branches(put_values(scene, (target,), jnp.asarray([float(value)]))).special
         except InputError:  # the exact method does not support this scene
             return {}
         kinds: dict[str, list[float]] = {}

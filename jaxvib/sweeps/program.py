@@ -19,7 +19,7 @@ from jaxvib.motion.integration.stiffness import equal_step_length, fastest_decay
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state
 from jaxvib.runtime.operations import program_digest
 from jaxvib.runtime.programs import cached
-from jaxvib.sweeps.axes import Axis, Target, extreme_cases, put, put_start
+from jaxvib.sweeps.axes import Axis, Target, extreme_cases, put_start, put_values
 from jaxvib.sweeps.definition import CASE_STATUSES, Study
 from jaxvib.sweeps.measures import Measure, RunMeasure
 from optimize.quantities.evaluation import Evaluation
@@ -75,7 +75,7 @@ def _measure_cases(
     """
 
     def measure_case(value: Array) -> tuple[tuple[Array, ...], Array]:
-        varied = put(scene, targets, value)
+        varied = put_values(scene, targets, value)
         evaluation, run = Evaluation(varied), None
         if plan is not None:
             separation = (
@@ -123,7 +123,7 @@ def _rates(scene: Scene, values: Array, targets: tuple[Target, ...]) -> Array:
     """
 
     def rates_of_case(value: Array) -> Array:
-        varied = put(scene, targets, value)
+        varied = put_values(scene, targets, value)
         fastest, slowest = fastest_motion(varied, _STEPS_PER_RADIAN_OF_CONTACT), frequency_bounds(varied)[1]
         total = jnp.sum(estimated_frequencies(varied) ** 2)
         return jnp.stack([fastest, -slowest, fastest_decay(varied), varied.top_speed, total])

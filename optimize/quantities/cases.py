@@ -29,7 +29,7 @@ class Changed:
     name: str
     values: tuple[tuple[str, float], ...]
 
-    several = False
+    has_several = False
 
     def scenes(self, scene: Scene) -> Scene:
         """Return the scene with these values."""
@@ -55,7 +55,7 @@ class Sampled:
     samples: int
     seed: int
 
-    several = True
+    has_several = True
 
     def factors(self, scene: Scene) -> list[tuple[NamedNumber, np.ndarray]]:
         """Return the factors (samples, entries) of each parameter, with normally distributed deviations from 1.

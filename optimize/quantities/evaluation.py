@@ -46,7 +46,7 @@ class Case(Protocol):
         ...
 
     @property
-    def several(self) -> bool:
+    def has_several(self) -> bool:
         """True if the case has several scenes."""
         ...
 

@@ -110,10 +110,12 @@ def find(problem: Problem, options: Options, report: Progress) -> SearchResult |
         begin = np.concatenate([_best_distinct(first), random])[: 2 * _STARTS_PER_BOUND]
     else:  # the best machines are near those of the first search
         begin, options = _best_distinct(first), replace(options, iterations=0, polishing=max(options.polishing, 20))
-    narrow = _in_small_batches(problem, problem.space)
+    in_small_batches = _in_small_batches(problem, problem.space)
     if len(begin) == 0:
         begin = first.point.z[:_STARTS_PER_BOUND]
-    result = _search_from_starts(narrow, replace(options, begin=begin), lambda what, share: report(what, 0.5 + 0.5 * share))
+    result = _search_from_starts(
+        in_small_batches, replace(options, begin=begin), lambda what, share: report(what, 0.5 + 0.5 * share)
+    )
     if result is None:
         return None
     interrupted = first.interrupted or result.interrupted
@@ -242,7 +244,7 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
         while queue and nodes < _MAX_NODES:
             _, _, node, initial = heapq.heappop(queue)
             numbers = problem.space.within(*node.bounds).numbers(node.point.z[node.best])
-            distances = [_distance_to_catalogue(choice.values, numbers[choice.start]) for choice in choices]
+            distances = [_distance_to_catalogue(choice.values, numbers[choice.entry]) for choice in choices]
             if max(distances) < 1e-9:
                 # The objective of every other node is at least as large.
                 return node._replace(drawn=root.drawn, existing=root.existing, interrupted=False, nodes=nodes)
@@ -274,12 +276,12 @@ def _split_bounds(node: SearchResult, choice: Choice, numbers: np.ndarray) -> It
     The catalogue of `choice` is divided into the values up to the present value of this parameter, and the values above it.
     `numbers` (d,) are the present free parameters, SI.
     """
-    allowed = [v for v in choice.values if node.bounds[0][choice.start] <= v <= node.bounds[1][choice.start]]
-    x = numbers[choice.start]
+    allowed = [v for v in choice.values if node.bounds[0][choice.entry] <= v <= node.bounds[1][choice.entry]]
+    x = numbers[choice.entry]
     for part in ([v for v in allowed if v <= x], [v for v in allowed if v > x]):
         if part:
             low, high = (b.copy() for b in node.bounds)
-            low[choice.start], high[choice.start] = part[0], part[-1]
+            low[choice.entry], high[choice.entry] = part[0], part[-1]
             yield low, high
 
 
@@ -300,7 +302,7 @@ def _nearest_choice(problem: Problem, node: SearchResult) -> SearchResult | None
     numbers = problem.space.within(*node.bounds).numbers(node.point.z[node.best])
     low, high = (b.copy() for b in node.bounds)
     for choice in problem.space.choices:
-        low[choice.start] = high[choice.start] = min(choice.values, key=lambda v: abs(v - numbers[choice.start]))
+        low[choice.entry] = high[choice.entry] = min(choice.values, key=lambda v: abs(v - numbers[choice.entry]))
     return _solve_in_bounds(problem, low, high, numbers[None], 0)
 
 
@@ -327,14 +329,14 @@ def _solve_in_bounds(
     """Polish the designs with the free parameters `numbers` (s, d), SI, in `polishing` steps within the bounds `low` and
     `high`."""
     space = problem.space.within(low, high)
-    narrow = _in_small_batches(problem, space)
+    in_small_batches = _in_small_batches(problem, space)
     z = np.asarray(space.shares(np.clip(numbers, low, high)))
-    point = evaluate(narrow, z, find_speeds(narrow, z))
+    point = evaluate(in_small_batches, z, find_speeds(in_small_batches, z))
     point = point.take(np.flatnonzero(point.exists()))
     if not len(point.z):
         return None
-    polished: Polished = polish(narrow, point, polishing, lambda *_: None)
-    final = _with_requested_modes(narrow, polished.point)
+    polished: Polished = polish(in_small_batches, point, polishing, lambda *_: None)
+    final = _with_requested_modes(in_small_batches, polished.point)
     violations = np.where(final.exists(), polished.violation, np.inf)
     if not np.any(np.isfinite(violations)):
         return None

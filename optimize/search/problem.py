@@ -248,10 +248,10 @@ def _speeds_of_branches(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ..
         paths: dict[tuple, JamModes] = {}
         for path, _ in keys:
             if path not in paths:
-                at, several = scene, False
+                at, has_several = scene, False
                 for case in path:
-                    at, several = case.scenes(at), several or case.several
-                paths[path] = jax.lax.map(jam_modes, at) if several else jam_modes(at)
+                    at, has_several = case.scenes(at), has_several or case.has_several
+                paths[path] = jax.lax.map(jam_modes, at) if has_several else jam_modes(at)
 
         def guess(path: tuple, target: tuple[str, int]) -> Array:
             modes = paths[path]

@@ -40,7 +40,7 @@ def test_catalogues_are_sorted_and_unique():
     catalogue = {"machine.stiffness": ["30 N/mm", 1e4, 3e4, 2e4], "loads.count": [4, 2, 4], "loads.drag": [0.0, 2.0]}
     space = DesignSpace(SCENE, {"machine.link_stiffness": (1e5, 3e5)}, choices=catalogue)
     assert space.counts == (2, 4) and space.size == 4
-    assert [(c.name, c.values, c.start) for c in space.choices] == [
+    assert [(c.name, c.values, c.entry) for c in space.choices] == [
         ("machine.stiffness", (1e4, 2e4, 3e4), 1),
         ("machine.stiffness", (1e4, 2e4, 3e4), 2),
         ("loads.drag", (0.0, 2.0), 3),
@@ -160,7 +160,7 @@ def test_absent_springs_stay_absent():
     np.testing.assert_allclose(space.at(jnp.array([0.0, 0.5, 1.0, 0.0])).machine.stiffness, [1e3, 0.0, 0.0, 4.55e4, 9e4])
     assert space.words()[1] == ("stiffness of support 4", "N/m")
     chosen = DesignSpace(chain, {"loads.drag": (1.0, 2.0)}, choices={"machine.stiffness": [1e3, 2e3, 9e3]})
-    assert [choice.start for choice in chosen.choices] == [1, 2, 3] and chosen.size == 4
+    assert [choice.entry for choice in chosen.choices] == [1, 2, 3] and chosen.size == 4
     np.testing.assert_allclose(chosen.low, [1.0, 1e3, 1e3, 1e3])
     for tie in (("machine.stiffness[0]", 0.5), ("machine.stiffness[0]", "keep"), "machine.stiffness[0]"):
         tied = DesignSpace(chain, {"machine.stiffness[0]": (1e4, 9e4)}, ties={"machine.damping": tie})

@@ -11,7 +11,7 @@ import pytest
 from scenes import BALLS, ROTOR, scene
 
 import jaxvib as jv
-from jaxvib.sweeps.axes import Axis, Grid, Target, axis_of, put, put_start, samples, tile_of
+from jaxvib.sweeps.axes import Axis, Grid, Target, axis_of, put_start, put_values, samples, tile_of
 from jaxvib.sweeps.study import study
 from optimize import jam_frequency
 
@@ -87,7 +87,7 @@ def test_values_are_put_into_the_named_numbers():
     targets = [axis_of(given, name, [1.0, 2.0]).target for name in names]
     values = np.array([7e4, 2.5, 30.0, 0.4, -0.1])
     moving = dataclasses.replace(jv.initial_state(given), velocity=jnp.asarray([0.3, 0.7]))
-    put_in, state = put(given, targets, values), put_start(moving, targets, values)
+    put_in, state = put_values(given, targets, values), put_start(moving, targets, values)
     assert put_in.machine.stiffness.tolist() == [5e4, 7e4] and float(put_in.loads.drag) == 2.5
     assert state.rate[0].tolist() == [0.0, 0.0, 30.0] and np.allclose(state.angle[0], 0.4 + np.deg2rad([-1.0, 0.0, 1.0]))
     assert state.velocity.tolist() == [-0.1, -0.1] and state.displacement.tolist() == [0.0, 0.0]
@@ -106,7 +106,7 @@ def test_an_axis_of_an_array_adds_no_spring():
     machine = jv.two_mass(mass=(50.0, 40.0), stiffness=(4e4, 0.0), damping=(0.0, 0.0), link_stiffness=1e5, link_damping=60.0)
     given = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
     axis = axis_of(given, "machine.stiffness", [1e4, 2e4])
-    assert put(given, (axis.target,), np.array([2e4])).machine.stiffness.tolist() == [2e4, 0.0]
+    assert put_values(given, (axis.target,), np.array([2e4])).machine.stiffness.tolist() == [2e4, 0.0]
     with pytest.raises(jv.InputError, match=r"axes\.machine\.damping is 0 in every entry"):
         axis_of(given, "machine.damping", [1.0, 2.0])
 

@@ -99,7 +99,7 @@ class Routes:
             if not path:
                 return speed_of_target(jv.jam_modes(scene), asked)
             at = path[0].scenes(scene)
-            return jax.vmap(lambda s: of(s, path[1:], asked))(at) if path[0].several else of(at, path[1:], asked)
+            return jax.vmap(lambda s: of(s, path[1:], asked))(at) if path[0].has_several else of(at, path[1:], asked)
 
         return {(path, asked): of(scene, path, asked) for path, asked in self.keys}
 
