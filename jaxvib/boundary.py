@@ -1,9 +1,9 @@
 """Checks of the arguments of public functions against the annotations of their signatures.
 
 The decorator `validated` is applied to every public function and to the public methods of results. An argument of a wrong type,
-such as None in place of a scene, a string in place of a count or a list in place of a function, therefore raises an error with
-a message of one sentence before anything is traced. Each function itself checks the properties that a type does not express:
-bounds, units and names of parameters.
+such as None in place of a scene or a string in place of a count, therefore raises an error before anything is traced. The
+message of this error is one sentence. Each function itself checks the properties that a type does not express: bounds, units
+and names of parameters.
 """
 
 from __future__ import annotations

@@ -151,8 +151,8 @@ def _search_options(table: Tables) -> Tables:
 def _read_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Catalogue | None:
     """Return the catalogue of a choice, or None if the design file itself contains the values.
 
-    The catalogue is a column of a CSV file (`values` is a table with `file` and, if necessary, `column`), or several columns
-    whose rows belong together (a table with `file` and `columns`).
+    A table `values` with `file` and, if necessary, `column` selects a column of a CSV file. A table with `file` and `columns`
+    selects several columns whose rows belong together.
     """
     if not isinstance(values, Mapping) or any("." in parameter for parameter in values):
         return None

@@ -163,8 +163,9 @@ def pareto(
 def not_dominated(values: np.ndarray) -> list[int]:
     """Return the indices of rows of `values` (n, q) that no other row dominates, ordered by their first column.
 
-    If rows are equal, one of them is returned. Row a is not worse than row b if, in each column, a exceeds b by less than 1e-6
-    of the range of the column or 1e-7 of its largest value, whichever is larger: demands are met to this accuracy.
+    If rows are equal, one of them is returned. Row a is not worse than row b if a exceeds b in no column by more than a
+    tolerance. The tolerance is 1e-6 of the range of the column or 1e-7 of its largest value, whichever is larger, because
+    demands are met to this accuracy.
     """
     span = np.maximum(np.ptp(values, axis=0), 0.1 * np.max(np.abs(values), axis=0))
     scaled = values / np.where(span > 0.0, span, 1.0)

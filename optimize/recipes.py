@@ -124,8 +124,8 @@ def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
     """Return the design task for an anti-resonance machine of three masses: least middle amplitude per outer amplitude.
 
     The springs of the links are free, and the frequency of the jam keeps its value. The outer amplitude is the amplitude of the
-    displacement of platform 1 relative to platform 3. Without damping and without a link 1-3, a natural mode of the frequency w
-    leaves the middle platform (2) at rest if (k1 + k12)/M1 = (k3 + k23)/M3 = w^2, with the stiffnesses k1 and k3 of the
+    displacement of platform 1 relative to platform 3. Without damping and without a link 1-3, the middle platform (2) is at
+    rest in a natural mode of the frequency w if (k1 + k12)/M1 = (k3 + k23)/M3 = w^2. k1 and k3 are the stiffnesses of the
     supports.
 
     **Arguments**: `scene`: at least three platforms with loads; `mode`: number of the jam mode; `range_`: as for `antiphase`.
@@ -195,7 +195,7 @@ def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[
     relative to the present one; typical: 0.7 to 1 (default 0.9).
 
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` if `keep` is not greater than 0 and
-    at most 1, for a machine without platforms, and for a jam mode that does not exist at the rotor speed of the scene.
+    at most 1. A machine without platforms raises it too, and a jam mode that does not exist at the rotor speed of the scene.
     """
     count(mode, "mode")
     share = number_in(keep, "", "keep")

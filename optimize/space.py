@@ -113,7 +113,7 @@ class DesignSpace(Readable):
       that are 0 stay 0, as in `free`
     - `choices`: a mapping from the name of a parameter to its allowed values, such as the springs of a catalogue, or from
       "loads.count" to allowed numbers of loads; typical: 2 to 20 values. If several values belong together, as those of a
-      motor, the key is any name, and the value is a mapping from parameters to the columns of a catalogue, for example
+      motor, the key is any name. Its value is then a mapping from parameters to the columns of a catalogue, for example
       {"motor": {"drive.speed": ["1450 rpm", "970 rpm"], "drive.inertia": [0.01, 0.02]}}. The values of the first column must
       differ
 

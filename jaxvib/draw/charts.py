@@ -204,8 +204,8 @@ def crossings(
 ) -> list[tuple[int, float, str, bool]]:
     """Return the intersections of a branch with the rotor speed `at`.
 
-    Each is a tuple of the index of the point before it, the fraction of the distance to the next point, the number of the mode,
-    and True if it is stable.
+    Each is a tuple (index of the point before it, fraction of the distance to the next point, number of the mode, True if it is
+    stable).
     """
     if at is None:
         return []

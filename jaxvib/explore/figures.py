@@ -135,7 +135,7 @@ def _draw_all(scene: Scene) -> None:
 
 
 def has_branches(scene: Scene) -> bool:
-    """Return True if the jams of the scene form branches over the rotor speed, that is, if it has one exciter with loads on a
+    """Return True if the jams of the scene form branches over the rotor speed. This requires one exciter with loads on a
     machine that moves only up and down."""
     return scene.is_plain and scene.mounting.axes == (1,)
 
@@ -182,9 +182,9 @@ def heading(scene: Scene) -> str:
 def diagram(scene: Scene, max_speed: float) -> str:
     """Draw the diagram of a scene.
 
-    It is the branch diagram with amplitudes and force for one exciter with loads on a machine that moves only up and down, and
-    the Campbell diagram if the machine moves in two directions. For other scenes (exciters with unbalances, several exciters),
-    it shows synchronous regimes over the speed of the drives.
+    For one exciter with loads, it is the branch diagram with amplitudes and force if the machine moves only up and down, and
+    the Campbell diagram if it moves in two directions. For other scenes (exciters with unbalances, several exciters), it shows
+    synchronous regimes over the speed of the drives.
 
     **Arguments**: `max_speed`: the highest rotor speed in the diagram, rad/s; the diagram always reaches at least 1.15 times
     the rotor speed of the scene.

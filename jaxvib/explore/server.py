@@ -1,7 +1,7 @@
 """Server of the page of `jaxvib explore`. It listens only on this computer.
 
 A browser lets every open web site send requests to servers on the same computer. The address of the page therefore contains a
-random token, and a request is answered only if it has that token, names this computer as its host, and comes from the page.
+random token. A request is answered only if it has this token, names this computer as its host, and comes from the page.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bo
     - Programs that differ in shapes, in options, in a version of jaxvib or JAX, or in the CPU have different keys. The
       folder may be deleted at any time
     - A program that calls back into Python, such as one with a progress bar, cannot be stored
-    - No program is stored or read while a function or a constant of the package is replaced (by a mock, for example), or after
-      a source file was edited since its import
+    - No program is stored or read while a function or a constant of the package is replaced, for example by a mock. The same
+      applies if a source file was edited after its import
 
     **Arguments**
 
@@ -97,8 +97,8 @@ def compiled_anew() -> Iterator[None]:
 
 
 def require_own(folder: Path) -> None:
-    """Raise `InputError` if another user owns a folder or may write to it, or if a folder above it belongs to another user
-    (except root) or lets every user replace its contents."""
+    """Raise `InputError` if another user owns a folder or may write to it. The same applies to a folder above it that belongs
+    to another user (except root), or whose contents every user can replace."""
     if not hasattr(os, "geteuid"):  # on Windows only the owner can write to a home folder
         return
     for place in (folder, *folder.resolve().parents):

@@ -16,9 +16,8 @@ from jaxvib.runtime.cpu import has_flags, limit_blas_threads, prepare_cpu
 def start() -> None:
     """Call `prepare_cpu()` and `use_cache()`, unless they were called before or JAXVIB_AUTOMATIC=off in the environment.
 
-    `prepare_cpu` is called only with versions of XLA that need its flags. The function `start` is called by the first use of a
-    public name of jaxvib, other than errors and names of `jaxvib.runtime`, and when the first part of a scene is made. It
-    issues a warning
+    `prepare_cpu` is called only with versions of XLA that need its flags. `start` is called when the first part of a scene is
+    made, and by the first use of a public name of jaxvib other than errors and names of `jaxvib.runtime`. It issues a warning
 
     - with such a version, if JAX has already begun to compute, because XLA's options then have no effect
     - if programs cannot be cached

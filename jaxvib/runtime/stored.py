@@ -81,8 +81,8 @@ class StoredFunction(Generic[T]):
 
     Programs of arrays on several devices belong to `jitted`; their memory is not limited.
 
-    In a process whose code differs from the source files (see `jaxvib.code_changes`), no program is stored or read, and
-    programs that were traced from the former code are not used again.
+    In a process whose code differs from the source files (see `jaxvib.code_changes`), no program is stored or read. Programs
+    that were traced from the former code are not used again.
     """
 
     def __init__(self, function: Callable[..., T]):

@@ -56,11 +56,11 @@ def moving_svg(scene: Scene, jam: Jam) -> str:
 
 
 def regime_svg(scene: Scene, regime: SynchronousRegime, points: Sequence[tuple[float, float]] = ()) -> str:
-    """Return the sketch of a scene that moves in a synchronous regime, with the forces on the foundation as arrows, and with
-    the ellipses on which points of the body move.
+    """Return the sketch of a scene that moves in a synchronous regime, with the forces on the foundation as arrows.
 
-    If an exciter has an unbalance, the rotors are drawn with one turn per period of the vibration. If all exciters have loads,
-    the number of turns per period is the rotor speed divided by the load speed in the first exciter.
+    The paths (ellipses) of the `points` of the body are drawn, too. If an exciter has an unbalance, the rotors are drawn with
+    one turn per period of the vibration. If all exciters have loads, the number of turns per period is the rotor speed divided
+    by the load speed in the first exciter.
 
     **Arguments**: `scene`, whose exciters have an unbalance or loads; a `regime` of it; `points` (x, y) of a body in a plane,
     m.

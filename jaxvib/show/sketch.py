@@ -50,9 +50,11 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
 
     **Returns** a matplotlib figure, or the given `ax`.
 
-    **Raises** `InputError` for an argument that is not a scene, a scene with traced values (within `jit` or `grad`), a machine
-    that cannot be drawn (such as several bodies in a plane), a rotor with several exciters, or a `deck` on a machine other than
-    a body in a plane.
+    **Raises** `InputError` for
+
+    - an argument that is not a scene, and a scene with traced values (within `jit` or `grad`)
+    - a machine that cannot be drawn, such as several bodies in a plane, and a rotor with several exciters
+    - a `deck` on a machine other than a body in a plane
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),

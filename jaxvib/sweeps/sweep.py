@@ -177,8 +177,8 @@ def sweep(
     - `store`: a folder, usually with the ending ".zarr"
     - `tier` of quantities of a jam: "leading" (light loads), "exact" (exact orbits) or "time" (full equations); default: the
       tier of each quantity
-    - `start`, `mode`: initial state of runs, "rest" (the default), "spin_up" (drives of constant speed are accelerated from
-      rest during half of the run), or "jam" for a start near the jam mode `mode`; axes whose names begin with
+    - `start`, `mode`: initial state of runs: "rest" (the default), "spin_up", or "jam" for a start near the jam mode `mode`.
+      With "spin_up", drives of constant speed are accelerated from rest during half of the run. Axes whose names begin with
       "start." change entries of this state
     - `until`: end of runs, s or text; typical: 5 to 60
     - `steps`: number of equal steps of a run, the same in all cases; default: one for each radian of the fastest motion of

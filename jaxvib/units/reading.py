@@ -136,8 +136,8 @@ def _example(unit: str) -> str:
 def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray | np.number:
     """Return the magnitude of `value` in the SI unit `unit`; a number without a unit is already in `unit`.
 
-    Strings and pint quantities are converted. If `unit` contains an angle, a frequency in hertz counts as revolutions per
-    second (pint alone would convert 25 Hz to 25 rad/s), "1500 1/min" is 1500 rpm, and 1/s without an angle raises an error.
+    Strings and pint quantities are converted. If `unit` contains an angle, "1500 1/min" is 1500 rpm, 1/s without an angle
+    raises an error, and a frequency in hertz counts as revolutions per second. (pint alone would convert 25 Hz to 25 rad/s.)
     Stiffnesses, dampings, masses and unbalances of several equal parts side by side are added: "4 x 50 N/mm". A stiffness may
     be a deflection of the spring under a mass or a force: "25 mm under 650 kg".
 
@@ -192,8 +192,8 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
 def _stiffness_under(deflection: str, load: str, value: str, field: str) -> float:
     """Return the stiffness, N/m, of a spring that deflects under a mass or a force.
 
-    **Raises** `InputError` for texts that are not such quantities or not positive, and for "4 x 25 mm under 650 kg", because it
-    does not state whether each spring carries the mass.
+    **Raises** `InputError` for texts that are not such quantities, and for values that are not positive. The text
+    "4 x 25 mm under 650 kg" raises it too, because it does not state whether each spring carries the mass.
     """
     if _SEVERAL.fullmatch(deflection):
         problem = f"is {quoted(value)}, which can mean the load of one spring or of all together"

@@ -57,8 +57,8 @@ def _row_prefix(cell: str) -> str:
 
 
 def _column(path: str | Path, unit: str, column: str | None) -> tuple[float, list[tuple[int, str, str]]]:
-    """Return the factor from the unit of a column to the SI unit, and (number of the row, cell in the column, first cell) for
-    each row in which the cell is not empty."""
+    """Return the factor from the unit of a column to the SI unit, and (number of the row, cell in the column, first cell of the
+    row) for each row. Rows with an empty cell in the column are left out."""
     (_, head), *rows = _rows(path)
     names = [split_head(each, unit) for each in head]
     matching = [k for k, (name, head_unit) in enumerate(names) if _matches(head[k], name, head_unit, unit, column)]

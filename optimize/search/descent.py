@@ -35,8 +35,7 @@ class _SearchState(NamedTuple):
 
     It contains the design with its values and derivatives (as in `Point`), the state of Adam, the step length, and the
     multipliers and the weight of the demands. `worst` is the largest violation of a demand at the last update of the
-    multipliers, `scale` the modulus of the initial objective, by which the objective is divided, and `steps` the number of
-    steps.
+    multipliers. The objective is divided by `scale`, the modulus of the initial objective. `steps` is the number of steps.
     """
 
     z: Array
@@ -154,10 +153,10 @@ def _run_steps(problem: Problem, states: _SearchState, rates: Array) -> tuple[_S
 def descend(problem: Problem, point: Point, steps: int, rate: float, report: Callable[[float, Point], None]) -> Descended:
     """Descend by Adam from all starts at once; each step keeps the held quantities and corrects their deviations.
 
-    Demands are included by the augmented Lagrangian sum_i (max(0, l_i + w g_i)^2 - l_i^2)/(2 w) with the excesses g_i, the
-    multipliers l_i and the weight w, which are updated every 20 steps. A step is rejected, and the step length of this search
-    is halved, if a quantity does not exist for the new design or if a held quantity deviates by more than 10 %. `report` is
-    called with the progress (0 to 1) and the point.
+    Demands are included by the augmented Lagrangian sum_i (max(0, l_i + w g_i)^2 - l_i^2)/(2 w) with the excesses g_i. The
+    multipliers l_i and the weight w are updated every 20 steps. A step is rejected if a quantity does not exist for the new
+    design, or if a held quantity deviates by more than 10 %. The step length of this search is then halved. `report` is called
+    with the progress (0 to 1) and the point.
 
     **Returns** `Descended`.
     """

@@ -96,8 +96,8 @@ def restore(
 ) -> Point:
     """Change designs as little as possible, to first order, so that they meet their constraints within the bounds.
 
-    The constraints are the held quantities, the demands that are violated or marked in `demanded` (designs, demands), and the
-    equality of those pieces of the objective whose weight in `shares` (designs, pieces) is not 0.
+    The constraints are the held quantities, and the demands that are violated or marked in `demanded` (designs, demands). If
+    `shares` (designs, pieces) are given, the pieces of the objective with a share must be equal, too.
     """
     m, mi = problem.equalities, len(problem.demands)
     if m + mi == 0 and shares is None:

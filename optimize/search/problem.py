@@ -5,8 +5,8 @@ Jams are followed from one design to the next: each search for a jam starts near
 The designs are computed in batches of at most 64, which run in parallel on all cores. The main compiled programs are the
 derivatives of a batch (`evaluate`) and a number of steps of the descent (`descent`).
 
-Sizes of arrays: s designs z in [0, 1]^d, in which each of the d free parameters is scaled to its bounds, me held quantities
-(equalities), mi demands (inequalities), p pieces of the objective, q quantities.
+Sizes of arrays: s designs, d free parameters, me held quantities (equalities), mi demands (inequalities), p pieces of the
+objective, q quantities. In a design z in [0, 1]^d, each free parameter is scaled to its bounds.
 """
 
 from __future__ import annotations
@@ -187,8 +187,8 @@ class Point(NamedTuple):
 def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand], starts: int = _MAX_BATCH_SIZE) -> Problem:
     """Return the problem of a search with its followed speeds and the scale of each demand.
 
-    The scale is the modulus of the limit. If the limit is 0 or a quantity, it is the larger of the moduli of the demand's
-    quantity and limit for the initial design, or 1 if both are 0 within rounding or one of them is not finite.
+    The scale is the modulus of the limit. If the limit is 0 or a quantity, the scale is the larger modulus of the demand's
+    quantity and limit for the initial design. It is 1 if both are 0 within rounding, or if one of them is not finite.
     """
     forms = tuple(demand.form() for demand in demands)
     keys, parts, program = _targets_of_search(space, objective, forms)
@@ -315,8 +315,9 @@ class _Shapes(NamedTuple):
 
 
 def find_targets(quantities: Sequence[Quantity], scene: Scene) -> tuple[tuple[Key, ...], int, str]:
-    """Return the keys of the load speeds that these quantities of a scene follow, the number of smooth pieces whose maximum is
-    the first quantity, and the digest of the program of the quantities, "" without a function of the user.
+    """Return the keys of the load speeds that these quantities follow, the number of pieces of the first quantity, and a
+    digest. The pieces are smooth, and their maximum is the quantity. The digest is that of the program of the quantities, "" if
+    they contain no function of the user.
 
     The digest is an argument of the compiled functions, because a user's function still compares equal after a change of its
     global variables. Without the digest, the program from before the change would be used again.

@@ -143,9 +143,9 @@ def audit(
       timings, which saves a compilation for each effect
     - `progress`: a function that is called with the name of each step and the finished share of all steps (0 to 1)
 
-    **Returns** `Audit`. **Raises** `InputError` for an accuracy that is not between 0 and 1, for a possible effect that the
-    scene has already and can have only once, `ComputationError` (status "absent") for a mode that does not exist, and the
-    errors of `jam_modes` and `simulate`.
+    **Returns** `Audit`. **Raises** `InputError` for an accuracy that is not between 0 and 1, and for a possible effect that the
+    scene has already and can have only once. For a mode that does not exist, it raises `ComputationError` (status "absent").
+    The errors of `jam_modes` and `simulate` are raised unchanged.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

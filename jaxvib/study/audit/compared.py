@@ -39,10 +39,10 @@ class EffectRow(NamedTuple):
 
     - `effect`: its name; `present`: True if the scene has the effect, which was removed, False if the effect was added; `tier`
       of the computation
-    - changes caused by the effect, relative to the value for the scene: `amplitude` (of the coordinate with the largest change;
-      relative to the largest amplitude with the same unit, or to a hundredth of the unbalance radius of the loads if the
-      machine hardly moves), `foundation_force`, `omega` of the loads, `fold` (the rotor speed at which the jam ends); NaN if
-      unknown
+    - changes caused by the effect, relative to the value for the scene, NaN if unknown: `amplitude`, `foundation_force`,
+      `omega` of the loads, `fold` (the rotor speed at which the jam ends). `amplitude` is that of the coordinate with the
+      largest change. Its change is relative to the largest amplitude with the same unit or, if the machine hardly moves, to a
+      hundredth of the unbalance radius of the loads
     - `uncertainty` of these changes
     - cost of the effect (value with the effect minus value without it): `operations` of the equations of motion; `seconds` of a
       run of 100 turns; `compile`: CPU time to trace and compile that run, s; NaN without timings. Small differences of

@@ -43,14 +43,14 @@ def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -
     contact and lift, whose limit is 1.
 
     - gravity on the loads: g/(R Omega^2), its share in the normal force of a load on its track
-    - crowding: if the N loads do not fit on the track, the share of the track that their diameters fill, N arcsin(r/R)/pi,
-      where r is `ball_radius`, or the radius of steel balls of the same mass. If the loads fit and have no `ball_radius`: the
-      share of the unbalance that is lost if they lie side by side, 1 - sin(N a)/(N sin a), sin a = r/R
+    - crowding: if the N loads do not fit on the track, the share of the track that their diameters fill, N arcsin(r/R)/pi. If
+      they fit and have no `ball_radius`: the share of the unbalance that is lost if they lie side by side, 1 - sin(N a)/(N sin
+      a), sin a = r/R. r is `ball_radius`, or the radius of steel balls of the same mass
     - contact: diameter of the loads divided by the smallest distance of two loads, if the scene has no contact between loads
     - dry friction divided by viscous friction: friction of a ball bearing, or of steel on steel, divided by the drag torque
       b_W R^2 (n - Omega)
-    - gyroscopic, if the machine cannot tilt: sum kappa m / M. This is the effective moment of inertia sum kappa m R^2 of the
-      loads about the axis of the rotor, divided by M R^2, the moment of inertia of a machine with the radius of gyration R
+    - gyroscopic, if the machine cannot tilt: sum kappa m / M. This is a ratio of two moments of inertia: that of the loads
+      about the axis of the rotor (effective, sum kappa m R^2), and that of a machine with the radius of gyration R (M R^2)
     - lift, for machines that move up and down: foundation force divided by the weight; above 1, supports under the machine
       would have to pull
 

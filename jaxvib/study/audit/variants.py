@@ -88,8 +88,8 @@ def require_absent(scene: Scene, possible: Sequence[Effect]) -> None:
 def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[Effect] | None) -> Iterator[Variant]:
     """Yield variants of the scene with one effect that it lacks and could have.
 
-    The effects are those of `given`. If it is None, they are those of the package with typical values (`Effect.typical`), and
-    the last variant of a scene with constant rotor speed has a speed that is lower by `_DROOP`, as with a motor.
+    The effects are those of `given`; if it is None, those of the package with typical values (`Effect.typical`). For a scene
+    with constant rotor speed, a last variant then has a speed that is lower by `_DROOP`, as with a motor.
 
     **Arguments**: `amplitude` (nd,): amplitudes of the coordinates, m or rad, for the typical values.
     """

@@ -94,8 +94,8 @@ def turning_points(record: Record) -> TurningPoints:
     """Return the turning points of a recorded swing, each from the samples within a sixth of a period before and after it.
 
     The arc c + a cos(v t) + b sin(v t) is fitted to these samples; its extremum is the turning point. With v = w sqrt(cos A),
-    where w is the frequency of small swings and A the amplitude, the fourth derivative of the arc at the turning point is also
-    that of a large swing. The noise is computed from the deviations of the samples from all these arcs.
+    the fourth derivative of the arc at the turning point is also that of a large swing. w is the frequency of small swings, and
+    A the amplitude. The noise is computed from the deviations of the samples from all these arcs.
 
     **Returns** `TurningPoints`. **Raises** `InputError` for a record with fewer than three turning points, or too few samples
     in a period.

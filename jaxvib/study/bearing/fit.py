@@ -66,8 +66,8 @@ def first_guess(
     **Arguments**: `dry`, `air`, `torque`: True if this part of the law is an unknown of the fit; the initial drag of the air
     and the initial torque are 0.
 
-    In half a period, a swing loses the share pi mu1/(2 J w) of its amplitude to viscous friction, and the angle 2 T_f/(m g l)
-    to dry friction with the torque T_f. mu1, J, m, g and l are those of `BearingPendulum`; w is the frequency of small swings.
+    In half a period, viscous friction reduces the amplitude by the share pi mu1/(2 J w), and dry friction with the torque T_f
+    by the angle 2 T_f/(m g l). mu1, J, m, g and l are those of `BearingPendulum`; w is the frequency of small swings.
     """
     a = turns.amplitude
     stretch = period_stretch(a)

@@ -25,9 +25,8 @@ from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, Friction
 
 _MAX_HALF_PERIODS = 1.3
-"""Longest time, in half periods, from the first sample to the first turning point, or from the last turning point to the last
-sample, if the pendulum swings (a swing needs at most 1.2). If the time is longer, the record begins before the release, or ends
-with the pendulum at rest."""
+"""Longest time, in half periods, between an end of the record and the next turning point, if the pendulum swings (a swing needs
+at most 1.2). If the time is longer, the record begins before the release, or ends with the pendulum at rest."""
 
 _PATTERN_PROBABILITY = 1e-5
 """Probability with which the F test of residuals that are pure noise gives the status `patterned`."""
@@ -135,8 +134,9 @@ def identify_bearing(
 
     f is the angle; the other symbols are those of `BearingPendulum`.
 
-    - Least squares over the angle and rate at the first sample, the offset, the frequency of small swings and the friction, by
-      Levenberg and Marquardt's method with forward-mode derivatives through the integration
+    - The unknowns of the least-squares fit are the angle and rate at the first sample, the offset, the frequency of small
+      swings and the friction. The method is that of Levenberg and Marquardt, with forward-mode derivatives through the
+      integration
     - The frequency is a free parameter, because the dimensions of a pendulum are never known accurately enough to predict the
       phase of many swings; g is adapted to the frequency. J is taken from `pendulum`; therefore mu1 is proportional to this J
     - Samples before the release are not used. If the record continues for more than 1.3 half periods after the last clear

@@ -36,8 +36,8 @@ class Record(Readable):
     - `angle` (n,), rad, relative to any position; typical: 0.05 to 1
     - `name` for messages
 
-    **Raises** `InputError` for lengths that differ, fewer than 16 samples, times that do not ascend, values that are not
-    finite, and angles with a range above one full turn, which are probably degrees.
+    **Raises** `InputError` for lengths that differ, fewer than 16 samples, times that do not ascend, and values that are not
+    finite. It is also raised for angles with a range above one full turn, which are probably degrees.
 
     >>> import numpy as np, jaxvib as jv
     >>> t = np.arange(0.0, 10.0, 0.04)

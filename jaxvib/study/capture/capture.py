@@ -184,8 +184,8 @@ def capture(
     - With a `resolution`, the interval between the two computed speeds around the threshold is divided by further speeds until
       it is small enough. The range above the first threshold is not refined: failures in an interval that is narrower than the
       spacing of the `speeds` may remain undetected
-    - The scan is repeated with twice as many steps until the threshold changes by no more than the resolution or, without one,
-      by no more than the spacing of the `speeds`
+    - The scan is repeated with twice as many steps until the threshold changes by no more than the resolution (without a
+      resolution: the spacing of the `speeds`)
 
     **Arguments**
 
@@ -202,8 +202,9 @@ def capture(
     - `rotation`: "rolling", for balls that roll from the start, or "none", for balls that do not rotate at the start and
       therefore slide until they roll; "none" needs the effect `Sliding`
     - `stepsize_controller`: `EqualSteps(n)` for the whole run, without doubling. By default the first scan has the largest of
-      three numbers of steps: 1 for each radian of the fastest vibration, 2 for each radian of the motion in a contact between
-      balls or at the end of a slip, 1 for every three time constants of the fastest decay; typical: 200 for each turn
+      three numbers of steps; typical: 200 for each turn. They are 1 for each radian of the fastest vibration, 2 for each radian
+      of the motion in a contact between balls or at the end of a slip, and 1 for every three time constants of the fastest
+      decay
     - `doublings`: largest number of times that the default steps are doubled; typical: 2 (the default); 0 for a single scan.
       With one doubling the work is three times that of a single scan
     - `equations`: as for `ensemble`
@@ -356,8 +357,8 @@ def _summarize_captures(
 def capture_time(run: Run, within: float = 0.05) -> Array:
     """Return the time, s, after which all load speeds stay within a band around the rotor speed.
 
-    This is the last time in the trajectory of the run at which the speed of a load differs from the rotor speed by more than
-    `within` times the rotor speed, interpolated linearly between the stored states. Forward and reverse derivatives exist. They
+    This is the last time in the trajectory at which the speed of a load differs from the rotor speed by more than `within`
+    times the rotor speed. It is interpolated linearly between the stored states. Forward and reverse derivatives exist. They
     describe the entry of one load into the band. If a parameter changes so much that another entry becomes the last one, the
     time jumps; the derivatives do not show this jump.
 
