@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
 from jaxvib.display import Drawn, Onto
-from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, panels
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, color_of, legend_above, panels
 
 
 def threshold_chart(
@@ -68,7 +68,7 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     figure, (paths, speeds) = panels(2, size=(7.0, 3.4), ax=ax)
     late = max(1, round(0.9 * time.size))
     for j in range(around.shape[1]):
-        colour = COLORS[j % len(COLORS)]
+        colour = color_of(j)
         x, y = _wrapped(around[:, j], -np.pi), _wrapped(across[:, j], -0.5 * np.pi)
         # The line is interrupted if a ball leaves the chart on one side and returns on the other.
         leaps = (np.abs(np.diff(x, prepend=x[:1])) > np.pi) | (np.abs(np.diff(y, prepend=y[:1])) > np.pi)

@@ -25,6 +25,7 @@ from jaxvib.draw.style import (
     log_ticks,
     numbered,
     panels,
+    resonance_lines,
 )
 from jaxvib.errors import InputError, quoted
 
@@ -191,8 +192,7 @@ def _speed_lines(
     axis: Axes, scale: float, resonances: np.ndarray, marks: Sequence[tuple[str, np.ndarray, np.ndarray]], high: float
 ) -> None:
     """Draw resonances, the line of equal rotor and load speeds, and marks in the panel of load speeds."""
-    for k, w in enumerate(resonances):
-        axis.axhline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "resonance")
+    resonance_lines(axis.axhline, scale * resonances)
     axis.plot([0.0, high], [0.0, high], color=GUIDE, lw=0.8, label="rotor speed", zorder=1.0)
     for (label, x, y), shape in zip(marks, itertools.cycle("osD^vPX"), strict=False):
         axis.plot(scale * x, scale * y, shape, ms=5.0, mfc="white", mec=COLORS[1], mew=1.2, label=label, ls="", zorder=3)

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, MARKERS, STROKES, Look, legend_above, log_ticks, panels
+from jaxvib.draw.style import COLORS, MARKERS, STROKES, Look, color_of, legend_above, log_ticks, panels
 
 
 def tiers_chart(
@@ -61,7 +61,7 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], error_levels: Sequence[
     """
     names = list(dict.fromkeys(name for panel in panels_by_title.values() for name in panel.lines))
     # Colours repeat after 8 lines and markers after 7; therefore no two of the first 56 lines look the same.
-    looks = {name: (COLORS[k % len(COLORS)], "os^Dv*P"[k % 7]) for k, name in enumerate(names)}
+    looks = {name: (color_of(k), "os^Dv*P"[k % 7]) for k, name in enumerate(names)}
     columns = len(panels_by_title) if ax is not None else min(2, len(panels_by_title))
     figure, cells = panels(-(-len(panels_by_title) // columns), columns, size=(6.6, 4.4), ax=ax)
     for spare in cells[len(panels_by_title) :]:
@@ -157,7 +157,7 @@ def stability_chart(
         axes.set_xlim(low, high)
     for k, (kind, points) in enumerate(marks.items()):
         # Points of different kinds can lie on each other: hollow marks of different sizes remain visible.
-        look: Look = {"mec": COLORS[k % len(COLORS)], "mfc": "none", "mew": 1.4, "ms": max(9.0 - 2.0 * k, 3.0), "ls": ""}
+        look: Look = {"mec": color_of(k), "mfc": "none", "mew": 1.4, "ms": max(9.0 - 2.0 * k, 3.0), "ls": ""}
         axes.plot(scale * points[:, 0], points[:, 1], "os^D"[k % 4], label=kind, **look)
     axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
     axes.set(xlabel=f"load speed, {unit}", ylabel=label)

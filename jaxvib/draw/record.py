@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxvib.display import Drawn, Onto, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, legend_above, panels
+from jaxvib.draw.style import COLORS, GUIDE, color_of, legend_above, panels
 
 
 def swing_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: float, *, ax: Onto = None) -> Drawn:
@@ -75,7 +75,7 @@ def fit_chart(
     """
     figure, (top, bottom) = panels(2, size=(9.0, 2.8), share_x=True, ax=ax)
     for k, name in enumerate(names):
-        color = COLORS[k % len(COLORS)]
+        color = color_of(k)
         top.plot(time, readings[:, k], ".", color=color, ms=1.5, alpha=0.5)
         top.plot(time, fitted[:, k], color=color, lw=0.8, label=name)
         bottom.plot(time, (readings[:, k] - fitted[:, k]) / max(float(noise[k]), 1e-300), ".", color=color, ms=1.5)

@@ -12,14 +12,16 @@ from jaxvib.draw.charts import scaled_amplitudes, solid_and_dashed
 from jaxvib.draw.style import (
     COLORS,
     GUIDE,
-    MARKERS,
-    STROKES,
     UNSTABLE,
     WORKING,
     Look,
+    color_of,
     legend_above,
     log_ticks,
+    marker_of,
     panels,
+    resonance_lines,
+    series_look,
 )
 
 
@@ -53,15 +55,15 @@ def modes_chart(
     shown = np.stack([values for _, values in scaled], axis=1)
     for axis, values in ((top, scale * omega[:, None]), (bottom, shown)):
         for k in range(values.shape[1]):
-            color, mark = COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]
+            color, mark = color_of(k), marker_of(k)
             for kind, face in ((stable, color), (~stable, "white")):
                 axis.plot(mode[kind], values[kind, k], mark, mfc=face, mec=color)
     for k, name in enumerate(names):
         label = f"{name}, {labels[k]}" if len(set(labels)) > 1 else name
-        bottom.plot([], [], MARKERS[k % len(MARKERS)], color=COLORS[k % len(COLORS)], label=label)
+        bottom.plot([], [], marker_of(k), color=color_of(k), label=label)
     legend_above(bottom, 6)
-    for k, w in enumerate(() if resonances is None else resonances):
-        top.axhline(scale * w, color=GUIDE, lw=0.9, ls=":", label=None if k else "resonance")
+    if resonances is not None:
+        resonance_lines(top.axhline, scale * resonances)
     top.plot([], [], "o", color="black", label="stable by slope")
     top.plot([], [], "o", color="black", mfc="white", label="unstable")
     legend_above(top)
@@ -95,7 +97,7 @@ def shapes_chart(
     for k, name in enumerate(names):
         places = np.arange(len(frequency)) + (k - 0.5 * (count - 1)) * width
         look: Look = {
-            "color": COLORS[k % len(COLORS)],
+            "color": color_of(k),
             "hatch": ("", "///", "...", "xxx")[k % 4],
             "edgecolor": "white",
             "lw": 0.0,
@@ -193,8 +195,8 @@ def _loads_on_circle(axis: Axes, angles: np.ndarray, numbers: np.ndarray, plural
         groups = [*groups[:-1], [*groups[-1], int(k)]] if near else [*groups, [int(k)]]
     for group in groups:
         for j in group:
-            look = {"mfc": COLORS[numbers[j] % len(COLORS)], "mec": "black", "ms": 9.0, "zorder": 3 + 0.01 * j}
-            axis.plot([np.cos(angles[j])], [np.sin(angles[j])], MARKERS[numbers[j] % len(MARKERS)], **look)
+            look = {"mfc": color_of(numbers[j]), "mec": "black", "ms": 9.0, "zorder": 3 + 0.01 * j}
+            axis.plot([np.cos(angles[j])], [np.sin(angles[j])], marker_of(numbers[j]), **look)
         e = np.mean(np.exp(1j * angles[group]))
         names = ", ".join(str(j + 1) for j in sorted(numbers[group])) if len(group) < 5 else f"{len(group)} {plural}"
         x, y = 1.15 * np.real(e / abs(e)), 1.15 * np.imag(e / abs(e))
@@ -226,7 +228,7 @@ def speeds_chart(
     top = 1.15 * np.max(values[np.isfinite(values)], initial=1e-300)
     heights = np.arange(len(rows) + len(spans))[::-1]
     for height, (k, (_, speeds)) in zip(heights, enumerate(rows), strict=False):
-        axis.plot(scale * speeds, np.full(np.shape(speeds), height), MARKERS[k % len(MARKERS)], color=COLORS[k % len(COLORS)])
+        axis.plot(scale * speeds, np.full(np.shape(speeds), height), marker_of(k), color=color_of(k))
         last = -np.inf
         for w in np.sort(scale * np.ravel(speeds)[np.isfinite(np.ravel(speeds))]):
             if w - last > 0.06 * top:
@@ -235,7 +237,7 @@ def speeds_chart(
                 last = w
     for height, (k, (_, intervals)) in zip(heights[len(rows) :], enumerate(spans), strict=True):
         for start, end in scale * intervals[~np.isnan(intervals[:, 0])]:
-            hatch = {"color": COLORS[(k + 2) % len(COLORS)], "hatch": ("", "///")[k % 2], "edgecolor": "white", "lw": 0.0}
+            hatch = {"color": color_of(k + 2), "hatch": ("", "///")[k % 2], "edgecolor": "white", "lw": 0.0}
             axis.barh(height, min(end, top) - start, left=start, height=0.5, **hatch)
     labels = [label for label, _ in (*rows, *spans)]
     axis.set_yticks(heights[::-1], labels[::-1])
@@ -250,7 +252,7 @@ def signals_chart(
     figure, axes = panels(len(signals), size=(7.5, 2.2), share_x=True, ax=ax)
     for axis, (label, values, names) in zip(axes, signals, strict=True):
         for k, name in enumerate(names):
-            axis.plot(x, values[:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], label=name)
+            axis.plot(x, values[:, k], **series_look(k), label=name)
         axis.set_ylabel(label)
         if len(names) > 1:
             legend_above(axis, 6)
@@ -262,8 +264,8 @@ def points_chart(values: np.ndarray, *, x_label: str, y_label: str, ax: Axes | N
     """Draw values (n, k) as points over their index 1 to n."""
     figure, (axis,) = panels(1, size=(7.0, 3.2), ax=ax)
     for k in range(values.shape[1]):
-        mark = MARKERS[k % len(MARKERS)]
-        axis.plot(np.arange(1, values.shape[0] + 1), values[:, k], mark, ms=3.5, color=COLORS[k % len(COLORS)])
+        mark = marker_of(k)
+        axis.plot(np.arange(1, values.shape[0] + 1), values[:, k], mark, ms=3.5, color=color_of(k))
     axis.set(xlabel=x_label, ylabel=y_label)
     return figure if ax is None else ax
 
@@ -350,8 +352,8 @@ def drag_diagram(
     figure, (axis,) = panels(1, size=(7.5, 4.6), ax=ax)
     shown = dict.fromkeys(name for name, *_ in branches)
     places = {name: k for k, name in enumerate(dict.fromkeys((*_PATTERNS, *shown)))}
-    colors = {name: COLORS[places[name] % len(COLORS)] for name in shown}
-    marks = {name: MARKERS[places[name] % len(MARKERS)] for name in shown}
+    colors = {name: color_of(places[name]) for name in shown}
+    marks = {name: marker_of(places[name]) for name in shown}
     for name, drag, speed, stable in branches:
         solid_and_dashed(axis, drag, scale * speed, stable, colors[name], widths=_WIDTHS, marker=marks.get(name, ""))
     for name, color in colors.items():
@@ -388,8 +390,7 @@ def drag_limits_chart(
     figure, axes = panels(1, size=(6.4, 3.0), ax=ax)
     unit, scale = speed_unit(unit)
     axis, exists = axes[0], np.isfinite(drag)
-    for k, w in enumerate(resonances):
-        axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "resonance")
+    resonance_lines(axis.axvline, scale * resonances)
     axis.plot(scale * omega[exists], drag[exists], "o", color=COLORS[0], label="no jam above")
     axis.set(xlabel=f"load speed, {unit}", ylabel="greatest drag, N s/m", yscale="log" if exists.any() else "linear")
     legend_above(axis)

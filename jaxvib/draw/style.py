@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, TypeAlias
 
 import matplotlib
@@ -78,12 +78,33 @@ _STYLE: Any = {
 }
 
 
+def color_of(k: int) -> str:
+    """Return the colour of series `k`, from 0."""
+    return COLORS[k % len(COLORS)]
+
+
+def marker_of(k: int) -> str:
+    """Return the marker of series `k`, from 0."""
+    return MARKERS[k % len(MARKERS)]
+
+
+def series_look(k: int) -> Look:
+    """Return the colour and the line style of series `k`, from 0."""
+    return {"color": color_of(k), "ls": STROKES[k % len(STROKES)]}
+
+
+def resonance_lines(draw_line: Callable[..., object], speeds: np.ndarray, name: str | None = "resonance", **look: Any) -> None:
+    """Draw dotted lines at `speeds` by `draw_line`, the method `axvline` or `axhline` of an axis; the first has the label."""
+    for k, w in enumerate(speeds):
+        draw_line(w, **{"color": GUIDE, "lw": 0.8, "ls": ":", "label": None if k else name, **look})
+
+
 def label_colors(names: Sequence[str]) -> list[str]:
     """Return the colour of each label."""
     modes = [name for name in names if name.startswith("jammed, mode ")]
     own = {name: _MODE_COLORS[(int(name.rpartition(" ")[2]) - 1) % len(_MODE_COLORS)] for name in modes}
     own |= _REGIME_COLORS
-    return [own.get(name, COLORS[k % len(COLORS)]) for k, name in enumerate(names)]
+    return [own.get(name, color_of(k)) for k, name in enumerate(names)]
 
 
 def panels(

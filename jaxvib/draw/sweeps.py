@@ -15,13 +15,14 @@ from jaxvib.display import Drawn
 from jaxvib.draw.style import (
     COLORS,
     HATCHED,
-    MARKERS,
     NO_RESULT,
     STROKES,
     Look,
+    color_of,
     label_colors,
     legend_above,
     log_ticks,
+    marker_of,
     panels,
 )
 
@@ -155,7 +156,7 @@ def points_over(
     """Draw values (n, k) as points over x (n,)."""
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     for k in range(values.shape[1]):
-        axis.plot(x, values[:, k], ".", color=COLORS[k % len(COLORS)], ms=4.0)
+        axis.plot(x, values[:, k], ".", color=color_of(k), ms=4.0)
     _scales(axis, x_label, y_label, (log, False))
     return figure if ax is None else ax
 
@@ -183,7 +184,7 @@ def shares_chart(
     """
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     for k, (colour, (name, (share, low, high))) in enumerate(zip(label_colors([*shares]), shares.items(), strict=True)):
-        look = {"color": colour, "ls": STROKES[k % len(STROKES)], "marker": MARKERS[k % len(MARKERS)]}
+        look = {"color": colour, "ls": STROKES[k % len(STROKES)], "marker": marker_of(k)}
         shift = 0.006 * (k - 0.5 * (len(shares) - 1)) if len(x) <= _MAX_BARS else 0.0  # bars stand beside each other
         place = x * (x[-1] / x[0]) ** shift if log else x + shift * np.ptp(x)
         axis.plot(place, 100.0 * share, ms=3.5, lw=1.1, label=name, **look)

@@ -17,7 +17,7 @@ from jaxvib.boundary import validated
 from jaxvib.draw.machine.animation import Animation
 from jaxvib.draw.machine.parts import Part, draw_part
 from jaxvib.draw.motion.histories import period_of
-from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, panels
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, panels, series_look
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
@@ -235,7 +235,7 @@ def _plot_histories(axes: tuple[Axes, Axes], scene: Scene, history: SampledMotio
     structure = scene.machine.structure()
     for k, name in enumerate(structure.coordinates):
         label = name if structure.units[k] == "m" else f"{name} (mrad)"
-        look = {"color": COLORS[k % len(COLORS)], "ls": STROKES[k % len(STROKES)], "lw": 1.2}
+        look = {**series_look(k), "lw": 1.2}
         upper.plot(history.time, 1e3 * history.displacement[:, k], label=label, **look)
     upper.set_ylabel("mm, mrad" if "rad" in structure.units else "mm")
     legend_above(upper, 6)

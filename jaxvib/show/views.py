@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxvib.draw.machine.parts import Part, Text, box, circle, ground
-from jaxvib.draw.style import COLORS, GUIDE, Look
+from jaxvib.draw.style import GUIDE, Look, color_of
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.show.plane import PlaneView
@@ -230,7 +230,7 @@ class FrontView(RotorView):
         places = centre + scale * np.stack([np.hypot(across, up) - middle, along], 1)
         for j, place in enumerate(places):
             hidden_count = np.sum(np.hypot(*(places[:j] - place).T) < 0.02)  # balls that a ball of the same size would cover
-            look = {"fc": COLORS[j % len(COLORS)], "ec": "black", "lw": 0.8, "zorder": 3.5 + 0.01 * j}
+            look = {"fc": color_of(j), "ec": "black", "lw": 0.8, "zorder": 3.5 + 0.01 * j}
             parts.append(Part(circle(tuple(place), max(scale * ball_radius, 0.08) * 0.75**hidden_count, 31), look, True))
         return parts
 
@@ -310,7 +310,7 @@ class ShaftView(RotorView):
         up = [] if self.wheel.loads is None else self.wheel.places(pose.rotors[0])[1]
         for j, (s, _) in enumerate(zip(self.stations, up, strict=False)):
             place = (self._x(s), self._y(s, pose, reach) + float(up[j]))
-            look = {"fc": COLORS[j % len(COLORS)], "ec": "black", "lw": 0.8, "zorder": 3.4 + 0.01 * j}
+            look = {"fc": color_of(j), "ec": "black", "lw": 0.8, "zorder": 3.4 + 0.01 * j}
             parts.append(Part(circle(place, self.wheel.size, 31), look, True))
         centre = (self.front + self._y(0.0, pose, reach, 0), self._y(0.0, pose, reach))
         return parts + self.wheel.parts(centre, pose.rotors[0])

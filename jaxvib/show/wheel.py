@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxvib.display import speed_text
 from jaxvib.draw.machine.parts import Part, Text, circle, sector, turning_arrow
-from jaxvib.draw.style import COLORS, GUIDE, Look
+from jaxvib.draw.style import COLORS, GUIDE, Look, color_of
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import number_specs
@@ -194,7 +194,7 @@ class Wheel:
         (x, y), found = centre, []
         across, up, *_ = self.places(pose)
         for j in range(self.loads.count):
-            color = COLORS[j % len(COLORS)]
+            color = color_of(j)
             place = (x + float(across[j]), y + float(up[j]))
             if self.loads.has_bearing:
                 found.append(Part(np.array([centre, place]), {"color": color, "lw": 2.0, "zorder": 3.4}))

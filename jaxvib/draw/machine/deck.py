@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import Drawn
-from jaxvib.draw.style import COLORS, GUIDE, panels
+from jaxvib.draw.style import GUIDE, color_of, panels
 
 
 def ellipses(points: np.ndarray, amplitude: np.ndarray, magnify: float) -> list[np.ndarray]:
@@ -36,8 +36,8 @@ def deck_chart(points: np.ndarray, amplitude: np.ndarray, *, ax: Axes | None = N
     figure, (axis,) = panels(1, size=(7.0, 3.2), ax=ax)
     magnify = magnification(points, amplitude)
     for k, path in enumerate(ellipses(points, amplitude, magnify)):
-        axis.plot(*path.T, color=COLORS[k % len(COLORS)], lw=1.4)
-        axis.plot(*path[0], "o", color=COLORS[k % len(COLORS)], ms=4)
+        axis.plot(*path.T, color=color_of(k), lw=1.4)
+        axis.plot(*path[0], "o", color=color_of(k), ms=4)
     axis.plot(*points.T, "+", color=GUIDE, ms=6)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set(xlabel="x, m", ylabel="y, m")

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, length_unit, load_names, panels
+from jaxvib.draw.style import color_of, legend_above, length_unit, load_names, panels, resonance_lines, series_look
 
 _BINS = 300
 """Maximum number of intervals of a run. The run is drawn as a band between the minimum and the maximum of each interval."""
@@ -104,7 +104,7 @@ def time_histories(
     left, right = axes[-4:-2]
     for k, name in _equal_loads(whole[2], part[2]):
         _draw_band(left, whole[0], scale * whole[2][:, k], k, name, bins)
-        right.plot(part[0], scale * part[2][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.2)
+        right.plot(part[0], scale * part[2][:, k], **series_look(k), lw=1.2)
     _draw_rotor_speeds(left, whole[0], scale * whole[3])
     slowest, fastest = np.min(part[2], initial=np.inf), np.max(part[2], initial=-np.inf)
     # The ripple of loads that are much slower than the rotor would be invisible on an axis that includes the rotor.
@@ -123,7 +123,7 @@ def time_histories(
     left, right = axes[-2:]
     for k, name in enumerate(directions):
         _draw_band(left, whole[0], whole[4][:, k], k, name, bins)
-        right.plot(part[0], part[4][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.2)
+        right.plot(part[0], part[4][:, k], **series_look(k), lw=1.2)
     left.set_ylabel("foundation force, N")
     if len(directions) > 1:
         legend_above(left)
@@ -157,7 +157,7 @@ def _draw_coordinates(
     depth = np.argsort(np.argsort(-np.ptp(whole[1], axis=0)))  # signals of larger range are drawn first, below smaller ones
     for k in (k for k in range(len(names)) if units[k] == unit):
         _draw_band(left, whole[0], factor * whole[1][:, k], k, names[k], bins, depth[k])
-        look = {"color": COLORS[k % len(COLORS)], "ls": STROKES[k % len(STROKES)]}
+        look = series_look(k)
         right.plot(end[0], factor_at_end * end[1][:, k], lw=1.3, **look)
     left.set_ylabel(label)
     legend_above(left, 6)
@@ -227,7 +227,7 @@ def _draw_band(
     middle, low, high = band(time, values, bins)
     if low is not high:
         low, high = -_smoothed_peaks(-low), _smoothed_peaks(high)
-    look = {"color": COLORS[k % len(COLORS)], "ls": STROKES[k % len(STROKES)], "lw": 1.1, "zorder": 2.0 + 0.01 * float(depth)}
+    look = {**series_look(k), "lw": 1.1, "zorder": 2.0 + 0.01 * float(depth)}
     axis.plot(middle, high, label=name, **look)
     if low is not high:
         axis.plot(middle, low, **look)
@@ -249,7 +249,7 @@ def _draw_rotor_speeds(axis: Axes, time: np.ndarray, speeds: np.ndarray) -> None
     """Draw the speeds of the rotors (nt, exciters), negative for a clockwise rotor, as dashed lines."""
     rotors = speeds.shape[1]
     for k in range(rotors):
-        look = {"color": "black" if rotors == 1 else COLORS[k % len(COLORS)], "ls": "--", "lw": 1.1}
+        look = {"color": "black" if rotors == 1 else color_of(k), "ls": "--", "lw": 1.1}
         sense = " (clockwise: negative)" if np.sum(speeds[:, k]) < 0.0 else ""
         axis.plot(time, speeds[:, k], label=f"rotor{'' if rotors == 1 else f' {k + 1}'}{sense}", **look)
 
@@ -298,8 +298,7 @@ def amplitude_histories(
     _draw_rotor_speeds(axes[-2], time, scale * rotor_speed)
     signs = [sign for sign in (1.0, -1.0) if np.any(sign * rotor_speed > 0.0)]
     passed = [w for w in resonances if w < np.max(np.abs(rotor_speed), initial=0.0)]
-    for k, w in enumerate(np.outer(signs, passed).ravel().tolist()):
-        axes[-2].axhline(scale * w, color=GUIDE, ls=":", lw=0.9, label=None if k else "resonances")
+    resonance_lines(axes[-2].axhline, scale * np.outer(signs, passed).ravel(), "resonances")
     axes[-2].set_ylabel(f"speed, {unit}")
     legend_above(axes[-2], 6)
     lines(axes[-1], force, range(len(directions)), directions)

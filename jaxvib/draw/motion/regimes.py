@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from jaxvib.display import Drawn, Onto, speed_unit
 from jaxvib.draw.results import draw_circle
-from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, legend_above, panels
+from jaxvib.draw.style import STROKES, color_of, legend_above, marker_of, panels, resonance_lines
 
 _MAX_TITLE_MASSES = 3
 """Largest number of masses whose phases and torques fit into the title of a circle."""
@@ -100,8 +100,7 @@ def _draw_torques(
     Equal curves are one line. An ideal drive has points of regimes but no curves.
     """
     top = float(np.nanmax(curves.driving))
-    for k, w in enumerate(resonances[(resonances > 0.0) & (resonances < curves.speed[-1])]):
-        axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "resonance")
+    resonance_lines(axis.axvline, scale * resonances[(resonances > 0.0) & (resonances < curves.speed[-1])])
     for values, stroke, words in ((curves.driving, "-", "of {}"), (curves.needed, STROKES[1], "needed by {}")):
         groups: list[list[int]] = []
         for k in (k for k in range(values.shape[1]) if not np.isnan(curves.driving[0, k])):
@@ -110,13 +109,13 @@ def _draw_torques(
             if same is not None:
                 same.append(k)
         for group in groups:
-            look = {"color": COLORS[group[0] % len(COLORS)], "ls": stroke, "lw": 1.2}
+            look = {"color": color_of(group[0]), "ls": stroke, "lw": 1.2}
             axis.plot(scale * curves.speed, values[:, group[0]], label=words.format(_group_name(names, group)), **look)
     for regime in sorted(regimes, key=lambda each: each.stable):  # stable ones on top
         for k, torque in enumerate(regime.torque):
-            color = COLORS[k % len(COLORS)]
+            color = color_of(k)
             look = {"mec": color, "mfc": color if regime.stable else "white", "ms": 5.0, "zorder": 4}
-            axis.plot([scale * regime.speed], [torque], MARKERS[k % len(MARKERS)], **look)
+            axis.plot([scale * regime.speed], [torque], marker_of(k), **look)
     lowest = min(float(np.min(regime.torque)) for regime in regimes)
     axis.set(xlim=(0.0, 1.03 * scale * float(curves.speed[-1])), ylim=(min(-0.05 * top, 1.15 * lowest), 1.15 * top))
     axis.plot([], [], "o", color="black", ms=5.0, label="regime; hollow: unstable")

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, log_ticks, panels
+from jaxvib.draw.style import COLORS, STROKES, Look, legend_above, log_ticks, panels, resonance_lines, series_look
 from jaxvib.errors import InputError, quoted
+
+Arrays: TypeAlias = Mapping[str, np.ndarray]
 
 PARTS = ("amplitude", "phase", "force", "torque")
 """Names of the panels."""
@@ -19,9 +22,9 @@ _DECADES = 4.0
 
 
 def response_chart(
-    curve: Mapping[str, np.ndarray],
-    points: Mapping[str, np.ndarray],
-    folds: Mapping[str, np.ndarray],
+    curve: Arrays,
+    points: Arrays,
+    folds: Arrays,
     resonances: np.ndarray,
     *,
     names: Sequence[str],
@@ -49,18 +52,29 @@ def response_chart(
     if isinstance(show, str) or not show or any(name not in PARTS for name in show):
         raise InputError("show", f"is {quoted(show)}; it must be a list of {', '.join(PARTS)}")
     unit, scale = speed_unit(unit)
+    curve, points = ({**arrays, "speed": scale * arrays["speed"]} for arrays in (curve, points))
+    last = float(np.max(curve["speed"]))
+    resonances = scale * resonances
+    resonances = resonances[(resonances > 0.0) & (resonances <= last)]
     kinds = [kind for kind in ("m", "rad") if kind in units]
     drawn = [(name, kind) for name in show for kind in (kinds if name == "amplitude" else ("",))]
     figure, axes = panels(len(drawn), size=(7.2, 2.5), share_x=True, ax=ax)
     for axis, (name, kind) in zip(axes, drawn, strict=True):
-        for k, w in enumerate(resonances[(resonances > 0.0) & (resonances <= np.max(curve["speed"]))]):
-            axis.axvline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k or axis is not axes[0] else "resonance")
+        resonance_lines(axis.axvline, resonances, "resonance" if axis is axes[0] else None)
         if name in ("amplitude", "phase"):
             which = [k for k, each in enumerate(units) if kind in ("", each)]
-            _coordinates(axis, curve, points, scale, name, which, names)
+            for k, number in enumerate(which):
+                look = {**series_look(k), "label": names[number]}
+                values = curve[name][:, number]
+                if name == "phase":
+                    angle = np.rad2deg(np.unwrap(np.where(np.isfinite(values), values, 0.0)))
+                    axis.plot(curve["speed"], angle, **look)
+                else:
+                    _line(axis, curve, points, 1e3 * values, 1e3 * points[name][:, number], look)
             axis.set_ylabel(f"{name}, { ({'m': 'mm', 'rad': 'mrad', '': 'deg'}[kind]) }")
         elif name == "force":
-            _line(axis, curve, points, scale, "foundation_force", 1.0, COLORS[0], "-", "force on the foundation")
+            look = {"color": COLORS[0], "label": "force on the foundation"}
+            _line(axis, curve, points, curve["foundation_force"], points["foundation_force"], look)
             axis.set_ylabel("force, N")
         else:
             _torque(axis, curve, points, folds, scale, has_motor=has_motor)
@@ -68,62 +82,22 @@ def response_chart(
         if name in ("amplitude", "force"):
             _logarithmic(axis)
         legend_above(axis)
-    axes[-1].set(xlabel=f"speed of the exciter, {unit}", xlim=(0.0, scale * float(np.max(curve["speed"]))))
+    axes[-1].set(xlabel=f"speed of the exciter, {unit}", xlim=(0.0, last))
     return figure if ax is None else ax
 
 
-def _coordinates(
-    axis: Axes,
-    curve: Mapping[str, np.ndarray],
-    points: Mapping[str, np.ndarray],
-    scale: float,
-    name: str,
-    which: Sequence[int],
-    names: Sequence[str],
-) -> None:
-    """Draw amplitudes, in mm or mrad, or phases, in degrees, of the coordinates `which`."""
-    for k, number in enumerate(which):
-
-        def of(arrays: Mapping[str, np.ndarray], number: int = number) -> dict[str, np.ndarray]:
-            return {**arrays, "shown": arrays[name][:, number]}
-
-        color, stroke = COLORS[k % len(COLORS)], STROKES[k % len(STROKES)]
-        lines = of(curve)
-        if name == "phase":
-            angle = np.unwrap(np.where(np.isfinite(lines["shown"]), lines["shown"], 0.0))
-            axis.plot(scale * curve["speed"], np.rad2deg(angle), color=color, ls=stroke, label=names[number])
-        else:
-            _line(axis, lines, of(points), scale, "shown", 1e3, color, stroke, names[number])
+def _line(axis: Axes, curve: Arrays, points: Arrays, line: np.ndarray, at_points: np.ndarray, look: Look) -> None:
+    """Draw the values `line` over the speeds of the curve, and the values `at_points` of the operating points."""
+    axis.plot(curve["speed"], line, **look)
+    for x, y, stable in zip(points["speed"], at_points, points["stable"], strict=True):
+        axis.plot([x], [y], "o", ms=5.0, mfc=look["color"] if stable else "white", mec=look["color"], zorder=4)
 
 
-def _line(
-    axis: Axes,
-    curve: Mapping[str, np.ndarray],
-    points: Mapping[str, np.ndarray],
-    scale: float,
-    name: str,
-    factor: float,
-    color: str,
-    stroke: object,
-    label: str,
-) -> None:
-    """Draw a line and its operating points."""
-    axis.plot(scale * curve["speed"], factor * curve[name], color=color, ls=stroke, label=label)
-    for x, y, stable in zip(points["speed"], points[name], points["stable"], strict=True):
-        axis.plot([scale * x], [factor * y], "o", ms=5.0, mfc=color if stable else "white", mec=color, zorder=4)
-
-
-def _torque(
-    axis: Axes,
-    curve: Mapping[str, np.ndarray],
-    points: Mapping[str, np.ndarray],
-    folds: Mapping[str, np.ndarray],
-    scale: float,
-    *,
-    has_motor: bool,
-) -> None:
-    """Draw the torque that the vibration needs, the torque of the motor, the operating points and the folds."""
-    _line(axis, curve, points, scale, "torque", 1.0, COLORS[0], "-", "needed by the vibration")
+def _torque(axis: Axes, curve: Arrays, points: Arrays, folds: Arrays, scale: float, *, has_motor: bool) -> None:
+    """Draw the torque that the vibration needs, the torque of the motor, the operating points and the folds, whose speeds are
+    drawn times `scale`."""
+    look = {"color": COLORS[0], "label": "needed by the vibration"}
+    _line(axis, curve, points, curve["torque"], points["torque"], look)
     if points["speed"].size:
         label = "operating point" + ("" if np.all(points["stable"]) else "; hollow: unstable")
         axis.plot([], [], "o", ms=5.0, color=COLORS[0], label=label)
@@ -131,7 +105,7 @@ def _torque(
     top = float(np.max(finite, initial=0.0))
     if has_motor:
         motor = curve["motor_torque"]
-        axis.plot(scale * curve["speed"], motor, color=COLORS[1], ls=STROKES[1], label="of the motor")
+        axis.plot(curve["speed"], motor, color=COLORS[1], ls=STROKES[1], label="of the motor")
         if np.any(np.isfinite(folds["speed"])):
             look = {"ms": 5.0, "mfc": "white", "mec": COLORS[4], "label": "fold: the speed jumps"}
             axis.plot(scale * folds["speed"], folds["torque"], "D", **look)

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
 from jaxvib.display import Drawn, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, length_unit, panels
+from jaxvib.draw.style import COLORS, STROKES, color_of, legend_above, length_unit, panels, resonance_lines, series_look
 
 _LOWEST_AMPLITUDE = 1e-4
 """Lower end of the amplitude scale, relative to the largest amplitude."""
@@ -35,10 +35,9 @@ def spectrum_chart(
     figure, (axis,) = panels(1, size=(7.5, 4.0), ax=ax)
     top = max(float(np.max(values)) for values in series.values())
     for k, (name, values) in enumerate(series.items()):
-        look = {"color": COLORS[k % len(COLORS)], "ls": STROKES[k % len(STROKES)], "lw": 1.3}
+        look = {**series_look(k), "lw": 1.3}
         axis.plot(scale * frequency, values, label=name, **look)
-    for k, w in enumerate(resonances):
-        axis.axvline(scale * w, color=GUIDE, lw=0.9, ls=":", label=None if k else "resonances")
+    resonance_lines(axis.axvline, scale * resonances, "resonances")
     marks = (("load speed", load_speeds, (0, (5, 3))), ("rotor speed", rotor_speeds, "-."))
     for name, speeds, stroke in marks:
         for k, speed in enumerate(np.abs(speeds[0])):
@@ -85,8 +84,7 @@ def waterfall_chart(
     )
     figure.colorbar(shade, ax=axis, label=f"{name}, zero to peak")
     axis.grid(False)
-    for k, w in enumerate(resonances):
-        axis.axhline(scale * w, color=COLORS[0], lw=1.0, ls=":", label=None if k else "resonances")
+    resonance_lines(axis.axhline, scale * resonances, "resonances", color=COLORS[0], lw=1.0)
     marks = (("load speed", load_speeds, COLORS[1], (0, (5, 3))), ("rotor speed", rotor_speeds, COLORS[2], "-."))
     for name, speeds, color, stroke in marks:
         for k, speed in enumerate(np.abs(speeds).T):
@@ -102,7 +100,7 @@ def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes |
     figure, (axis,) = panels(1, size=(5.0, 4.8), ax=ax)
     unit, factor = length_unit(*(each for path in paths.values() for each in path))
     for k, (name, (x, y)) in enumerate(paths.items()):
-        color = COLORS[k % len(COLORS)]
+        color = color_of(k)
         axis.plot(factor * x, factor * y, color=color, ls=STROKES[k % len(STROKES)], lw=1.2, label=name)
         axis.plot(factor * x[-1:], factor * y[-1:], "o", color=color, mec="black", zorder=3)
     axis.plot([], [], "o", color="white", mec="black", label="end of the path")
