@@ -208,15 +208,15 @@ def noise_like(size, noise, rng, color=0.0, outliers=0.0):
     return noise * (found + 20.0 * rng.normal(size=size) * (rng.random(size) < outliers))
 
 
-def scene_of(numbers):
-    """Return the scene with numbers as `TRUTH`, under a motor whose speed is not known."""
+def scene_of(numbers, loads=None):
+    """Return the scene with numbers as `TRUTH`, and possibly loads, under a motor whose speed is not known."""
     mass, stiffness, damping = ([numbers[f"machine.{name}[{k}]"] for k in (0, 1)] for name in ("mass", "stiffness", "damping"))
     machine = jv.two_mass(
         mass=mass, stiffness=stiffness, damping=damping,
         link_stiffness=numbers["machine.link_stiffness[0]"], link_damping=numbers["machine.link_damping[0]"],
     )  # fmt: skip
     motor = jv.DCMotor("1500 rpm", stall_torque=5.0, inertia=0.1)
-    return jv.Scene(machine, exciters=[jv.Exciter(drive=motor, unbalance=numbers["exciters[0].unbalance"], at=2)])
+    return jv.Scene(machine, exciters=[jv.Exciter(loads, motor, unbalance=numbers["exciters[0].unbalance"], at=2)])
 
 
 @functools.cache

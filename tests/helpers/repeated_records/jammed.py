@@ -5,6 +5,7 @@ import functools
 import numpy as np
 from run_ups_by_scipy import TRUTH as MACHINE
 from run_ups_by_scipy import record
+from run_ups_by_scipy import scene_of as scene_with
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
@@ -111,14 +112,7 @@ def bound(names, noise, impact=0.1, color=0.0, outliers=0.0):
 
 def scene_of(numbers):
     """Return the scene with numbers as `TRUTH`, under a motor whose speed is not known."""
-    mass, stiffness, damping = ([numbers[f"machine.{name}[{k}]"] for k in (0, 1)] for name in ("mass", "stiffness", "damping"))
-    machine = jv.two_mass(
-        mass=mass, stiffness=stiffness, damping=damping,
-        link_stiffness=numbers["machine.link_stiffness[0]"], link_damping=numbers["machine.link_damping[0]"],
-    )  # fmt: skip
-    balls = jv.balls(count=2, mass=numbers["loads.mass"], radius=RADIUS, drag=numbers["loads.drag"])
-    motor = jv.DCMotor("1500 rpm", stall_torque=5.0, inertia=0.1)
-    return jv.Scene(machine, exciters=[jv.Exciter(balls, motor, unbalance=numbers["exciters[0].unbalance"], at=2)])
+    return scene_with(numbers, jv.balls(count=2, mass=numbers["loads.mass"], radius=RADIUS, drag=numbers["loads.drag"]))
 
 
 def jammed_record(noise, rng, impact=0.1, added=0.0, drag=1.5, **options):
