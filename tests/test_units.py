@@ -384,7 +384,8 @@ def test_a_text_beside_a_speed_must_say_what_it_counts():
 
 
 @pytest.mark.parametrize(
-    ("unit", "factor"), [("cps", 2 * np.pi), ("U/min", np.pi / 30), ("min^-1", np.pi / 30), ("1/s", None), ("s^-1", None)]
+    ("unit", "factor"),
+    [("cps", 2 * np.pi), ("U/min", np.pi / 30), ("upm", np.pi / 30), ("min^-1", np.pi / 30), ("1/s", None), ("s^-1", None)],
 )
 def test_a_column_of_speeds_must_say_what_it_counts(unit, factor):
     assert unit_factor(unit, "rad/s") == (None if factor is None else pytest.approx(factor, rel=1e-15))

@@ -9,6 +9,7 @@ import importlib
 import json
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -193,7 +194,7 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
     from rich.console import Console  # slow import, which --json does not need
     from rich.table import Table
 
-    rich_table = Table(title=title, title_justify="left")
+    rich_table = Table()
     shown_columns = [k for k in range(len(columns)) if not rows or any(row[k] for row in rows)]
     for k in shown_columns:
         rich_table.add_column(columns[k], justify="left" if k == 0 else "right", overflow="fold")
@@ -202,7 +203,7 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
     console = Console(width=80)
     with console.capture() as capture:
         console.print(rich_table)
-    return capture.get().rstrip()
+    return f"{textwrap.fill(title, 80)}\n{capture.get().rstrip()}"
 
 
 _GROUPS = {

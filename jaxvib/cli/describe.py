@@ -36,8 +36,11 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
     if group not in GROUPS and name is None:
         group_of_part = next((each for each, kinds in GROUPS.items() if group in kinds), None)
         if group_of_part is None:
-            all_names = [*GROUPS, *(kind for kinds in GROUPS.values() for kind in kinds)]
-            raise InputError("name", f"is {quoted(group)}; {suggest_name(group, all_names)}")
+            all_names = {kind: build for kinds in GROUPS.values() for kind, build in kinds.items()}
+            word = group.replace("_", " ")
+            parts = [kind for kind, build in all_names.items() if word in f"{kind} {inspect.getdoc(build)}".lower()]
+            known = f"parts that mention it: {', '.join(parts)}" if parts else suggest_name(group, [*GROUPS, *all_names])
+            raise InputError("name", f"is {quoted(group)}; {known}")
         group, name = group_of_part, group
     kinds = GROUPS.get(group, {}) if name is None else {name: builder_of(group, name)}
     parts_found = [

@@ -40,7 +40,11 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
                     raise InputError("--deck", f"is {quoted(point)}; give X,Y from the centre of mass, m, such as 1.5,0.1")
             value = [numbers([part.strip() for part in point.split(",")], "m", "--deck", 2).tolist() for point in value]
         elif parameter.name == "layer":
-            value = None if value is None else [part.strip() for part in value.split(",")]
+            parts = None if value is None else [part.strip() for part in value.split(",")]
+            if parts is not None and len(parts) != 3:
+                problem = "give WIDTH,HEIGHT,DENSITY, such as '1.5 m, 55 mm, 1600 kg/m^3'"
+                raise InputError("--layer", f"is {quoted(value)}; {problem}")
+            value = parts
         elif value is not None:
             from jaxvib.steady.points import read_slope  # slow import, which --help does not need
 

@@ -93,8 +93,18 @@ _KEY = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
 _LONG_KEY = re.compile(rf"(?<![\w\"'.-]){_KEY}(?:[ \t]*\.[ \t]*{_KEY}){{16}}")
 """A dotted key of more than 16 names; the time of `tomllib` is proportional to the square of their number."""
 
-_DECIMAL_COMMA = re.compile(r"^[^#\n]*=\s*[+-]?\d+,\d", re.MULTILINE)
-"""A number with a decimal comma, which TOML does not read."""
+_HINTS = (
+    (re.compile(r"^[^#\n]*=\s*[+-]?\d+,\d", re.MULTILINE), "; write decimals with a point, not with a comma"),
+    (
+        re.compile(r"^[^#\n\"']*=[ \t]*[+-]?\d[\d.]*[ \t]*(?!e[\d+-])[a-zA-Z%°]", re.MULTILINE),
+        '; write a number with a unit in quotes, such as "400 kg"',
+    ),
+    (
+        re.compile(r"^\s*\[(\w+(?:\.\w+)*)\](?:.*\n)+?\s*\[\[\1\]\]", re.MULTILINE),
+        "; several tables of one name have two brackets each, such as [[exciters]]",
+    ),
+)
+"""Patterns of mistakes in TOML files, with advice."""
 
 
 def read_toml(path: str | Path) -> Tables:
@@ -119,7 +129,7 @@ def _tables(text: str, name: str) -> Tables:
     except RecursionError as error:
         raise InputError(name, too_deep) from error
     except tomllib.TOMLDecodeError as error:
-        hint = "; write decimals with a point, not with a comma" if _DECIMAL_COMMA.search(text) else ""
+        hint = next((words for pattern, words in _HINTS if pattern.search(text)), "")
         raise InputError(name, f"is not a TOML file: {error}{hint}") from error
     except ValueError as error:
         raise InputError(name, "has a whole number with more digits than Python reads; write it as 1e6, for example") from error

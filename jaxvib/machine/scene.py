@@ -314,7 +314,7 @@ class Scene(Part):
         if len(self.exciters) != 1:
             problem = f"has {len(self.exciters)} exciters; this function needs a scene with one exciter"
             instead = "for others use simulate, settle, envelope, response or synchronous_regimes (command regimes)"
-            raise InputError("scene", f"{problem}; {instead} (their parts are scene.exciters[0].drive and so on)")
+            raise InputError("scene", f"{problem}; {instead}; their parts are scene.exciters[0].drive and so on")
         return self.exciters[0]
 
     @property

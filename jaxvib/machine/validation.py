@@ -135,6 +135,9 @@ whose sag and motor power are examined. Machines with dimensionless parameters h
 _MAX_SUPPORT_DISTANCE = 100.0
 """Largest usual coordinate of a support, m."""
 
+_MIN_STIFFNESS_RATIO = 5e-3
+"""Smallest usual ratio of two stiffnesses of supports."""
+
 _MIN_AMPLITUDE, _MAX_AMPLITUDE = 1e-5, 0.05
 """Smallest and largest usual amplitude above the resonances of a machine that unbalances excite, the sum of the unbalances
 divided by the mass, m."""
@@ -196,6 +199,13 @@ def implausible_numbers(scene: Scene) -> list[str]:
     if mass > _MAX_MASS:
         note("machine.mass", f"{mass / 1e3:g} t", "kg", f"{mass / 1e3:g} kg")
     supports = [each.stiffness for each in getattr(scene.machine, "supports", ())]
+    names = [f"machine.supports[{k}].stiffness[{i}]" for k, each in enumerate(supports) for i in range(np.size(each))]
+    springs = getattr(scene.machine, "stiffness", ()) if not supports else np.ravel(supports)
+    if np.ndim(springs) == 1 and np.size(springs) > 1:
+        for k, value in enumerate(np.asarray(springs)):
+            if 0.0 < value < _MIN_STIFFNESS_RATIO * np.max(springs):
+                name = names[k] if supports else f"machine.stiffness[{k}]"
+                note(name, f"{value:g} N/m, but another one is {np.max(springs):g} N/m", "N/m", f"{value:g} N/mm")
     if supports and mass >= _MIN_MASS and 0.0 < np.sum(supports) * _MAX_SAG < STANDARD_GRAVITY * mass:
         sag = f"{STANDARD_GRAVITY * mass / float(np.sum(supports)):.3g} m"
         note(

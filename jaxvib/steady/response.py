@@ -297,7 +297,7 @@ def require_unbalances(scene: Scene) -> None:
     """**Raises** `InputError` for exciters with loads, and for effects that the response does not include."""
     for k, exciter in enumerate(scene.exciters):
         if exciter.loads is not None:
-            problem = "turn at a speed of their own; this function needs unbalances; for loads use branches(scene)"
+            problem = "turn at a speed of their own; this function needs unbalances; for loads use branches (command modes)"
             raise InputError(f"{scene.prefix_of(k)}loads", problem)
     require_rotating_masses(scene, (*AVERAGED_TERMS, RotorImbalance))
 

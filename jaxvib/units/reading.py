@@ -57,7 +57,7 @@ _THOUSANDS = re.compile(r"[+-]?\d{1,3},\d{3}(?!\d)")
 """Pattern of a number whose comma can separate thousands."""
 
 _SPELLINGS = {
-    **dict.fromkeys(("RPM", "Rpm", "r/min", "U/min", "rev/min"), "rpm"),
+    **dict.fromkeys(("RPM", "Rpm", "upm", "Upm", "UPM", "r/min", "U/min", "rev/min"), "rpm"),
     **dict.fromkeys(("cps", "rps", "r/s", "U/s", "rev/s"), "turn/s"),
     "Kg": "kg",
     "PS": "metric_horsepower",

@@ -191,6 +191,8 @@ WRONG = [
     (("[machine]", "[machin]"), "machin is not part of a scene file; did you mean 'machine'"),
     (("[machine]", "[machine"), "is not a TOML file"),
     (("drag = 1.5", "drag = 1,5"), "; write decimals with a point, not with a comma"),
+    (("drag = 1.5", "drag = 1.5 N s/m"), '; write a number with a unit in quotes, such as "400 kg"'),
+    (("[machine]", "[a.b]\nc = 1\n[[a.b]]\n[machine]"), "; several tables of one name have two brackets each"),
     (("[machine]", "mass = 5.0\n[machine]"), "mass is not part of a scene file; write it below the header of its table"),
 ]
 

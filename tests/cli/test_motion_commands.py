@@ -238,6 +238,13 @@ def test_describe(typed):
     code, out, _ = typed("describe", "three_mass")
     assert code == 0 and "link_stiffness: N/m; needed; at least 0\n      (3,) of the links 1-2, 1-3, 2-3, N/m" in out
     assert max(map(len, typed("describe", "machines")[1].splitlines())) <= 80
+    for word, parts in (
+        ("bearing", ("name_plate_motor", "switched_off", "dry_friction")),
+        ("motor", ("dc_motor", "belt_drive")),
+    ):
+        code, _, err = typed("describe", word)
+        assert code == 2 and f"name is '{word}'; parts that mention it: " in err and all(part in err for part in parts)
+    assert "'dc_moto'; did you mean 'dc_motor'? allowed: machines" in typed("describe", "dc_moto")[2]
     code, out, _ = typed("describe", "exciter")
     assert code == 0 and "unbalance: kg m; default none; greater than 0\n      S, kg m: static moment" in out
     assert typed("describe", "dc_motr")[2].startswith("jaxvib: name is 'dc_motr'; did you mean 'dc_motor'?")

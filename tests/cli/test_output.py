@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import jaxvib as jv
-from jaxvib.cli.app import tolerance_table
+from jaxvib.cli.app import table, tolerance_table
 from jaxvib.cli.optimize import _few_machines_texts, _quantities_with_ranges
 from jaxvib.cli.output import Output
 from optimize import Design, DesignSpace, ToleranceRange, amplitude, foundation_force, worst
@@ -48,6 +48,11 @@ def test_a_report_has_the_requested_title(tmp_path, title, heading):
     page = (tmp_path / "report.html").read_text()
     assert f"<h1>{heading}</h1>" in page and ("<p>A. Author</p>" in page) == (title is not None)
     assert "<code>jaxvib simulate</code>" in page
+
+
+def test_title_of_a_narrow_table_stays_on_one_line():
+    lines = table("whirl frequency = rotor speed", ["", "rpm"], [["forward", "1"]]).splitlines()
+    assert lines[0] == "whirl frequency = rotor speed" and lines[1].startswith("┏") and len(lines[1]) < len(lines[0])
 
 
 def test_ranges_of_a_maximized_quantity_are_positive():

@@ -59,6 +59,10 @@ def test_wrong_commands(typed, words, says):
     assert (code, out) == (2, "") and says in err and err.count("\n") == 1
 
 
+def test_a_scene_file_is_not_a_recording(typed):
+    assert "machine.toml is a file of jaxvib, not a recording" in typed("record", "machine.toml")[2]
+
+
 def test_channel_with_wrong_times_is_noted(typed, tmp_path):
     (tmp_path / "bad.csv").write_text("time (s),frame (g)\n" + "".join(f"{k // 2},{k % 3}\n" for k in range(40)))
     code, out, _ = typed("record", "bad.csv", "--json")

@@ -12,7 +12,7 @@ from scenes import BALLS, machines, scene
 
 import jaxvib as jv
 from jaxvib.machine import validation as module
-from jaxvib.machine.files import SCREENS
+from jaxvib.machine.files import SCREENS, TEMPLATES
 from jaxvib.machine.validation import implausible_numbers, lifting_torques, start_notes, validate_scene, weight_notes
 from jaxvib.show.moving import sketch_svg
 
@@ -181,6 +181,17 @@ def test_torque_at_rest_that_rises_is_not_judged(drive, start):
     (torques,) = lifting_torques(scene)
     assert (torques is None) if start is None else float(torques[1]) == start
     assert bool(start_notes(scene)) == (start is not None)
+
+
+def test_a_stiffness_far_below_the_others_is_noted():
+    says = "but another one is {} N/m; a plain number is in N/m: did you mean '{} N/mm'?"
+    feeder = SCREENS["feeder"].replace('["80 N/mm", "126 N/mm"]', '["80 N/mm", 126]', 1)
+    assert implausible_numbers(jv.scene_from_toml(feeder)) == [
+        "machine.supports[0].stiffness[1] is 126 N/m, " + says.format(126000, 126)
+    ]
+    two = TEMPLATES["two_mass"].replace("[5.0e4, 5.0e4]", "[5.0e4, 40.0]")
+    assert implausible_numbers(jv.scene_from_toml(two)) == ["machine.stiffness[1] is 40 N/m, " + says.format(50000, 40)]
+    assert implausible_numbers(jv.scene_from_toml(two.replace("40.0]", "0.0]"))) == []
 
 
 def test_implausible_bodies_in_a_plane_are_noted():

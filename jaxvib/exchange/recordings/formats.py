@@ -53,6 +53,8 @@ def read_channels(path: Path, rate: float | None) -> list[Recorded]:
 
     **Raises** `InputError` for a file that cannot be read or has no channel, and if a library is not installed.
     """
+    if path.suffix.lower() == ".toml":
+        raise InputError(str(path), "is a file of jaxvib, not a recording; give a recording, such as run_up.csv")
     reader = _READERS.get(path.suffix.lower(), _read_text)
     try:
         with open_regular(path) as file:

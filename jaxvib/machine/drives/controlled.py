@@ -25,7 +25,8 @@ class TorqueTable(Motor):
 
     The torque follows straight lines between the points. The first and the last line continue beyond them. In
     a scene file, `file = "torque.csv"` replaces the two lists: a CSV file with two columns, whose header states their units,
-    such as "speed (rpm);torque (N m)".
+    such as "speed (rpm);torque (N m)". The friction of bearings and belts between the motor and the unbalance can be included:
+    subtract its torque from the torques.
 
     **Arguments** (SI, or strings with a unit)
 

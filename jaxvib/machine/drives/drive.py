@@ -471,6 +471,9 @@ class InductionMotor(Motor):
 
         T = 2 T_b s s_b / (s^2 + s_b^2),    s = 1 - theta' / speed,    theta' the rotor speed
 
+    The torque is that at the shaft of the motor. For the friction of other bearings, such as those of a vibrator, subtract
+    their torque and use a `TorqueTable`.
+
     **Arguments** (SI, or strings with a unit; all greater than 0)
 
     - `speed`: synchronous speed, rad/s; typical: "750 rpm", "1000 rpm", "1500 rpm" or "3000 rpm" on a grid of 50 Hz

@@ -42,6 +42,9 @@ class NamePlateMotor(Motor):
     The torque then decreases from T_b at the slip s_b to `starting_ratio` T_r at standstill; at slips below s_b it does not
     change. A minimum of the torque between standstill and s_b (pull-up torque) is not included.
 
+    The torque is that at the shaft of the motor. For the friction of other bearings, such as those of a vibrator, subtract
+    their torque and use a `TorqueTable`.
+
     **Arguments** (SI, or strings with a unit)
 
     - `power`: rated mechanical power, W; typical: "0.25 kW" to "15 kW"
