@@ -39,6 +39,7 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, known_number, numbers
+from jaxvib.units.known import require_finite
 
 
 @validated
@@ -87,7 +88,8 @@ def foundation_moment(scene: Scene, state: State, about: Sequence[Number] = (0.0
     - `about` p (2,), m, measured from the position of this body's centre of mass at rest (the default); typical: the middle of
       the foundation
 
-    **Returns** a number, N m. **Raises** `InputError` for another machine.
+    **Returns** a number, N m. **Raises** `InputError` for another machine; `ComputationError` with the status "overflow" if the
+    number is not finite.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> springs = [jv.support(at=(x, 0.0), stiffness=(1e5, 2e5), damping=(500.0, 900.0)) for x in (-0.5, 1.0)]
@@ -102,7 +104,9 @@ def foundation_moment(scene: Scene, state: State, about: Sequence[Number] = (0.0
     """
     rows = validate_scene(scene).machine.moment_rows(numbers(about, "m", "about", 2))
     require_motion(scene, state, "state")
-    return rows[0] @ jnp.asarray(state.displacement) + rows[1] @ jnp.asarray(state.velocity)
+    moment = rows[0] @ jnp.asarray(state.displacement) + rows[1] @ jnp.asarray(state.velocity)
+    require_finite("parts of the foundation moment", moment)
+    return moment
 
 
 @validated
@@ -144,7 +148,9 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     Source: the energy of the equations in `vector_field`, derived here.
     """
     scene, state = _validated(scene, state)
-    return _energy(scene, state, known_number(t, "s", "t"))
+    found = _energy(scene, state, known_number(t, "s", "t"))
+    require_finite("parts of the energy", found)
+    return found
 
 
 def _validated(scene: Scene, state: State) -> tuple[Scene, State]:
@@ -245,7 +251,9 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     Source: derived here from `vector_field`; the drag of loads on machines with platforms: the antiphase paper, equation (2).
     """
     scene, state = _validated(scene, state)
-    return _power(scene, known_number(t, "s", "t"), state)
+    found = _power(scene, known_number(t, "s", "t"), state)
+    require_finite("parts of the power", found)
+    return found
 
 
 @cached

@@ -33,7 +33,7 @@ from jaxvib.steady.outcome import REFUSED, outcome, require_index
 from jaxvib.steady.regimes.local import regime_growth
 from jaxvib.steady.regimes.synchronous import require_one_speed
 from jaxvib.units import Number, Numbers, count, number, numbers
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_finite, when_known
 
 _LENGTHS = ("displacement", "amplitude")
 """Fields of a response that are 0 at speed 0, except for those of a machine without supports."""
@@ -290,6 +290,7 @@ def response(
         w = _default_speeds(scene, scene.top_speed * 4.0 / 3.0 if top is None else top, size)
     else:
         w = jnp.atleast_1d(numbers(speeds, "rad/s", "speeds", None, low=0.0))
+    require_finite("speeds of the response", w)
     return outcome(_response(scene, w, angles), scene)
 
 

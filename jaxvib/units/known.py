@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxvib.errors import InputError
+from jaxvib.errors import ComputationError, InputError
 from jaxvib.runtime.compat import traced
 
 T = TypeVar("T")
@@ -58,3 +58,15 @@ def require_known(tree: PyTree, field: str, caller: str, instead: str) -> None:
     if not is_known(tree):
         problem = f"contains values that JAX is transforming (jit, grad, vmap, ...), but {caller} needs their values"
         raise InputError(field, f"{problem}; {instead}")
+
+
+def require_finite(what: str, *trees: PyTree) -> None:
+    """Raise `ComputationError` with the status "overflow" if a known value in `trees` is NaN or infinite.
+
+    >>> require_finite("the torques", np.asarray([1.0, np.inf]))
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.ComputationError: overflow: the torques are not finite; check the largest and the smallest numbers
+    """
+    if is_known(trees) and not all(np.all(np.isfinite(np.asarray(leaf))) for leaf in jax.tree.leaves(trees)):
+        raise ComputationError("overflow", f"{what} are not finite; check the largest and the smallest numbers")

@@ -84,3 +84,12 @@ def test_states_of_other_scenes_are_refused_in_one_sentence(state, says):
 def test_a_time_is_one_finite_number(quantity, time):
     with pytest.raises(jv.InputError, match=r"^t "):
         quantity(time, state_of_both())
+
+
+@pytest.mark.parametrize("of", [jv.energy, lambda s, state: jv.power(s, 0.0, state)])
+def test_energy_and_power_that_overflow_have_a_status(of):
+    loads = jv.balls(count=1, mass=0.5, radius=1e200, drag=1.0)
+    s = jv.Scene(jv.one_mass(mass=50.0, stiffness=1e300, damping=1e300), loads, jv.ConstantSpeed(60.0))
+    state = jv.State(jnp.array([1e10]), jnp.array([-1e10]), (jnp.zeros(1),), (jnp.zeros(1),))
+    with pytest.raises(jv.ComputationError, match=r"^overflow: parts of the (energy|power) are not finite; check"):
+        of(s, state)

@@ -430,6 +430,12 @@ def test_equal_speeds_are_no_peaks(stiffness):
     assert len(jv.response(jv.Scene(machine, exciters=[exciter]), most="4000 rpm").peaks()) == 1
 
 
+def test_speeds_that_overflow_have_a_status():
+    exciter = jv.Exciter(drive=jv.DCMotor(1.5e308, stall_torque=60.0, inertia=0.05), unbalance=0.4)
+    with pytest.raises(jv.ComputationError, match=r"^overflow: speeds of the response are not finite"):
+        jv.response(jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), exciters=[exciter]))
+
+
 def test_scenes_with_loads_are_refused():
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))

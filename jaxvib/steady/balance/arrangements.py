@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxvib.errors import InputError
+
 
 class Arrangements(NamedTuple):
     """Arrangements of the loads of one plane: the name of their `BalanceStatus`, and fields as in `BalancedStates`."""
@@ -27,6 +29,8 @@ def arrangements(loads: np.ndarray, imbalance: complex, touching: float, *, orde
     n, free = loads.size, imbalance == 0.0
     sides = loads if free else np.append(loads, abs(imbalance))
     largest = sides.max()
+    if largest == 0.0:
+        raise InputError("loads", "have unbalances of 0 within rounding; check their masses and radii")
     rest = sides.sum() - largest
     rounding = 8.0 * n * np.finfo(sides.dtype).eps * largest
     if largest > rest + rounding:

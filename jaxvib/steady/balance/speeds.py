@@ -20,7 +20,7 @@ from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit, names_along
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_finite, when_known
 
 _GRID_POINTS = 24
 """Number of grid points on each side of each resonance in the search for sign changes of the damped machine."""
@@ -209,6 +209,7 @@ def _require_mount_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndar
     if not np.any(port):
         problem = "does not move with any coordinate, and its loads have no effect; put the exciter at a point that can move"
         raise InputError("machine.mount", problem)
+    require_finite("stiffnesses and masses of the machine", stiffness, mass)
     if scene.mounting.gyroscopic is not None:
         if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
             raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; every motion needs one")

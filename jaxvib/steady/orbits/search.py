@@ -9,6 +9,7 @@ from jax import Array
 
 from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_model
+from jaxvib.errors import ComputationError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.runtime.programs import cached
@@ -42,6 +43,9 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     omega = np.interp(np.linspace(0.0, 1.0, _BRANCH_POINTS), np.linspace(0.0, 1.0, grid.size), grid)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
     known = np.isfinite(speed)
+    if np.sum(known) < 2:
+        problem = "no exact jam was found at any load speed; check the largest and the smallest numbers of the scene"
+        raise ComputationError("not_converged", problem)
     omega, speed = _interpolated(omega[known], speed[known], slope[known])
     folds, ends, modes = sampled_modes(omega, speed, resonances)
     crossed = (speed[1:] - target) * (speed[:-1] - target) <= 0.0

@@ -19,6 +19,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import solve_torques
 from jaxvib.steady.regimes.local import slopes_of, vibration_scale
 from jaxvib.steady.regimes.symmetry import Exchange, distinct_regimes, exchanges_of
+from jaxvib.units.known import require_finite
 
 _EVEN_SPEEDS, _NEAR_SPEEDS = 200, 40
 """Numbers of speeds at equal distances, and on each side of a resonance or of a drive's working speed."""
@@ -102,6 +103,9 @@ def exchanges_in(balance: TorqueBalance) -> list[Exchange]:
     """Return the exchanges of masses that leave the torque balance unchanged, see `exchanges_of`."""
     speeds = float(balance.speed) * np.array([0.31, 0.57, 0.83, 0.99])
     influence, torque = map(np.asarray, _at_speeds(balance, on_device(speeds.astype(balance.unbalance.dtype))))
+    with np.errstate(over="ignore", invalid="ignore"):
+        largest = influence * (np.max(np.asarray(balance.unbalance)) ** 2 * speeds**4)[:, None, None]
+    require_finite("torques of the vibration", largest)
     numbers = [balance.unbalance, balance.averaged.inertia, balance.is_prescribed, *torque]
     return exchanges_of(influence, np.stack([np.nan_to_num(np.asarray(x, float)) for x in numbers], axis=1))
 
@@ -172,9 +176,11 @@ def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tup
     if balance.is_prescribed.any():
         return np.full(len(sets), np.asarray(balance.speed)), sets
     total = in_chunks(_SETS_AT_ONCE, _total_torques, sets, shared=(balance, on_device(speeds)))
-    place, passed = np.nonzero(total[:, :-1] * total[:, 1:] <= 0.0)
+    sign = np.sign(total)  # products of large torques overflow
+    place, passed = np.nonzero(sign[:, :-1] * sign[:, 1:] <= 0.0)
     low, high = total[place, passed], total[place, passed + 1]
-    share = low / np.where(low == high, 1.0, low - high)
+    with np.errstate(over="ignore"):
+        share = low / np.where(low == high, 1.0, low - high)
     roots = speeds[passed] + share * (speeds[passed + 1] - speeds[passed])
     touched, middle = _nearly_touching(total)
     starts = np.concatenate([roots, speeds[middle - 1], speeds[middle + 1]])
@@ -185,8 +191,9 @@ def _nearly_touching(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of local minima of |values| (n, points) whose neighbours have the same sign, the larger of them at
     least twice as large."""
     left, size, right = (np.abs(x) for x in (values[:, :-2], values[:, 1:-1], values[:, 2:]))
-    same = (values[:, :-2] * values[:, 1:-1] > 0.0) & (values[:, 1:-1] * values[:, 2:] > 0.0)
-    row, point = np.nonzero(same & (size <= np.minimum(left, right)) & (2.0 * size <= np.maximum(left, right)))
+    sign = np.sign(values)
+    same = (sign[:, :-2] * sign[:, 1:-1] > 0.0) & (sign[:, 1:-1] * sign[:, 2:] > 0.0)
+    row, point = np.nonzero(same & (size <= np.minimum(left, right)) & (size <= 0.5 * np.maximum(left, right)))
     return row, point + 1
 
 

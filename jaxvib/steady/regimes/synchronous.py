@@ -344,7 +344,8 @@ def synchronous_regimes(
     **Returns** `SynchronousRegimes`, or `SynchronousRegime` with `near`.
 
     **Raises** `InputError` for exciters with both loads and an unbalance, loads with a motor, unbalances whose ideal drives
-    have different speeds, and effects that this theory does not include.
+    have different speeds, and effects that this theory does not include; `ComputationError` with the status "overflow" if
+    torques exceed the range of floating-point numbers.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

@@ -207,6 +207,14 @@ def test_foundation_moment_is_equal_in_all_tiers():
         np.testing.assert_allclose(result.foundation_moment(about=(0.2, 0.1)), expected, rtol=1e-2)
 
 
+def test_foundation_moment_that_overflows_has_a_status():
+    support = jv.support(at=(0.5, 0.0), stiffness=(1e5, 1e5), damping=(1e3, 1e3))
+    exciter = jv.Exciter(drive=DRIVES[0], unbalance=0.05)
+    scene = jv.Scene(jv.plane_body(mass=100.0, inertia=20.0, supports=[support]), exciters=[exciter])
+    with pytest.raises(jv.ComputationError, match=r"^overflow: parts of the foundation moment are not finite"):
+        jv.foundation_moment(scene, jv.initial_state(scene), about=(1e308, 0.0))
+
+
 def test_foundation_moment_of_other_machines_is_refused():
     exciter = jv.Exciter(drive=DRIVES[0], unbalance=0.05)
     with pytest.raises(jv.InputError, match="defined for bodies in a plane"):

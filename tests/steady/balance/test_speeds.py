@@ -55,3 +55,12 @@ def test_what_rounding_holds_fast_is_named(stiffness, says):
     else:
         with pytest.raises(jv.InputError, match=says):
             characteristic_speeds(scene)
+
+
+def test_stiffnesses_whose_sum_overflows_have_a_status():
+    shaft = dict(mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(1e308, 1e308), damping=400.0)
+    scene = jv.Scene(
+        jv.rotor(**shaft, position=(0.165, -0.155)), jv.balls(count=2, mass=0.05, radius=0.1, drag=0.5), jv.ConstantSpeed(300.0)
+    )
+    with pytest.raises(jv.ComputationError, match=r"^overflow: stiffnesses and masses of the machine are not finite"):
+        characteristic_speeds(scene)

@@ -6,7 +6,7 @@ from scenes import machines
 
 import jaxvib as jv
 from jaxvib.steady.balance import states
-from jaxvib.steady.balance.arrangements import inscribed_polygon, neutral_directions
+from jaxvib.steady.balance.arrangements import arrangements, inscribed_polygon, neutral_directions
 from jaxvib.steady.balance.states import _growth_rate, stability_changes
 
 
@@ -115,3 +115,8 @@ def test_undamped_vibration_has_no_stable_interval(stiffness):
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=5.0), jv.ConstantSpeed(60.0))
     assert jv.balanced_states(scene).stability().status_name == "undecided"
     assert jv.balanced_states(scene).intervals(50.0, 90.0, points=20) == []
+
+
+def test_loads_without_unbalance_in_rounding_are_refused():
+    with pytest.raises(jv.InputError, match=r"^loads have unbalances of 0 within rounding"):
+        arrangements(np.zeros(2), 0.0, 0.0, ordered=False)

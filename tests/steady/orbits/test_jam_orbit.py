@@ -110,3 +110,10 @@ def test_a_branch_is_looked_at_once_at_each_point(monkeypatch):
     monkeypatch.setattr(search, "_search_grid", lambda scene: (points, jnp.array([2.0, 3.0])))
     monkeypatch.setattr(search, "branch_at", lambda scene, omega: (omega, jnp.ones_like(omega)))
     assert search.exact_mode_speeds(published(speed=30.0).scene()) == {5: 30.0}
+
+
+def test_jams_that_no_load_speed_has_end_in_a_status():
+    machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.8, radius=1e-300, drag=1.5), jv.ConstantSpeed(120.0))
+    with pytest.raises(jv.ComputationError, match=r"^not_converged: no exact jam was found at any load speed; check"):
+        jv.jam_orbit(scene, mode=3, points=8)

@@ -157,6 +157,21 @@ def test_start_with_a_wrong_number_of_phases_is_refused():
         jv.synchronous_regimes(scene_of(PAIR, (1, 1)), near=(99.0, jnp.zeros(3)))
 
 
+OVERFLOWS = [lambda s: s.exciters[0].drive.speed, lambda s: s.machine.mass, lambda s: s.exciters[0].unbalance]
+
+
+@pytest.mark.parametrize("where", OVERFLOWS)
+def test_torques_that_overflow_end_in_a_status(where):
+    with pytest.raises(jv.ComputationError, match=r"^overflow: torques of the vibration are not finite; check"):
+        jv.synchronous_regimes(eqx.tree_at(where, scene_of(PAIR, (1, 1)), jnp.asarray(1e160)))
+
+
+def test_motors_whose_squared_torques_overflow_hold_their_speed():
+    found = jv.synchronous_regimes(scene_of(PAIR, (1, -1), [jv.DCMotor(100.0, stall_torque=1e300, inertia=0.05)] * 2))
+    assert found.speed.size > 0
+    np.testing.assert_allclose(found.speed, 100.0, rtol=1e-9)
+
+
 def test_margin_is_infinite_for_equal_drives():
     """Also where the phases are neutral: exciters that turn in opposite directions at the middle of equal springs."""
     springs = [jv.support(at=(x, 0.0), stiffness=(3e4, 3e4), damping=(600.0, 600.0)) for x in (-0.6, 0.6)]
