@@ -244,8 +244,8 @@ def join_names(named: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:
     """
     groups: list[list[tuple[float, str]]] = []
     for share, name in named:
-        # A name joins a group if it is near the last name and not far from the first one, because the text of the group is
-        # placed at the mean height.
+        # A name joins a group if it is near the last name and not far from the first one. The second condition is needed
+        # because the text of the group is placed at the mean height.
         first, last = (groups[-1][0][0], groups[-1][-1][0]) if groups else (-1.0, -1.0)
         near = share - last < 0.045 and share - first < 0.09
         groups = [*groups[:-1], [*groups[-1], (share, name)]] if near else [*groups, [(share, name)]]

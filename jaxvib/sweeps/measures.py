@@ -164,9 +164,9 @@ RUN_MEASURES = {
   quantity `peak_force`
 - relative rotation: the largest difference between the angles through which two loads, or rotors without loads, turn in the
   measuring window
-- settling time: the time after which each load speed differs from its final value by less than 1 % of the rotor speed (for
-  a scene that is not plain, see `Scene.is_plain`: of the largest final speed), with a resolution of 1/64 of the time before
-  the measuring window. It is the end of the run if the loads do not settle
+- settling time: the time after which each load speed differs from its final value by less than 1 % of the rotor speed. For
+  a scene that is not plain (see `Scene.is_plain`), it is 1 % of the largest final speed. The resolution is 1/64 of the time
+  before the measuring window. If the loads do not settle, the value is the end of the run
 - the measures from `run.stroke` to `run.conveying_speed`: those of `VibrationMeasures` with the centre of mass as the point.
   All of them except torque and power are NaN for a run that does not end in a vibration at the speed of its exciters (see
   `Run.no_vibration`)

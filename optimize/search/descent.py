@@ -33,7 +33,7 @@ _STEPS_PER_UPDATE = 20
 class _SearchState(NamedTuple):
     """State of one search.
 
-    It contains the design with its values and derivatives (as in `Point`), the state of Adam, the step length, and the
+    It contains the design with its values and derivatives (as in `Point`), the state of Adam, the step `length`, and the
     multipliers and the weight of the demands. `worst` is the largest violation of a demand at the last update of the
     multipliers. The objective is divided by `scale`, the modulus of the initial objective. `steps` is the number of steps.
     """

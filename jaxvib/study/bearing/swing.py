@@ -300,7 +300,7 @@ def swing_states(
         max_steps=max_steps,
         throw=False,
         # `flip=True` states that the function decreases through 0. Without it the search would fail if the last step ends just
-        # before the root and, by rounding, the function has the same sign at both ends of the step.
+        # before the root: by rounding, the function may then have the same sign at both ends of the step.
         event=None if margin is None else diffrax.Event(margin, root_finder=optx.Bisection(1e-12, 1e-12, flip=True)),
     )
     assert solution.ts is not None and solution.ys is not None

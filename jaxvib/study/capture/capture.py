@@ -202,9 +202,9 @@ def capture(
     - `rotation`: "rolling", for balls that roll from the start, or "none", for balls that do not rotate at the start and
       therefore slide until they roll; "none" needs the effect `Sliding`
     - `stepsize_controller`: `EqualSteps(n)` for the whole run, without doubling. By default the first scan has the largest of
-      three numbers of steps; typical: 200 for each turn. They are 1 for each radian of the fastest vibration, 2 for each radian
-      of the motion in a contact between balls or at the end of a slip, and 1 for every three time constants of the fastest
-      decay
+      three numbers of steps; typical: 200 for each turn. The first number is 1 for each radian of the fastest vibration. The
+      second is 2 for each radian of the motion in a contact between balls or at the end of a slip. The third is 1 for every
+      three time constants of the fastest decay
     - `doublings`: largest number of times that the default steps are doubled; typical: 2 (the default); 0 for a single scan.
       With one doubling the work is three times that of a single scan
     - `equations`: as for `ensemble`
