@@ -149,6 +149,8 @@ class SpeedIntervals(list[list[float]]):
 
     >>> SpeedIntervals([[10.0, 20.0], [40.0, 50.0]]), SpeedIntervals()
     (95.493 .. 190.986, 381.972 .. 477.465 rpm, no interval)
+    >>> print(SpeedIntervals([[10.0, 20.0]]).summary())
+    95.493 .. 190.986 rpm
     """
 
     def __repr__(self) -> str:
@@ -156,3 +158,7 @@ class SpeedIntervals(list[list[float]]):
         unit, factor = speed_unit()
         ends = ", ".join(f"{factor * low:.6g} .. {factor * high:.6g}" for low, high in self)
         return f"{ends} {unit}" if ends else "no interval"
+
+    def summary(self) -> str:
+        """Return the intervals as text."""
+        return repr(self)

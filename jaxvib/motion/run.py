@@ -22,6 +22,7 @@ from jaxvib.machine.carrier import on_body, read_place
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import start_notes
+from jaxvib.motion.analysis.beat import beat_period
 from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory, duration_text, turning_masses
 from jaxvib.motion.analysis.points import (
     PointMotion,
@@ -201,7 +202,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         stuck = [] if np.max(np.abs(rotors)) > 1.0 else start_notes(self.scene)
         if not stuck and float(jnp.abs(self.omega)) < STILL_SHARE * float(self.scene.top_speed):
             stuck = [f"the {turning_masses(self.scene)} are almost at rest"]
-        state = "settled" if bool(self.settled) else f"not settled: {stuck[0] if stuck else 'run longer'}"
+        state = "settled" if bool(self.settled) else f"not settled: {stuck[0] if stuck else self._unsettled_text()}"
         state = "steady in the mean" if bool(self.status == RunStatus.beating) else state
         state = "balanced" if bool(self.status == RunStatus.creeping) else state
         unstable, first = bool(self.status == RunStatus.would_separate), []
@@ -231,6 +232,13 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 *self._detachment(),
             ]
         )
+
+    def _unsettled_text(self) -> str:
+        period = beat_period(self.scene, self._stored)
+        if period is None:
+            return "run longer"
+        reason = "the loads turn slower than the imbalance of the rotor"
+        return f"the vibration beats with a period of {period:.4g} s and will not settle, because {reason}"
 
     def _window_text(self) -> str:
         start, end = (f"{float(self.window.time[k]):.4g}" for k in (0, -1))

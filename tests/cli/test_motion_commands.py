@@ -291,6 +291,33 @@ def test_response_of_several_exciters_lists_each_torque(typed, tmp_path):
     assert code == 2 and err.strip() == "jaxvib: --phases has 1 values; 2 are needed"
 
 
+def test_regimes_list_motions_in_groups_if_not_all_synchronize(typed, tmp_path, monkeypatch):
+    """Two motors of different speeds, and a motor whose partner is switched off; the search for groups is slow and tested
+    elsewhere."""
+
+    def partitions(scene):
+        n = sum(not isinstance(each.drive, jv.SwitchedOff) for each in scene.exciters) - 1
+        values, speeds = np.zeros((n, 2)), np.tile([100.0, 60.0], (n, 1))
+        groups, stable = np.tile([0, 1], (n, 1)), np.ones(n, bool)
+        found = jv.RegimeSearchStatus.done
+        return jv.RegimePartitions(found, groups, speeds, values, values[:, 0] - 1.0, stable, values[:, 0] + 0.05, scene)
+
+    monkeypatch.setattr(jv, "regime_partitions", partitions)
+    springs = [jv.support(at=(x, 0.0), stiffness=(3e4, 3e4), damping=(300.0, 300.0)) for x in (-0.6, 0.6)]
+    screen = jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
+    fast, slow = (jv.DCMotor(n, stall_torque=60.0, inertia=0.05) for n in (100.0, 60.0))
+    for second, text, key in (
+        (slow, "  1: 954.93 rpm; 2: 572.958 rpm; stable (-1 1/s), interaction 0.05\n", "speed"),
+        (jv.SwitchedOff(slow, bearing=3.0), "exciter 1 alone: 952.701 rpm, stable, if", "without_switched_off"),
+    ):
+        pair = [jv.Exciter(drive=m, unbalance=0.4, at=(x, 0.0)) for m, x in ((fast, -0.3), (second, 0.3))]
+        jv.save_scene(jv.Scene(screen, exciters=pair), tmp_path / "screen.toml")
+        code, out, _ = typed("regimes", "screen.toml")
+        assert code == 0 and "no regime" in out and text in out
+        assert len(json.loads(typed("regimes", "screen.toml", "--json")[1])["groups"][key]) == 1
+    assert "if exciter 2 (switched off) comes to rest" in out
+
+
 def test_response_at_an_undamped_resonance_is_unbounded(typed, tmp_path):
     resonance = (800e3 / 200.0) ** 0.5
     drive = f'{{ kind = "constant_speed", speed = {resonance!r} }}'

@@ -44,19 +44,13 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
     output.figure("regimes.png", result.plot)
     output.csv(csv, result, "regime")
     frequencies = sorted(map(float, jv.natural_frequencies(loaded)))
+    groups = None if any(regime.stable for regime in selected) else _Groups(loaded)
     document = {
         "natural_frequencies": frequencies,
         "judged": "by the growth of small disturbances of the averaged motion",
         "search": status_name(result.search),
-        "regimes": [
-            {
-                "status": regime.message,
-                **fields_of(regime, "speed", "phases", "stable", "growth", "quasi_static", "margin"),
-                **fields_of(regime, "torque", "vibrational_torque", "power", "can_start", "amplitude", "foundation_force"),
-                **({} if figures is None else {"measures": figures.document()}),
-            }
-            for regime, figures in zip(selected, measures, strict=True)
-        ],
+        "regimes": [_regime_document(*pair) for pair in zip(selected, measures, strict=True)],
+        **({} if groups is None else {"groups": groups.document()}),
         **({"tolerances": [each._asdict() for each in ranges]} if tolerances else {}),
     }
 
@@ -66,7 +60,7 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
         unit, scale = speed_unit()
         resonances = f"resonances: {speed_text(frequencies)}"
         if not selected:
-            return f"{result.summary()}\n{resonances}"
+            return "\n".join([result.summary(), *(groups.lines() if groups else []), resonances])
         force_unit, factor = shown_unit("N", max(float(regime.foundation_force) for regime in selected))
         rows = [[*_row(regime, scale), f"{factor * float(regime.foundation_force):.4g}"] for regime in selected]
         head = [unit, "", " ", "phases, degrees", "margin", "power, W", f"foundation force, {force_unit}"]
@@ -78,6 +72,7 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
             f"rotation: {', '.join(f'exciter {k} {direction}' for k, direction in enumerate(directions, 1))}",
             "margin: factor by which the differences of the motors' torques can grow; inf for",
             "equal motors",
+            *(groups.lines() if groups else []),
             *([] if status_name(result.search) == "done" else [jv.RegimeSearchStatus[result.search]]),
             *(textwrap.fill(note, 80) for note in result.notes()),
         ]
@@ -89,6 +84,59 @@ def regimes(scene: Path, without: tuple[str, ...], tolerances: tuple[str, ...], 
         return "\n".join([drawing, *notes, *blocks, *within])
 
     output.done(document, text, "regimes", result)
+
+
+def _regime_document(regime: jv.SynchronousRegime, measures: jv.VibrationMeasures | None) -> dict[str, object]:
+    return {
+        "status": regime.message,
+        **fields_of(regime, "speed", "phases", "stable", "growth", "quasi_static", "margin"),
+        **fields_of(regime, "torque", "vibrational_torque", "power", "can_start", "amplitude", "foundation_force"),
+        **({} if measures is None else {"measures": measures.document()}),
+    }
+
+
+_MAX_MASSES = 4
+"""Largest number of rotating masses for which the command computes motions in groups: 15 groups."""
+
+
+class _Groups:
+    """Stable motions of rotating masses in groups of different speeds, for a scene without a stable regime of all masses.
+
+    A motor that is switched off and belongs to no group is assumed to come to rest."""
+
+    def __init__(self, scene: jv.Scene):
+        self.scene = scene
+        carries = [1 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters]
+        self.count = sum(carries)
+        self.motions = jv.regime_partitions(scene) if 1 < sum(carries) <= _MAX_MASSES else None
+        off = [isinstance(exciter.drive, jv.SwitchedOff) for exciter in scene.exciters]
+        running = [k for k, is_off in enumerate(off) if not is_off]
+        self.off, self.running = [k + 1 for k, is_off in enumerate(off) if is_off], []
+        if self.off and running and sum(carries) == len(carries) and not (self.motions and len(self.motions.speed)):
+            found = jv.synchronous_regimes(scene, masses=running)
+            self.running = [each for each in map(found.select, range(len(found.speed))) if each.stable]
+
+    def document(self) -> dict[str, object]:
+        """Return the motions for a document."""
+        names = ("group", "speed", "phases", "stable", "growth", "interaction")
+        in_groups = {} if self.motions is None else fields_of(self.motions, *names)
+        running = [fields_of(each, "masses", "speed", "phases", "growth") for each in self.running]
+        return {**in_groups, "without_switched_off": running}
+
+    def lines(self) -> list[str]:
+        """Return the motions as lines of text; an empty list if none is known."""
+        from jaxvib.display import speed_text  # slow import, which --help does not need
+
+        if self.motions is not None and len(self.motions.speed):
+            lines = [f"  {line}" for line in self.motions.summary().splitlines()]
+            about = "motions in groups of different speeds (numbers: rotating masses; interaction:"
+            return [about, "estimated relative error, because groups act on each other):", *lines]
+        if self.count > _MAX_MASSES:
+            return [f"motions in groups of different speeds: regime_partitions in Python (slow for {self.count} masses)"]
+        off = f"if exciter {', '.join(map(str, self.off))} (switched off) comes to rest"
+        numbers = [", ".join(str(int(k) + 1) for k in each.masses) for each in self.running]
+        speeds = [speed_text(each.speed, 6) for each in self.running]
+        return [f"exciter {k} alone: {w}, stable, {off}" for k, w in zip(numbers, speeds, strict=True)]
 
 
 def _place_among(speed: float, frequencies: list[float]) -> str:

@@ -22,7 +22,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import sentence, status_name
 from jaxvib.runtime.compat import enumeration_names
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.phases import PhasePattern, phase_pattern
+from jaxvib.steady.jams.phases import PhasePattern, degrees, phase_pattern
 from jaxvib.steady.whirl import whirl
 
 _MAX_EQUAL_SPEED_DIFFERENCE = 3e-3
@@ -71,7 +71,8 @@ class Regime(Result):
 
     **Attributes**
 
-    - `name`: a `RegimeName`
+    - `name`: a `RegimeName`, for comparisons such as `name == jv.RegimeName.jammed`; for texts `label` is its short name
+      ("jammed"), and `message` its sentence
     - `pattern`: a `PhasePattern` of the loads
     - `load_speed` (count,): mean speeds of the loads over whole turns, and `rotor_speed`, rad/s
     - `ripple`: largest ripple of the speed of a load (half of peak to peak), rad/s
@@ -123,7 +124,7 @@ class Regime(Result):
 
     def summary(self) -> str:
         """Return the kind of motion and the quantities from which it follows as text."""
-        pattern = sentence(self.pattern)
+        pattern = self._pattern_text()
         loads, rotor = (speed_text(speed) for speed in (self.load_speed, self.rotor_speed))
         evidence = [f"loads {loads}, rotor {rotor}, ripple {speed_text(self.ripple, 2)}"]
         if bool(self.name == RegimeName.jammed):
@@ -139,6 +140,13 @@ class Regime(Result):
         if abs(float(self.rotor_speed)) > STILL_SHARE * float(self.resonance_speed):
             evidence.append(f"speeds change by {float(self.change):.1e}")
         return f"{self.message} ({'; '.join(evidence)})"
+
+    def _pattern_text(self) -> str:
+        if not bool(self.pattern == PhasePattern.other):
+            return sentence(self.pattern)
+        frame = "relative to load 1" if bool(self.name == RegimeName.jammed) else "in the rotor"
+        angles = ", ".join(f"{degrees(float(a)) % 360.0:.4g}" for a in self.phase)
+        return f"at {angles} deg {frame}"
 
     def _remainder(self) -> str:
         share = float(self.unbalance)
