@@ -132,14 +132,19 @@ def quantity_text(values: ArrayLike, unit: str, digits: int = 5, between: str = 
     numbers = np.atleast_1d(np.asarray(values, float))
     shown, factor = shown_unit(unit, float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers))))
     # NumPy's numbers would warn of an overflow.
-    return between.join(f"{factor * x:.{digits}g}" for x in numbers.tolist()) + f" {shown}"
+    return between.join(_without_exponent(f"{factor * x:.{digits}g}") for x in numbers.tolist()) + f" {shown}"
+
+
+def _without_exponent(text: str) -> str:
+    """Return the text of a number below 1e6 without a positive exponent: "11000" for "1.1e+04"."""
+    return f"{float(text):.0f}" if "e+" in text and abs(float(text)) < 1e6 else text
 
 
 def speed_text(values: ArrayLike, digits: int = 5, between: str = ", ") -> str:
     """Return speeds, rad/s, as text, see `quantity_text`.
 
     >>> speed_text(157.0796), speed_text([100.0, 200.0], 3, " .. ")
-    ('1500 rpm', '955 .. 1.91e+03 rpm')
+    ('1500 rpm', '955 .. 1910 rpm')
     """
     return quantity_text(values, "rad/s", digits, between)
 

@@ -417,6 +417,11 @@ def test_values_are_shown_in_si_on_request():
     assert shown_unit("m", 0.02) == ("mm", 1e3)
 
 
+def test_speeds_are_shown_without_an_exponent():
+    assert quantity_text([1151.917306, 1.5e5 * np.pi / 30.0], "rad/s", 4) == "11000, 150000 rpm"
+    assert quantity_text([1e8], "rad/s", 4) == "9.549e+08 rpm"
+
+
 def test_values_above_all_numbers_are_shown_without_a_warning():
     assert quantity_text(np.asarray([1e308, 1.0]), "rad/s", 3) == "inf, 9.55 rpm"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import weakref
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Any
@@ -135,6 +136,9 @@ whose sag and motor power are examined. Machines with dimensionless parameters h
 _MAX_SUPPORT_DISTANCE = 100.0
 """Largest usual coordinate of a support, m."""
 
+_DIGITS_OF_SPEEDS = 5
+"""Largest usual number of digits of a speed that a user writes."""
+
 _MIN_STIFFNESS_RATIO = 5e-3
 """Smallest usual ratio of two stiffnesses of supports."""
 
@@ -170,7 +174,8 @@ def implausible_numbers(scene: Scene) -> list[str]:
     for k, exciter in enumerate(scene.exciters):
         place, loads = scene.prefix_of(k), exciter.loads
         speed = float(exciter.drive.speed)
-        if speed > MAX_USUAL_SPEED:
+        is_short = math.isclose(speed, float(f"{speed:.{_DIGITS_OF_SPEEDS}g}"), rel_tol=1e-9)
+        if speed > MAX_USUAL_SPEED and is_short:  # a speed that was given in rpm has many digits in rad/s
             note(f"{place}drive.speed", speed_text(speed), "rad/s", f"{speed:g} rpm")
         power = float(getattr(exciter.drive, "power", np.inf))
         if mass >= _MIN_MASS and power < _MIN_POWER * mass:

@@ -183,6 +183,13 @@ def test_torque_at_rest_that_rises_is_not_judged(drive, start):
     assert bool(start_notes(scene)) == (start is not None)
 
 
+@pytest.mark.parametrize(("speed", "count"), [(1500.0, 1), ("11000 rpm", 0), ("400 Hz", 0), (300.0, 0)])
+def test_only_plain_speeds_are_noted(speed, count):
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(speed))
+    assert len(implausible_numbers(scene)) == count
+
+
 def test_a_stiffness_far_below_the_others_is_noted():
     says = "but another one is {} N/m; a plain number is in N/m: did you mean '{} N/mm'?"
     feeder = SCREENS["feeder"].replace('["80 N/mm", "126 N/mm"]', '["80 N/mm", 126]', 1)
