@@ -1,6 +1,6 @@
-"""Trial of random scenes and mutated files: each result must be right, a named status, or a message about the input.
+"""Trial of random scenes: each result must be right, a named status, or a message about the input.
 
-    python benchmarks/trials/random_scenes.py --scenes 500 --files 5000 --out out
+    python benchmarks/trials/random_scenes.py --scenes 500 --out out
 
 The scenes are of few kinds, so that few programs are compiled, with parameters over many decades. The tests of each scene are
 
@@ -12,9 +12,7 @@ The scenes are of few kinds, so that few programs are compiled, with parameters 
 - the gradient of the foundation force with respect to the stiffnesses agrees with finite differences for one of two steps, to
   1e-4
 
-A mutated file is a template or a record with changed characters, numbers, lines or words; reading it must end in a scene or in
-an `InputError`. Every other outcome, including warnings and more than 60 s, is a failure and is printed with the seed that
-repeats it.
+Every other outcome, including warnings and more than 60 s, is a failure and is printed with the seed that repeats it.
 """
 
 from __future__ import annotations
@@ -26,7 +24,6 @@ import functools
 import json
 import pathlib
 import sys
-import tempfile
 import time
 import traceback
 import warnings
@@ -39,12 +36,10 @@ import numpy as np
 from scipy.linalg import eigh
 
 import jaxvib as jv
-from jaxvib.machine.files import TEMPLATES
 from jaxvib.results.status import status_name
 
 sys.path[:0] = [str(pathlib.Path(__file__).parents[2] / "tests" / name) for name in ("helpers", "validation")]
 
-import mutations  # noqa: E402
 from hard_cases.reference_integration import multipliers, run_out  # noqa: E402
 from hard_cases.reference_model import ReferenceModel, light_modes, light_speed, number_of, reference_model  # noqa: E402
 from hard_cases.shared import away, compared_state, end_of_run, light_force_slope, state_of  # noqa: E402
@@ -73,25 +68,6 @@ def not_counted(function: Callable) -> Callable:
 
 
 run_out, multipliers = map(not_counted, (run_out, multipliers))
-
-
-def record(rng: np.random.Generator) -> str:
-    """A recorded swing as a CSV file."""
-    times = np.arange(0.0, 6.0, 0.05)
-    angle = 20.0 * np.exp(-0.05 * times) * np.cos(6.0 * times) + 0.01 * rng.normal(size=times.size)
-    return "time, angle\n" + "\n".join(f"{t:.3f}, {a:.4f}" for t, a in zip(times, angle, strict=True))
-
-
-def read_file(seed: int, folder: pathlib.Path, texts: dict[str, str]) -> str:
-    """Outcome of reading one mutated file."""
-    rng = np.random.default_rng([seed, 2])
-    name = rng.choice([*texts, "record"])
-    text, file, read = (
-        (record(rng), "record.csv", jv.read_record) if name == "record" else (texts[name], "scene.toml", jv.load_scene)
-    )
-    (folder / file).write_text(mutations.mutated_text(text, mutations.seeded(seed)), encoding="utf-8", errors="surrogatepass")
-    read(folder / file)
-    return "read"
 
 
 def drawn(rng: np.random.Generator) -> jv.Scene:
@@ -321,7 +297,6 @@ def ended(ask: Callable[[], str]) -> str:
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--scenes", type=int, default=500)
-    options.add_argument("--files", type=int, default=5000)
     options.add_argument("--first", type=int, default=0, help="number of the first one")
     options.add_argument("--questions", nargs="*", default=list(QUESTIONS), choices=list(QUESTIONS))
     options.add_argument("--minutes", type=float, default=1e9, help="after which nothing more is asked")
@@ -343,21 +318,15 @@ def main() -> None:
             found = {"first": given.first, "counts": counts, "bad": bad}
             (given.out / "random_scenes.json").write_text(json.dumps(found, indent=1) + "\n")
 
-    texts = {kind: text for kind, text in TEMPLATES.items() if kind != "design"}
-    files = -(-given.files // max(given.scenes, 1))  # with each scene, so that both advance
     begun = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        for k in range(max(given.scenes, 1)):
-            if time.perf_counter() - begun > 60.0 * given.minutes:
-                break
-            for seed in range(given.first + k * files, given.first + min((k + 1) * files, given.files)):
-                note("file", seed, ended(lambda: read_file(seed, pathlib.Path(folder), texts)))  # noqa: B023
-            seed = given.first + k
-            for question in given.questions if given.scenes else ():
-                rng = np.random.default_rng([seed, 1])
-                note(question, seed, ended(lambda: QUESTIONS[question](drawn(rng), rng)))  # noqa: B023
-            if k % 5 == 4:
-                write()
+    for seed in range(given.first, given.first + given.scenes):
+        if time.perf_counter() - begun > 60.0 * given.minutes:
+            break
+        for question in given.questions:
+            rng = np.random.default_rng([seed, 1])
+            note(question, seed, ended(lambda: QUESTIONS[question](drawn(rng), rng)))  # noqa: B023
+        if seed % 5 == 4:
+            write()
     for question, found in counts.items():
         print(f"{question}: " + ", ".join(f"{number} {name}" for name, number in found.most_common()))
     write()
