@@ -65,23 +65,23 @@ def tier_rows(scene: Scene, comparison: JamComparison | RunComparison, reference
 
 
 def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, reference: MotionValues, repeats: int) -> TierRow:
-    unknown_numbers = (math.nan,) * 5
+    def not_applicable(note: str) -> TierRow:
+        return TierRow(tier.name, False, *(math.nan,) * 5, note=note)
+
     refusal = tier.refusal(scene)
     if refusal is not None:
-        return TierRow(tier.name, False, *unknown_numbers, note=refusal)
+        return not_applicable(refusal)
     call = _call(tier, scene, comparison, reference)
     if isinstance(call, str):
-        return TierRow(tier.name, False, *unknown_numbers, note=call)
+        return not_applicable(call)
     try:
         result, seconds, compiling = timed(call, repeats) if repeats else (call(), math.nan, math.nan)
     except (InputError, ComputationError) as problem:
-        return TierRow(tier.name, False, *unknown_numbers, note=str(problem))
+        return not_applicable(str(problem))
     amplitude, size = np.abs(np.asarray(result.amplitude)), np.asarray(reference.amplitude)
     if not np.all(np.isfinite(amplitude)):
         status = getattr(result, "status", None)
-        return TierRow(
-            tier.name, False, *unknown_numbers, note="this motion does not exist" if status is None else status_name(status)
-        )
+        return not_applicable("this motion does not exist" if status is None else status_name(status))
     note = tier.purpose
     if isinstance(comparison, JamComparison) and isinstance(result, MotionValues) and result.kind != "jammed":
         note = f"the run left the jam: {result.kind}"
