@@ -35,7 +35,6 @@ from optimize.quantities.jams import amplitude, force_per_amplitude, foundation_
 from optimize.quantities.quantity import Demand, Pair, Quantity, Tier, walk
 from optimize.result import Limit, Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
 from optimize.search.find import Options, Searcher, SearchResult, choose, require_searcher
-from optimize.search.polish import FEASIBILITY_TOLERANCE
 from optimize.search.problem import Problem, evaluate_quantities, problem_of, scenes_of
 from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours, numbers_to_free
 from optimize.space import DesignSpace
@@ -207,11 +206,10 @@ def _describe_searches(result: SearchResult, space: DesignSpace) -> tuple[Synthe
     """Return the status of a search, the reason why its best machine is not verified ("" for none), and the fields of
     `Synthesis` that describe the searches."""
     best, z = result.best, result.designs(space)
-    is_feasible = result.violation < 10.0 * FEASIBILITY_TOLERANCE
-    done = is_feasible & (result.remaining_decrease < _CONVERGED_DECREASE)
+    done = result.is_feasible & (result.remaining_decrease < _CONVERGED_DECREASE)
     if result.interrupted:
         status, why_unverified = SynthesisStatus.interrupted, "the search was interrupted"
-    elif not is_feasible[best]:
+    elif not result.is_feasible[best]:
         status, why_unverified = SynthesisStatus.contradictory, "the machine does not meet all demands"
     else:
         status, why_unverified = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged, ""
@@ -222,9 +220,9 @@ def _describe_searches(result: SearchResult, space: DesignSpace) -> tuple[Synthe
             "starts": len(z),
             "drawn": result.drawn,
             "converged": int(np.sum(done)),
-            "same": int(np.sum(is_feasible & (np.max(np.abs(z - z[best]), axis=1) < _SAME_DESIGN_DISTANCE))),
+            "same": int(np.sum(result.is_feasible & (np.max(np.abs(z - z[best]), axis=1) < _SAME_DESIGN_DISTANCE))),
             "designs": z,
-            "values": np.where(is_feasible, result.point.values[:, 0], np.inf),
+            "values": result.feasible_values,
             "done": done,
             "history": result.history,
             "kkt": float(result.optimality.kkt[best]),
@@ -305,7 +303,7 @@ def _missing(space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...
 
 
 def _rank(result: SearchResult) -> tuple[bool, float]:
-    is_feasible = bool(result.violation[result.best] < 10.0 * FEASIBILITY_TOLERANCE)
+    is_feasible = bool(result.is_feasible[result.best])
     return not is_feasible, float(result.point.values[result.best, 0] if is_feasible else result.violation[result.best])
 
 

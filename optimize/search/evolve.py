@@ -112,7 +112,7 @@ def evolve(problem: Problem, evaluations: int, seed: int, report: Callable[[floa
     """
     import cma  # an optional dependency
 
-    populations, m = PopulationValues(problem), problem.equalities
+    populations = PopulationValues(problem)
     merits, designs, history = np.zeros(0), np.zeros((0, problem.space.size)), []
     size, drawn, existing, run, interrupted = np.nan, 0, 0, 0, False
     # The package fails for a single free parameter; therefore a second one without effect is added.
@@ -132,9 +132,7 @@ def evolve(problem: Problem, evaluations: int, seed: int, report: Callable[[floa
                 drawn, existing = drawn + len(z), existing + int(np.sum(exists))
                 if np.isnan(size) and np.any(exists):
                     size = max(float(np.median(np.abs(values[exists, 0]))), 1e-300)
-                total_violation = np.sum(np.abs(values[:, 1 : 1 + m]), axis=1) + np.sum(
-                    np.maximum(values[:, 1 + m :], 0.0), axis=1
-                )
+                total_violation = np.sum(problem.violations(values), axis=1)
                 merit = np.where(
                     exists, np.nan_to_num(values[:, 0] / size + _VIOLATION_PENALTY * total_violation), _MERIT_WITHOUT_OBJECTIVE
                 )

@@ -15,7 +15,7 @@ from optimize.quantities.cases import Robust
 from optimize.quantities.quantity import walk
 from optimize.search.descent import descend
 from optimize.search.evolve import evolve, require_cma
-from optimize.search.polish import FEASIBILITY_TOLERANCE, Optimality, Polished, draw_starts, optimality, polish, violation
+from optimize.search.polish import MAX_VIOLATION, Optimality, Polished, draw_starts, optimality, polish, violation
 from optimize.search.problem import Point, Problem, evaluate, find_speeds
 from optimize.space import Choice, DesignSpace
 
@@ -68,10 +68,17 @@ class SearchResult(NamedTuple):
     def best(self) -> int:
         """Index of the design with the least objective among the designs that meet all demands. If no design meets them, index
         of the design with the least violation."""
-        is_feasible = self.violation < 10.0 * FEASIBILITY_TOLERANCE
-        if np.any(is_feasible):
-            return int(np.argmin(np.where(is_feasible, self.point.values[:, 0], np.inf)))
-        return int(np.argmin(self.violation))
+        return int(np.argmin(self.feasible_values if np.any(self.is_feasible) else self.violation))
+
+    @property
+    def is_feasible(self) -> np.ndarray:
+        """True (s,) for designs that meet all demands."""
+        return self.violation < MAX_VIOLATION
+
+    @property
+    def feasible_values(self) -> np.ndarray:
+        """Objective (s,) of each design, infinite for designs that do not meet all demands."""
+        return np.where(self.is_feasible, self.point.values[:, 0], np.inf)
 
     def designs(self, space: DesignSpace) -> np.ndarray:
         """Return the final designs (s, d) in [0, 1], relative to the bounds of `space`, not to the `bounds` of a branch."""
@@ -235,7 +242,7 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
         return root
     if root.interrupted:
         return _interrupted(problem, root)
-    if root.violation[root.best] > 10.0 * FEASIBILITY_TOLERANCE:
+    if root.violation[root.best] > MAX_VIOLATION:
         return root
     order = itertools.count()
     queue = [(float(root.point.values[root.best, 0]), next(order), root, problem.space.numbers(_best_distinct(root)))]
@@ -254,7 +261,7 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
                 child = _solve_in_bounds(problem, low, high, starts, max(options.polishing, 20))
                 if child is None:
                     continue
-                if child.violation[child.best] > 10.0 * FEASIBILITY_TOLERANCE:
+                if child.violation[child.best] > MAX_VIOLATION:
                     if nearest is root or child.violation[child.best] < nearest.violation[nearest.best]:
                         nearest = child
                     continue
@@ -314,7 +321,7 @@ def _distance_to_catalogue(values: tuple[float, ...], x: float) -> float:
 
 def _best_distinct(result: SearchResult) -> np.ndarray:
     """Return the best distinct designs, (at most 7, d)."""
-    order = np.argsort(np.where(result.violation < 10.0 * FEASIBILITY_TOLERANCE, result.point.values[:, 0], np.inf))
+    order = np.argsort(result.feasible_values)
     distinct: list[np.ndarray] = []
     for k in order:
         z = result.point.z[k]

@@ -30,8 +30,10 @@ from optimize.search.model import (
 from optimize.search.problem import Point, Problem, evaluate
 
 FEASIBILITY_TOLERANCE = 1e-8
-"""Violation below which a search treats held quantities and demands as met, relative to held values and limits. A
-final design counts as feasible up to ten times this violation."""
+"""Violation below which a search treats held quantities and demands as met, relative to held values and limits."""
+
+MAX_VIOLATION = 10.0 * FEASIBILITY_TOLERANCE
+"""Violation up to which a final design counts as feasible."""
 
 _UNREACHABLE_DECREASE = 1e-10
 """Predicted relative decrease of the objective that counts as zero if no step achieves it. Rounding errors of the derivatives
@@ -86,9 +88,7 @@ class Polished(NamedTuple):
 def violation(problem: Problem, point: Point) -> np.ndarray:
     """Return the largest relative violation (s,) of held quantities and demands; infinite for designs whose quantities do not
     exist."""
-    m = problem.equalities
-    parts = np.concatenate([np.abs(point.values[:, 1 : 1 + m]), np.maximum(point.values[:, 1 + m :], 0.0)], axis=1)
-    return np.where(point.exists(), np.max(parts, axis=1, initial=0.0), np.inf)
+    return np.where(point.exists(), np.max(problem.violations(point.values), axis=1, initial=0.0), np.inf)
 
 
 def restore(
@@ -362,10 +362,7 @@ def _trial_point(problem: Problem, point: Point, model: Step, size: np.ndarray, 
 
 
 def _merit(problem: Problem, point: Point, size: np.ndarray, penalty: np.ndarray) -> np.ndarray:
-    m = problem.equalities
-    total_violation = np.sum(np.abs(point.values[:, 1 : 1 + m]), axis=1) + np.sum(
-        np.maximum(point.values[:, 1 + m :], 0.0), axis=1
-    )
+    total_violation = np.sum(problem.violations(point.values), axis=1)
     total_violation = np.where(total_violation < 1e-12, 0.0, total_violation)
     return np.where(point.exists(), point.values[:, 0] / size + penalty * total_violation, np.inf)
 

@@ -114,6 +114,11 @@ class Problem(eqx.Module):
             space, objective, forms, keys, self.constants[index], self.scales[index], self.batch_size, parts, program
         )
 
+    def violations(self, values: np.ndarray) -> np.ndarray:
+        """Return the relative violations (s, me + mi) of held quantities and demands from the values of s designs."""
+        m = self.equalities
+        return np.concatenate([np.abs(values[:, 1 : 1 + m]), np.maximum(values[:, 1 + m :], 0.0)], axis=1)
+
     @property
     def forward_only(self) -> bool:
         """True if the derivatives of a quantity exist in forward mode only."""

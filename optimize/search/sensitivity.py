@@ -13,7 +13,7 @@ from jaxvib.machine.scene import Scene
 from optimize.quantities.quantity import Demand, Quantity
 from optimize.result import Influence, Limit, Machine
 from optimize.search.find import SearchResult
-from optimize.search.polish import ACTIVE_DISTANCE, FEASIBILITY_TOLERANCE
+from optimize.search.polish import ACTIVE_DISTANCE, MAX_VIOLATION
 from optimize.search.problem import Problem, evaluate_quantities
 from optimize.space import DesignSpace
 
@@ -49,13 +49,13 @@ def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult,
         unit, factor = shown_unit(held.quantity.unit, abs(at))
         what = f"{held.quantity.words} held at {at * factor:.5g} {unit}".rstrip()
         size = abs(deviation)
-        violation = 0.0 if size <= 10.0 * FEASIBILITY_TOLERANCE else size if np.isfinite(size) else np.inf
+        violation = 0.0 if size <= MAX_VIOLATION else size if np.isfinite(size) else np.inf
         value = float(at * (1.0 + deviation))
         multiplier = float(-dual * np.sign(at))
         rows.append(Limit(what, held.quantity.unit, value, at, float(violation), True, multiplier, gain(multiplier), held=True))
     for k, demand in enumerate(demands):
         excess, dual, scale = values[1 + held_count + k], duals.demands[best, k], float(problem.scales[k])
-        violation = 0.0 if excess <= 10.0 * FEASIBILITY_TOLERANCE else excess if np.isfinite(excess) else np.inf
+        violation = 0.0 if excess <= MAX_VIOLATION else excess if np.isfinite(excess) else np.inf
         active = bool(excess > -1e-6)
         multiplier = -dual * abs(sides[k, 1]) / scale if active else 0.0
         value, limit = float(sides[k, 0]), float(sides[k, 1])
@@ -122,7 +122,7 @@ def machines_of(problem: Problem, result: SearchResult, same: float) -> tuple[Ma
 
     **Arguments**: `same`: distance of two designs, relative to the ranges, below which they are the same machine.
     """
-    values = np.where(result.violation < 10.0 * FEASIBILITY_TOLERANCE, result.point.values[:, 0], np.inf)
+    values = result.feasible_values
     remaining = [int(k) for k in np.argsort(values) if np.isfinite(values[k])]
     z, numbers = result.designs(problem.space), problem.space.within(*result.bounds).numbers(result.point.z)
     machines: list[Machine] = []
