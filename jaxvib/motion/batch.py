@@ -97,8 +97,8 @@ def divide_run(
 ) -> tuple[IntegratorState, Array, Array]:
     """Return the first state of the integrator, and the start times and lengths, s, of `number` parts of equal `length`.
 
-    Regular implicit steps do not resolve the fast acceleration of loads by drag at the start. Therefore very short steps are
-    taken first, the end of each at twice the time of the previous one. The first part begins at their end and is shorter.
+    Before regular implicit steps, which do not resolve the fast acceleration of loads by drag at the start, very short steps
+    are taken, the end of each at twice the time of the previous one. The first part begins at their end and is shorter.
     """
     begins, lengths = length * jnp.arange(number, dtype=length.dtype), jnp.full(number, length)
     if not implicit:
@@ -128,18 +128,10 @@ def batch_size() -> int:
 
 
 class BatchPlan(NamedTuple):
-    """Steps of a batch of runs, equal for all runs.
-
-    **Attributes**
-
-    - `until`: end time, s
-    - `window`: length of the measuring window at the end, s
-    - `samples`: number of evenly spaced states in the window
-    - `each`: number of steps in each of the `PARTS_OF_RUN` parts before the window
-    - `between`: number of steps from one sample to the next
-    - `implicit`: True if decay is too fast for explicit steps
-    - `blocks`: number of blocks of a part, in each of which the largest values are determined; 0: they are not determined
-    """
+    """Steps of a batch of runs: end time `until` and length `window` of the measuring window at the end, s; numbers of
+    `samples` in the window, of steps in `each` of the `PARTS_OF_RUN` parts before it and `between` two samples; `implicit`:
+    True if decay is too fast for explicit steps; number of `blocks` of a part whose largest values are determined, 0 for
+    none."""
 
     until: float
     window: float
@@ -202,7 +194,6 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
         return moved, (moved, None)
 
     def block(packed: IntegratorState, at: tuple[Array, Array]) -> tuple[IntegratorState, Peaks]:
-        """Advance by a block, and return the largest values in it."""
         last, steps = advance_by_steps(motion, packed, *at, plan.each // plan.blocks, implicit=plan.implicit)
         return last, extrema_of_steps(model, field, *steps).peaks(model) if has_contact else locate_peaks(model, field, *steps)
 
@@ -241,5 +232,4 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
 
 
 def _prepended(first: IntegratorState, later: IntegratorState) -> IntegratorState:
-    """Return a state of the integrator and later ones as one history along a leading axis."""
     return jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, later)

@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 from jaxvib.boundary import call_user, validated
 from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text
 from jaxvib.equations.dynamics import vector_field
-from jaxvib.equations.state import State
+from jaxvib.equations.state import ExciterState, State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
@@ -302,22 +302,9 @@ def ensemble(
         masses = rotating_masses(plan.scenes, last, load_speed, plan.end, plan.end / ENSEMBLE_PARTS)
         relative_rotation = jnp.max(masses.rotation, axis=1) - jnp.min(masses.rotation, axis=1)
     labels = axis_labels(plan.scenes)
+    values = last, load_speed, relative_rotation, error, plan.allowed, finite, resolved, detached, step_counts[0], unknown
     result = Ensemble(
-        *on_device(
-            (
-                last,
-                load_speed,
-                relative_rotation,
-                error,
-                plan.allowed,
-                finite,
-                resolved,
-                detached,
-                step_counts[0],
-                unknown,
-                masses,
-            )
-        ),
+        *on_device((*values, masses)),
         coordinates=labels["coordinate"],
         units=labels["unit"],
         loads=labels["load"],
@@ -357,20 +344,15 @@ def _run_batch(
 
 
 def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equations, implicit: bool) -> _Ends:
-    """Integrate a run with equal steps in `ENSEMBLE_PARTS` parts, once for each entry of `counts` (steps in a part).
-
-    **Returns** for the first count: the final state, the mean load speeds over the last part, the distance of the final
-    state from that with the last count, True if the motion stayed finite, True for loads that lost contact with their track,
-    and the number of steps.
-    """
+    """Integrate a run with equal steps in `ENSEMBLE_PARTS` parts, once for each entry of `counts` (steps in a part), and return
+    for the first: the final state, the mean load speeds over the last part, the distance of the final state from that with the
+    last count, True if the motion stayed finite, True for loads that lost contact with their track, and the number of steps."""
     scene, (state, end) = with_first_derivatives(scene, (state, end))
     has_one_sided_loads = any(exciter.loads is not None and exciter.loads.one_sided for exciter in scene.exciters)
     field, start = field_of(equations, scene), state
     if has_one_sided_loads:
-        missing_forces = [
-            jnp.zeros_like(exciter_state.angle[0]) if exciter_state.angle else jnp.zeros(1) for exciter_state in state.exciters
-        ]
-        field, start = _FieldWithDetachment(field, scene), _StateWithDetachment(state, _concatenate(missing_forces))
+        missing_forces = _concatenate(list(map(_no_force, state.exciters)))
+        field, start = _FieldWithDetachment(field, scene), _StateWithDetachment(state, missing_forces)
     motion = pack_batch(scene, field, start, implicit=implicit)
     length = end / ENSEMBLE_PARTS
 
@@ -408,10 +390,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
 
 class _StateWithDetachment(State):
     """State with the time integral `missing` (loads,), N s, of the force max(-N, 0) with which each track would have to pull
-    its load.
-
-    The integral is exactly 0 if the normal force N was never negative, for any weights of the stages of the method.
-    """
+    its load: exactly 0 if the normal force N was never negative, for any weights of the stages of the method."""
 
     missing: Array
 
@@ -431,13 +410,17 @@ class _FieldWithDetachment(eqx.Module):
         scene, change, missing_forces = self.scene, self.equations(t, plain), []
         for exciter, exciter_state in zip(scene.exciters, state.exciters, strict=True):
             if exciter.loads is None or not exciter.loads.one_sided:
-                missing_forces.append(jnp.zeros_like(exciter_state.angle[0]) if exciter_state.angle else jnp.zeros(1))
+                missing_forces.append(_no_force(exciter_state))
                 continue
             normal_force = exciter.loads.normal_force(exciter_state.angle, exciter_state.rate, total_gravity(scene.effects))
             assert normal_force is not None
             force = normal_force.at(scene.machine.mount(exciter.place).load_rates(change.velocity))
             missing_forces.append(jnp.maximum(-force, 0.0))
         return _StateWithDetachment(change, _concatenate(missing_forces))
+
+
+def _no_force(state: ExciterState) -> Array:
+    return jnp.zeros_like(state.angle[0]) if state.angle else jnp.zeros(1)
 
 
 def _concatenate(arrays: list[Array]) -> Array:

@@ -201,10 +201,8 @@ def growth(
 
 
 def _classify_growth(late: np.ndarray) -> str:
-    """Return the name of the `GrowthStatus` from the logarithms `late` (n,) of the growth in the segments of the later half.
-
-    This function does not test whether the motion is periodic: "chaotic" includes "unstable".
-    """
+    """Return the name of the `GrowthStatus` from the logarithms `late` (n,) of the growth in the segments of the later half;
+    "chaotic" includes "unstable" here."""
     total, error = float(np.sum(late)), _sum_error(late)
     first, last = np.split(late, [late.size // 2])
     increase = float(np.mean(last) - np.mean(first))
@@ -217,10 +215,7 @@ def _classify_growth(late: np.ndarray) -> str:
 
 
 def _uncertainty(late: np.ndarray, segment: float) -> float:
-    """Return the uncertainty of the mean of the rates `late` (n,), 1/s, in the segments of the later half.
-
-    `segment`: length of each segment, s.
-    """
+    """Return the uncertainty of the mean of the rates `late` (n,), 1/s, in `segment`s, s, of the later half."""
     first, last = np.split(late, [late.size // 2])
     change = abs(float(np.mean(last) - np.mean(first)))
     return max(_sum_error(late) / late.size, 0.5 * change, _UNSEPARATED_LOG_GROWTH / (late.size * segment))
@@ -231,9 +226,8 @@ def _sum_error(values: np.ndarray) -> float:
 
         s^2 = n c_0 + 2 (n - 1) c_1
 
-    with the autocovariances c_k; the result is at least the error of one value. The correlation matters: if the phase of the
-    motion differs between the ends of segments, the logarithms of the growth in neighbouring segments are large and have
-    opposite signs.
+    with the autocovariances c_k; the result is at least the error of one value. If the phase of the motion differs between the
+    ends of segments, the logarithms of the growth in neighbouring segments are large and have opposite signs.
     """
     deviation = values - np.mean(values)
     variance = float(np.sum(deviation**2)) / (values.size - 1)
@@ -242,15 +236,10 @@ def _sum_error(values: np.ndarray) -> float:
 
 def _has_returned(scene: Scene, state: State, steps: Tolerance) -> bool:
     """Return True if the motion from `state` returns to this state within a few turns of rotor and loads."""
-    speed, turning = float(scene.top_speed), []
-    for exciter_state in state.exciters:
-        turning += (
-            [*np.abs(np.ravel(exciter_state.rate[0]))]
-            if exciter_state.rate
-            else []
-            if exciter_state.rotor is None
-            else [abs(exciter_state.rotor[1])]
-        )
+    speed = float(scene.top_speed)
+    rates = [own.rate[0] for own in state.exciters if own.rate]
+    rates += [own.rotor[1] for own in state.exciters if own.rotor is not None and not own.rate]
+    turning = np.abs(np.concatenate([np.ravel(rate) for rate in rates] or [np.zeros(0)]))
     slowest = min([speed, *(float(w) for w in turning if w > 1e-2 * speed)])
     run = simulate(
         scene, _TURNS_TO_RETURN * 2.0 * math.pi / slowest, start=state, samples=_SAMPLES_OF_RETURN, stepsize_controller=steps,

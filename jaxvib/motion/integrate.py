@@ -104,10 +104,8 @@ def with_jump_times(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeCo
 
 
 def effects_rate(scene: Scene, *kinds: type[Term]) -> Array:
-    """Return the fastest rate that effects add to the motion of loads, see `Effect.fastest_rate`; 0 without such effects.
-
-    **Arguments**: `kinds` of terms: only effects with a term of one of these kinds count; default: all effects.
-    """
+    """Return the fastest rate that effects, with terms of certain `kinds` if given, add to the motion of loads, see
+    `Effect.fastest_rate`; 0 without such effects."""
     all_rates, zero = [], jnp.zeros_like(scene.exciters[0].drive.speed)
     for exciter in scene.exciters:
         if exciter.loads is not None:
@@ -118,10 +116,8 @@ def effects_rate(scene: Scene, *kinds: type[Term]) -> Array:
 
 
 def motor_poles(drive: Drive) -> Array:
-    """Return the poles of a motor whose rotor is free, complex, 1/s, at several speeds.
-
-    They are the eigenvalues of the equations of the speed and of the states of the motor, linearized about these speeds.
-    """
+    """Return the poles of a motor whose rotor is free, complex, 1/s, at several speeds: eigenvalues of the linearized equations
+    of the speed and of the states of the motor."""
     drive, zero = drive.at_working_speed(), jnp.zeros_like(drive.speed)
     states = tuple(zero for _ in drive.state_units())
 
@@ -165,16 +161,10 @@ def angle_wrapping(scene: Scene, dtype: np.dtype) -> tuple[bool, bool]:
 class IntegrationPlan(NamedTuple):
     """Choices for one time integration: method, steps, and stored states.
 
-    **Attributes**
-
-    - `solver` of diffrax, None for the method of order 8 in its fastest form
-    - `control` of the steps; `max_steps`
-    - `adjoint` of diffrax, None for that of `jaxvib.ode.replay`, which differentiates the steps that were taken
-    - `samples`: number of stored states of the whole run, 0 for none
-    - `periods`: length of the measuring window in periods of the slowest motion
-    - `bounds`, see `frequency_bounds`
-    - `progress_meter` of diffrax
-    - `window_samples`: number of samples in the measuring window
+    **Attributes**: `solver` of diffrax, None for the method of order 8 in its fastest form; `control` of the steps; `adjoint`
+    of diffrax, None for that of `jaxvib.ode.replay`; number of stored `samples` of the whole run, 0 for none; length of the
+    measuring window in `periods` of the slowest motion; `bounds`, see `frequency_bounds`; `max_steps`; `progress_meter` of
+    diffrax; `window_samples`: number of samples in the measuring window.
     """
 
     solver: diffrax.AbstractSolver | None
@@ -192,10 +182,8 @@ class IntegrationPlan(NamedTuple):
 def integrate(
     scene: Scene, end: Array, state: State, plan: IntegrationPlan, is_measured: Array | np.ndarray | None = None
 ) -> Run:
-    """Integrate the full equations of motion from 0 to `end` by a plan, and measure a window at the end.
-
-    **Arguments**: `is_measured`: False to skip the measurement; None to measure always, without a branch in the program.
-    """
+    """Integrate the full equations of motion from 0 to `end` by a plan, and measure a window at the end if `is_measured` is not
+    False; None: always, without a branch in the program."""
     scene, (end, state) = with_first_derivatives(scene, (end, state))
     # An initial state that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
     exists = is_finite(state)

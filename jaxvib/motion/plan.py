@@ -242,12 +242,8 @@ def plan_run(
 
 
 def _window_samples(scene: Scene, end: Array | np.ndarray, length: Array | np.ndarray) -> int:
-    """Return the number of samples in a measuring window of a `length`, s, that is at most half of the run until `end`, s.
-
-    It is a power of 2 that resolves the forces of stops.
-
-    **Raises** `InputError` if a stop needs more than the largest number.
-    """
+    """Return the number of samples, a power of 2 that resolves the forces of stops, in a measuring window of a `length`, s,
+    that is at most half of the run until `end`, s. **Raises** `InputError` if a stop needs too many."""
     if not any(term.stiffness is not None for term in terms_of(scene.effects, SupportForce)):
         return WINDOW_SAMPLES
     needed = max(float(sampling_rate(scene)) * min(float(length), float(end) / 2.0), WINDOW_SAMPLES)
@@ -281,13 +277,8 @@ def plan_segment(scene: Scene, length: float, state: State, steps: StepChoice, *
 
 
 def enough_steps(fastest: Array | np.ndarray, end: Array, chosen: StepChoice | None = None) -> int:
-    """Return a maximum number of steps, a power of 2.
-
-    It is at least 4096 plus 500 for each turn of the `fastest` motion, rad/s, and at least the number of `chosen` equal steps.
-
-    The number can be a static argument of a program; with powers of 2, few programs are compiled. **Raises** `InputError` for a
-    run that would need too many steps.
-    """
+    """Return a maximum number of steps: at least 4096 plus 500 for each turn of the `fastest` motion, rad/s, and at least the
+    number of `chosen` equal steps. With powers of 2, few programs are compiled. **Raises** `InputError` for too many steps."""
 
     def count_steps(fastest: float, end: float) -> int:
         turns = end * fastest / (2.0 * math.pi)
@@ -302,10 +293,8 @@ def enough_steps(fastest: Array | np.ndarray, end: Array, chosen: StepChoice | N
 
 
 def _enough_samples(speed: Array, end: Array) -> int:
-    """Return a number of samples that shows the vibration at a rotor `speed`, rad/s, in a figure without aliasing.
-
-    The number has one of two values, so that few programs are compiled.
-    """
+    """Return a number of samples that shows the vibration at a rotor `speed`, rad/s, in a figure without aliasing; one of two
+    values, so that few programs are compiled."""
 
     def samples_of(end: float, speed: float) -> int:
         return _FEW_SAMPLES if MIN_SAMPLES_PER_TURN * end * speed / (2.0 * math.pi) <= _FEW_SAMPLES else _MANY_SAMPLES
@@ -467,8 +456,7 @@ def _build_scenes(make: Callable[..., Scene | tuple[Scene, State]], values: PyTr
 
 
 def _start_speed(states: State) -> np.ndarray:
-    """Return the largest speed (runs,), rad/s, at which a load or the rotor of a motor starts; a user may choose one above
-    that of the drive."""
+    """Return the largest speed (runs,), rad/s, at which a load or the rotor of a motor starts."""
     speeds = [np.abs(exciter.rate[0]) for exciter in states.exciters if exciter.rate]
     speeds += [np.abs(exciter.rotor[1])[:, None] for exciter in states.exciters if exciter.rotor is not None]
     return np.max([np.max(np.where(np.isfinite(x), x, 0.0), axis=-1) for x in speeds] or [0.0], axis=0)

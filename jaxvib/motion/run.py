@@ -396,27 +396,17 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
 
 def _histories(trajectory: Trajectory) -> list[np.ndarray]:
-    """Return time, displacements, speeds of all loads and of all rotors, and forces."""
     loads = [np.asarray(exciter_state.rate[0]) for exciter_state in trajectory.state.exciters if exciter_state.rate]
     rotors = np.stack([np.asarray(speed) for speed in trajectory.rotor_speeds], axis=1)
     speeds = np.concatenate(loads, axis=1) if loads else np.zeros((rotors.shape[0], 0))
-    return [
-        np.asarray(trajectory.time),
-        np.asarray(trajectory.state.displacement),
-        speeds,
-        rotors,
-        np.asarray(trajectory.foundation_force),
-    ]
+    time, displacement, force = map(np.asarray, (trajectory.time, trajectory.state.displacement, trajectory.foundation_force))
+    return [time, displacement, speeds, rotors, force]
 
 
 def with_separation_status(run: Run, *, is_settled: bool = True) -> Run:
-    """Return the run with the status `overlapping` or `would_separate` if it applies, otherwise unchanged.
-
-    - `overlapping`: loads with a size are inside each other at the end of the run
-    - `would_separate`: loads stay at nearly one angle although this motion is unstable
-
-    For a settled run the measuring window is examined; for another run only its last state, and only for overlapping loads.
-    """
+    """Return the run with the status `overlapping` (loads with a size are inside each other at its end) or `would_separate`
+    (loads stay at nearly one angle although this motion is unstable; only for a settled run) if it applies, otherwise
+    unchanged."""
     if status_name(run.status) not in ENDS:
         return run
     if overlap(run.scene, run.window if is_settled else jax.tree.map(lambda leaf: np.asarray(leaf)[-1:], run.window)):

@@ -198,10 +198,8 @@ def _plan_settle(
 
 
 def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
-    """Return the run of the last segment, and False if an error must be raised.
-
-    No error is raised if the motion has settled or has the status `would_separate` or `overlapping`.
-    """
+    """Return the run of the last segment, and False if an error must be raised: if the motion has not settled and has neither
+    the status `would_separate` nor `overlapping`."""
     length, state = float(plan.first.end), plan.first.state
     coincident, drifts, measured, regimes = True, [], [], []
     while True:
@@ -241,10 +239,8 @@ def _with_final_status(run: Run, name: str) -> Run:
 
 @cached
 def _matrices(scene: Scene, window: Trajectory | None) -> tuple[Array, Array, Array]:
-    """Return the matrices (nd, nd) of mass, damping with gyroscopic terms, and stiffness.
-
-    With a `window`, the damping contains the slopes of the resistances of supports, averaged over the motion in the window.
-    """
+    """Return the matrices (nd, nd) of mass, damping with gyroscopic terms and, with a `window`, the mean slopes of the
+    resistances of supports in it, and stiffness."""
     model = linear_model(scene)
     damping = model.damping(mean_speed(scene))
     for term, rows in zip(terms_of(scene.all_effects, SupportForce), assemble(scene).supports, strict=True):
@@ -256,10 +252,8 @@ def _matrices(scene: Scene, window: Trajectory | None) -> tuple[Array, Array, Ar
 
 
 def _slowest_decay(scene: Scene, window: Trajectory | None = None) -> float:
-    """Return the smallest decay rate of free vibrations of the carrier with its loads, 1/s; 0 if a vibration does not decay.
-
-    Friction at supports is included for the motion in a `window`: a small vibration beside this motion decays.
-    """
+    """Return the smallest decay rate of free vibrations of the carrier with its loads, 1/s, 0 if a vibration does not decay;
+    for a small vibration beside the motion in a `window` with friction at supports."""
     poles = poles_of(*(np.asarray(matrix, float) for matrix in _matrices(scene, window)))
     slowest = float(np.min(-poles.real))
     return slowest if slowest > 1e-12 * float(np.max(np.abs(poles))) else 0.0
@@ -284,11 +278,8 @@ def _distance(drifts: Sequence[float], run: Run, decay: float, segment: float) -
 
 
 def _steady_in_the_mean(measured: np.ndarray) -> bool:
-    """Return True if measured values scatter about constant means.
-
-    **Arguments**: `measured` (4 n, 3 + nd): for each segment the drift, the load speed, the force and the amplitudes as lengths
-    (`Carrier.as_lengths`). Changes below half the drift are ignored.
-    """
+    """Return True if measured values scatter about constant means, except for changes below half the drift; `measured` (4 n, 3
+    + nd): for each segment the drift, the load speed, the force and the amplitudes as lengths (`Carrier.as_lengths`)."""
     drift, values = measured[:, 0], measured[:, 1:]
     place = np.arange(len(measured)) - (len(measured) - 1) / 2.0
     fall = place @ np.log(drift) / (place @ place)

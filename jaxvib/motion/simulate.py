@@ -167,11 +167,7 @@ def _run(plan: RunPlan, control: Control, *, is_measured: bool = True) -> Run:
     """Return a run with the steps of `control`, in the segments of the plan; `is_measured`: True to measure its window."""
     if plan.segments > 1:
         return _run_in_segments(plan, control, is_measured=is_measured)
-    return _run_segment(plan, plan.end, plan.state, control, is_measured=is_measured)
-
-
-def _run_segment(plan: RunPlan, end: Array, state: State, control: Control, *, is_measured: bool) -> Run:
-    return integrate(*_integration(plan, end, state, control, is_measured=is_measured))
+    return integrate(*_integration(plan, plan.end, plan.state, control, is_measured=is_measured))
 
 
 def prepare_run(plan: RunPlan) -> None:
@@ -206,6 +202,10 @@ def _run_in_segments(plan: RunPlan, control: Control, *, is_measured: bool) -> R
     The time of each segment begins at 0. All segments except the last have a whole number of turns of the rotor, and the
     angles at the beginning of a segment are within one turn.
     """
+
+    def added(counts: list[Array]) -> Array:
+        return on_device(np.sum([np.asarray(step_count) for step_count in counts], dtype=counts[0].dtype))
+
     number, end = plan.segments, float(plan.end)
     if isinstance(control, StepControl) and control.steps is not None:
         control = StepControl(steps=np.asarray(np.ceil(control.steps / number), control.steps.dtype))
@@ -213,7 +213,7 @@ def _run_in_segments(plan: RunPlan, control: Control, *, is_measured: bool) -> R
     for k in range(number):
         is_last = k == number - 1
         span = jnp.asarray(end - (number - 1) * length if is_last else length, plan.end.dtype)
-        run = _run_segment(plan, span, state, control, is_measured=is_measured and is_last)
+        run = integrate(*_integration(plan, span, state, control, is_measured=is_measured and is_last))
         runs.append(run)
         if status_name(run.status) != "done":
             break
@@ -221,14 +221,10 @@ def _run_in_segments(plan: RunPlan, control: Control, *, is_measured: bool) -> R
     last = runs[-1]
     return dataclasses.replace(
         last,
-        **{name: _sum([getattr(run, name) for run in runs]) for name in ("steps", "rejected", "evaluations")},
+        **{name: added([getattr(run, name) for run in runs]) for name in ("steps", "rejected", "evaluations")},
         window=dataclasses.replace(last.window, time=last.window.time + length * (number - 1)),
         coincident=on_device(np.all([numpy_if_known(run.coincident) for run in runs])),
     )
-
-
-def _sum(counts: list[Array]) -> Array:
-    return on_device(np.sum([np.asarray(step_count) for step_count in counts], dtype=counts[0].dtype))
 
 
 _COARSE_TOLERANCE_RATIO = 100.0
@@ -245,10 +241,8 @@ def _coarser(control: StepControl) -> StepControl:
 
 
 def _run_with_estimate(plan: RunPlan) -> Run:
-    """Return a run with its error, estimated by a second run with larger steps.
-
-    Both runs are computed in parallel, but not with a progress meter or under a JAX transformation.
-    """
+    """Return a run with its error, estimated by a second run with larger steps, computed in parallel, but not with a progress
+    meter or under a JAX transformation."""
     control = plan.integration.control
     assert isinstance(control, StepControl)
     coarser = _coarser(control)
@@ -265,10 +259,8 @@ _MAX_ACCURACY_RUNS = 6
 
 
 def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
-    """Repeat a run with smaller and smaller tolerances, and return the first one whose estimated error is at most `accuracy`.
-
-    The status is `not_accurate` if no tolerance is small enough.
-    """
+    """Repeat a run with smaller and smaller tolerances, and return the first one whose estimated error is at most `accuracy`,
+    or the last one with the status `not_accurate`."""
     control, dtype = plan.integration.control, plan.scene.top_speed.dtype
     assert isinstance(control, StepControl)
     floor, coarser = 10.0 * float(jnp.finfo(dtype).eps), _coarser(control)
@@ -293,10 +285,7 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
 def _compare_runs(
     plan: RunPlan, fine: Run, coarse: Run, control: StepControl, coarser: StepControl, earlier_evaluations: Array | np.ndarray
 ) -> Run:
-    """Return the run `fine` with its estimated error, and with the number of evaluations of all runs.
-
-    **Arguments**: `earlier_evaluations`: number of evaluations of the earlier runs.
-    """
+    """Return the run `fine` with its estimated error, and with the number of evaluations of all runs."""
     coarse_states, evaluation_counts = (coarse.window.state, coarse.status), (fine.evaluations, earlier_evaluations)
     solver, (fastest, _) = plan.integration.solver, plan.integration.bounds
     order = 8 if solver is None else solver.order(None) or 1
@@ -332,11 +321,8 @@ def _estimate_error(
     evaluations: tuple[Array, Array | np.ndarray],
     order: int,
 ) -> tuple[Array, Array]:
-    """Return the estimated error of a run, and the sum of the `evaluations`.
-
-    **Arguments**: `window` of the run; `coarse_states` of the window and `status` of a run with larger steps; `fastest`: see
-    `frequency_bounds`; `order` of the method.
-    """
+    """Return the estimated error of a run with a method of this `order` from its `window`, and from the `coarse_states` of the
+    window and the `status` of a run with larger steps, and the sum of the `evaluations`; `fastest`: see `frequency_bounds`."""
     # The error is unknown if the second run failed, or if it has the same steps.
     is_known = status == RunStatus.done
     if control.steps is not None:

@@ -130,10 +130,8 @@ def initial_state(
 
 
 def must_compile_jams(scene: Scene, mode: int | None) -> bool:
-    """Return True if a run that starts in a jam `mode` must first compile the jam modes of its scene.
-
-    **Raises** `InputError` if the number of the mode is wrong.
-    """
+    """Return True if a run that starts in a jam `mode` must first compile the jam modes of its scene. **Raises** `InputError`
+    for a wrong number."""
     if mode is None or not scene.is_plain:
         return False
     require_mode_of(scene, mode)
@@ -141,10 +139,8 @@ def must_compile_jams(scene: Scene, mode: int | None) -> bool:
 
 
 def _places(exciter: Exciter, loads: Loads, start: Start, separation: Number | None, *, one_each: bool) -> Array | np.ndarray:
-    """Return the angles (count,), rad, of the loads relative to their middle.
-
-    **Arguments**: `one_each`: True if the user has given an angle for each load.
-    """
+    """Return the angles (count,), rad, of the loads relative to their middle; `one_each`: True if each load has a given
+    angle."""
     n = loads.count
     has_contact = has_term(exciter.effects, LoadInteraction)
     has_size = getattr(loads, "ball_radius", None) is not None
@@ -275,14 +271,11 @@ def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: 
 
 
 def _validate_state(scene: Scene, state: State, mode: int | None, separation: Number | None) -> State:
-    """Return the initial state of the user, converted to the precision of JAX and completed by `with_spin`.
-
-    **Raises** `InputError` if its shapes do not fit the scene, or if a `mode` or `separation` is given together with it.
-    """
+    """Return the initial state of the user, converted to the precision of JAX and completed by `with_spin`. **Raises**
+    `InputError` if its shapes do not fit the scene, or if a `mode` or `separation` is given together with it."""
     if separation is not None:
-        raise InputError(
-            "separation", f"is {quoted(separation)}; it is used only with named starts: put the angles into the State"
-        )
+        problem = "it is used only with named starts: put the angles into the State"
+        raise InputError("separation", f"is {quoted(separation)}; {problem}")
     if mode is not None:
         raise InputError("mode", f"is {quoted(mode)}; it is used only with start='jam': leave it out if start is a State")
     require_state(scene, state, "start")

@@ -15,6 +15,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.state import State
+from jaxvib.equations.torque_balance import mass_owners
 from jaxvib.machine.drives.controlled import SwitchedOff
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.scene_field import mass_names
@@ -44,10 +45,8 @@ _WORKING_SHARE = 0.95
 
 
 def catching_resonance(speed: ArrayLike, working_speed: ArrayLike, resonances: Array | np.ndarray) -> Array:
-    """Return the number, from 1, of the lowest of the `resonances` (nd,), ascending, that a mass at `speed` has not passed.
-
-    Only resonances below 0.95 of the `working_speed` of the drive count; the number is 0 if all of them are passed.
-    """
+    """Return the number, from 1, of the lowest of the `resonances` (nd,), ascending, below 0.95 of the `working_speed` of the
+    drive that a mass at `speed` has not passed; 0 if all of them are passed."""
     missed = (resonances < _WORKING_SHARE * jnp.asarray(working_speed)) & ~(jnp.asarray(speed) > _BELOW_RESONANCE * resonances)
     return jnp.where(jnp.any(missed), jnp.argmax(missed) + 1, 0)
 
@@ -73,12 +72,9 @@ class RotatingMasses(Readable):
 
 @cached
 def rotating_masses(scenes: Scene, states: State, mean_speed: Array, end: Array, length: Array) -> RotatingMasses:
-    """Return the motions of the masses of runs.
-
-    **Arguments**: `scenes` and final `states` with a leading axis over the runs; `mean_speed` (runs, mass), rad/s, over the
-    last part of the runs, its `length`, s, and the `end`, s, of the runs.
-    """
-    directions, owners = jnp.asarray(turning_directions(scenes)), _owners(scenes)
+    """Return the motions of the masses of runs from `scenes` and final `states` with a leading axis over the runs, and
+    `mean_speed` (runs, mass), rad/s, over the last part of the runs, with its `length` and `end`, s."""
+    directions, owners = jnp.asarray(turning_directions(scenes)), mass_owners(scenes).tolist()
 
     def of_run(scene: Scene, state: State, speed: Array) -> RotatingMasses:
         angles, _ = turning_angles(scene, lambda: end[None], jax.tree.map(lambda leaf: leaf[None], state))
@@ -95,12 +91,6 @@ def rotating_masses(scenes: Scene, states: State, mean_speed: Array, end: Array,
         return RotatingMasses(turned * length, phase, jnp.stack(numbers), mass_names(scene), tuple(equal))
 
     return jax.vmap(of_run)(scenes, states, mean_speed)
-
-
-def _owners(scene: Scene) -> list[int]:
-    """Return the number of the exciter of each rotating mass."""
-    counts = [1 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters]
-    return [k for k, count in enumerate(counts) for _ in range(count)]
 
 
 def _has_no_resonance(exciter: Exciter) -> bool:
@@ -219,10 +209,8 @@ def _masses_text(names: Sequence[str]) -> str:
 
 
 def regimes_of_runs(masses: RotatingMasses, load_speed: np.ndarray, finite: np.ndarray) -> EnsembleRegimes:
-    """Return the regimes of runs.
-
-    **Arguments**: `masses` and `load_speed` (runs, mass), rad/s, of all runs; `finite` (runs,): False for runs that failed.
-    """
+    """Return the regimes of runs from their `masses`, `load_speed` (runs, mass), rad/s, and `finite` (runs,), False for runs
+    that failed."""
     used, runs = np.flatnonzero(finite), np.size(finite)
     values = [np.asarray(each)[used] for each in (masses.rotation, masses.phase, masses.resonance, load_speed)]
     order = _order_of_equal(values[0], values[1], masses.equal)
@@ -287,11 +275,8 @@ def _groups(rotation: np.ndarray) -> np.ndarray:
 
 
 def _order_of_equal(rotation: np.ndarray, phase: np.ndarray, equal: Sequence[int]) -> np.ndarray:
-    """Return the order (runs, mass) of the masses in which those that may be exchanged are sorted.
-
-    The fastest ones are first; masses of one speed are in the order of their phases. This order begins with the phase that
-    follows the largest gap between two phases.
-    """
+    """Return the order (runs, mass) of the masses in which those that may be exchanged are sorted, the fastest first; masses of
+    one speed by phases, from the phase that follows the largest gap between two phases."""
     order = np.tile(np.arange(len(equal)), (phase.shape[0], 1))
     for number in set(equal):
         own = np.flatnonzero(np.asarray(equal) == number)

@@ -72,8 +72,7 @@ class Trajectory(Readable):
 
 
 def only_exciter_value(values: tuple[Array, ...], name: str) -> Array:
-    """Return the value of the only exciter. **Raises** `InputError` for several exciters; the message states how to read the
-    values of each."""
+    """Return the value of the only exciter. **Raises** `InputError` for several exciters."""
     if len(values) != 1:
         raise InputError(name, f"are those of {len(values)} exciters; read {name}[0] and so on")
     return values[0]
@@ -131,11 +130,8 @@ class AbstractMeasured(Readable):
         return f"amplitude, zero to peak: {amplitude}; foundation force {force}{kind}"
 
     def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array]) -> str:
-        """Return a line of text with the speeds of the turning masses, and the last rotor speed of each exciter with loads.
-
-        The mean speed is left out if the speeds differ much, for example because a motor stands still. The turning mass of an
-        exciter without loads is its rotor. `rotor_speeds`: an array (nt,), rad/s, for each exciter.
-        """
+        """Return a line of text with the speeds of the turning masses, and the last of the `rotor_speeds` (nt,), rad/s, of each
+        exciter with loads. The mean speed is left out if the speeds differ much, for example because a motor stands still."""
         exciters = zip(scene.exciters, rotor_speeds, strict=True)
         rotors = [speeds[-1] for exciter, speeds in exciters if exciter.loads is not None]
         rotor = f", {'rotor' if len(rotors) == 1 else 'rotors'} at {speed_text(rotors, 6)}" if rotors else ""
@@ -176,22 +172,16 @@ def trajectory(model: Model, times: Array, states: State) -> Trajectory:
 
 
 def turning_angles(scene: Scene, times: Callable[[], Array], states: State) -> tuple[Array, Array]:
-    """Return angles (nt, n), rad, and rates, rad/s, of the turning masses of all exciters, in the order of the exciters.
-
-    The masses of an exciter are its loads or, if it has no loads, its rotor.
-
-    **Arguments**: `times`: function that returns the times (nt,), s, of the states; it is called for rotors only.
-    """
+    """Return angles (nt, n), rad, and rates, rad/s, of the turning masses of all exciters, in the order of the exciters: their
+    loads or, without loads, their rotor. `times` returns the times (nt,), s, of the states; it is called for rotors only."""
     columns: list[tuple[Array, Array]] = []
     for exciter, exciter_state in zip(scene.exciters, states.exciters, strict=True):
         if exciter_state.angle:
             columns.append((exciter_state.angle[0], exciter_state.rate[0]))
         else:
             drive, moments = exciter.turning_drive, times()
-            angle, rate = (
-                jax.vmap(drive.rotor_angle)(moments, exciter_state.rotor),
-                jax.vmap(drive.rotor_speed)(moments, exciter_state.rotor),
-            )
+            angle = jax.vmap(drive.rotor_angle)(moments, exciter_state.rotor)
+            rate = jax.vmap(drive.rotor_speed)(moments, exciter_state.rotor)
             columns.append((angle[:, None], rate[:, None]))
     if len(columns) == 1:
         return columns[0]
@@ -207,11 +197,9 @@ def turning_directions(scene: Scene) -> np.ndarray:
 def measure(model: Model, field: Field, times: Array, states: State, unit: State, extrema: Extrema | None = None) -> Measured:
     """Measure the amplitudes and the load speed of an evenly sampled part of a motion, see `Measured`.
 
-    Extrema and whole turns are computed from interpolants that use the rates of the equations of motion, not from the samples.
-
     **Arguments**: `field` returns the rates of a state at a time; it must be a pytree of its arrays, such as `Dynamics` or a
-    `jax.tree_util.Partial`, not a plain function; `unit`: the `natural_units` of the scene; `extrema` between each sample and
-    the next, if they are known; default: those of the interpolants.
+    `jax.tree_util.Partial`; `unit`: the `natural_units` of the scene; `extrema` between each sample and the next; default:
+    those of interpolants that use the rates.
     """
     nd, half = states.displacement.shape[1], times.shape[0] // 2
     if extrema is None:
@@ -246,11 +234,7 @@ def unmeasured(model: Model, states: State) -> Measured:
 @eqx.filter_custom_jvp
 def _spans(model: Model, field: Field, times: Array, states: State) -> Array:
     """Return half of the peak-to-peak values of displacements and foundation forces, (3, outputs): over the first half of the
-    samples, over the second half, and over all of them.
-
-    Derivatives of any order cost little: the equations are evaluated again at the few samples next to the extrema, and only
-    these evaluations are differentiated.
-    """
+    samples, over the second half, and over all of them. Only evaluations at the samples next to extrema are differentiated."""
     (low, high), _, _ = _extrema(model, field, times, states)
     return (high - low) / 2.0
 
@@ -293,13 +277,11 @@ def _spans_of_kinked_force(model: Model, field: Field, times: Array, states: Sta
 
 
 def _kinked_extrema(outputs: Callable[[Array, Array], Array], field: Field, times: Array, states: State) -> Array:
-    """Return extrema (2, 3, n) of outputs that are not smooth functions of displacement and velocity, ordered as those of
-    `locate_extrema`.
+    """Return extrema (2, 3, n) of `outputs` (n,), a function of displacement and velocity that is not smooth, ordered as those
+    of `locate_extrema`, for arguments as in `measure`.
 
     Between two samples, the outputs are computed from interpolated displacements and velocities. The search for the extrema is
     not differentiated; their values are.
-
-    **Arguments**: `outputs` (n,): function of displacement and velocity; the others as in `measure`.
     """
     step, count, m = _step(times), times.shape[0], _POINTS_IN_STEP
 
@@ -360,22 +342,15 @@ def _kinked_extrema(outputs: Callable[[Array, Array], Array], field: Field, time
 
 
 class Peaks(NamedTuple):
-    """Largest values of a motion.
-
-    **Attributes**: `displacement` (nd,), m or rad: largest displacement of each coordinate from static equilibrium; `force`, N:
-    largest magnitude of the foundation force.
-    """
+    """Largest `displacement` (nd,), m or rad, of each coordinate from static equilibrium, and magnitude of the foundation
+    `force`, N, in a motion."""
 
     displacement: Array
     force: Array
 
 
 def locate_peaks(model: Model, field: Field, times: Array, states: State) -> Peaks:
-    """Return the largest values of an evenly sampled part of a motion, for arguments as in `measure`.
-
-    Values between the samples are those of the polynomials of `locate_extrema` or, for a force with kinks, those of
-    `_kinked_extrema`. The magnitude of the force is largest where the square of the force is largest.
-    """
+    """Return the largest values of an evenly sampled part of a motion, for arguments as in `measure`."""
     nd = states.displacement.shape[1]
     if model.has_kinked_force:
 
@@ -395,11 +370,8 @@ def locate_peaks(model: Model, field: Field, times: Array, states: State) -> Pea
 
 
 class Extrema(NamedTuple):
-    """Extrema of a motion whose forces have kinks and jumps, from all steps of a run; or of several parts of it.
-
-    **Attributes**: `low`, `high` (..., outputs): extrema of the displacements and foundation forces; `square` (...), N^2:
-    largest square of the magnitude of the foundation force.
-    """
+    """Extrema `low`, `high` (..., outputs) of displacements and foundation forces with kinks and jumps, from all steps of a run
+    or of several parts of it, and the largest `square` (...), N^2, of the magnitude of the foundation force."""
 
     low: Array
     high: Array
@@ -416,7 +388,6 @@ class Extrema(NamedTuple):
         return Extrema(jnp.min(low, axis=0), jnp.max(high, axis=0), jnp.max(square, axis=0))
 
     def peaks(self, model: Model) -> Peaks:
-        """Return the largest values."""
         nd = model.carrier.mass.shape[0]
         return Peaks(jnp.maximum(-self.low, self.high)[..., :nd], model.known_force(jnp.sqrt(self.square)))
 
@@ -458,13 +429,11 @@ def _outputs(model: Model, step: Array, state: State, rates: State) -> tuple[Arr
 
 
 def mean_speeds(times: Array, angle: Array, rate: Array, first: Sequence[int], last: Sequence[int] | None = None) -> Array:
-    """Return mean speeds over parts of the samples.
-
-    The mean of a part is taken over the whole turns that end at its last sample, or over the whole part if it is shorter than a
-    turn.
+    """Return mean speeds (parts, m), rad/s, over the whole turns that end at the last sample of each part, or over the whole
+    part if it is shorter than a turn.
 
     **Arguments**: `times` (n,) s; `angle` (n, m) rad and its `rate`, rad/s; the `first` and the `last` sample of each part
-    (default: the last sample of all). **Returns** (parts, m) rad/s.
+    (default: the last sample of all).
     """
     ends = [len(times) - 1] * len(first) if last is None else last
     speeds_of_part = jax.vmap(_mean_speed, in_axes=(None, 1, 1, None, None))

@@ -96,10 +96,10 @@ def fit_harmonic(time: Array, displacement: Array, speed: Array) -> tuple[Array,
 @cached
 def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -> Vibration:
     """Return the harmonic at the mean load speed, fitted to the displacements of a window, with the measured amplitudes
-    and the mean torques and powers of the drives.
+    and the mean torques and powers of the drives (NaN for loads that spin or slide).
 
-    The exciter force is NaN for a rotor with an imbalance, or with loads and an unbalance, because the rotor can turn faster
-    than the loads. Torques and powers are NaN for loads that spin or slide.
+    The exciter force is NaN for a rotor with an imbalance, or with loads and an unbalance, which can turn faster than the
+    loads.
     """
     time, states, model = window.time, window.state, assemble(scene)
     harmonic, _ = fit_harmonic(time, states.displacement, measured.omega)
@@ -132,13 +132,9 @@ def require_turns(time: np.ndarray, speed: float) -> None:
 
 
 def vibration_share(machine: Machine, time: Array, measured: AbstractMeasured, harmonic: Array) -> Array:
-    """Return the share of the amplitude of a motion that is a vibration at the speed of the exciters; 0 for too few turns.
-
-    Measures describe a vibration at this speed. The share is small if the exciters stand almost still, if their speed changes
-    fast, and if the motion is a free vibration.
-
-    **Arguments**: `time` (nt,) of the window, its `measured` quantities, and the `harmonic` (nd,) of this speed.
-    """
+    """Return the share of the amplitude of a motion that is a vibration at the speed of the exciters, from its `harmonic`
+    (nd,); 0 for too few turns. It is small for a free vibration, and if the exciters stand almost still or change their speed
+    fast."""
     share = _harmonic_share(machine, harmonic, measured.amplitude)
     return jnp.where(_turns(time, measured.omega) >= _MIN_TURNS, share, 0.0)
 

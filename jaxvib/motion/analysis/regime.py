@@ -152,13 +152,9 @@ class Regime(Result):
         share = float(self.unbalance)
         if share < 1.005:
             return f"{100.0 * share:.3g} % of the loads' unbalance is left"
-        remaining_text = f"{share:.2g} times the loads' unbalance is left"
         # Loads at one angle add at most their own unbalance to that of the rotor.
-        return (
-            f"{remaining_text}: the imbalance of the rotor exceeds what the loads can balance"
-            if share > 2.005
-            else remaining_text
-        )
+        cause = ": the imbalance of the rotor exceeds what the loads can balance" if share > 2.005 else ""
+        return f"{share:.2g} times the loads' unbalance is left{cause}"
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
@@ -275,10 +271,8 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
 
 
 def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
-    """Return the estimated jam mode of loads with the mean speed `mean`, rad/s, see `mode` of `Regime`.
-
-    **Arguments**: `natural`: natural frequencies, rad/s, ascending, infinite for missing ones; `rotor`: rotor speed, rad/s.
-    """
+    """Return the estimated jam mode of loads with the mean speed `mean`, rad/s, see `mode` of `Regime`; `natural`: natural
+    frequencies, rad/s, ascending, infinite for missing ones."""
     ends = jnp.concatenate([jnp.zeros_like(natural[:1]), natural, jnp.full_like(natural[:1], jnp.inf)])
     below = jnp.sum(natural <= mean)
     rises = jnp.minimum(ends[below + 1], rotor) - mean < mean - ends[below]
@@ -287,11 +281,8 @@ def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
 
 
 def _is_rotor_caught(scene: Scene, natural: Array, rotor: Array) -> Array:
-    """Return True if the rotor of a motor is caught at a resonance.
-
-    The rotor speed is then at most 15 % below or 2 % above the resonance, and more than 5 % below the no-load speed of
-    the motor.
-    """
+    """Return True if the rotor of a motor is caught at a resonance: its speed is at most 15 % below or 2 % above the resonance,
+    and more than 5 % below the no-load speed of the motor."""
     if scene.drive.ideal:
         return jnp.zeros((), bool)
     return jnp.any((rotor > 0.85 * natural) & (rotor < 1.02 * natural)) & (rotor < 0.95 * scene.drive.speed)
@@ -313,11 +304,9 @@ def _unbalances(scene: Scene, turn: Array) -> tuple[Array, Array]:
 
 
 def _unbalance(scene: Scene, unbalances: Array, rotor_unbalance: Array, turn: Array) -> Array:
-    """Return the residual unbalance of the loads (count,) and the rotor, complex, relative to all loads at one angle.
-
-    For a rotor that tilts, the moment about the point of the loads is included, relative to the levers of the loads, or to the
-    radius of gyration of the rotor if the levers are 0.
-    """
+    """Return the residual unbalance of the loads (count,) and the rotor, complex, relative to all loads at one angle, or, if
+    larger, the moment of a rotor that tilts about the point of the loads, relative to their levers, or to the radius of
+    gyration of the rotor if the levers are 0."""
     mount, origin = scene.mount(), jnp.zeros_like(turn[0])
     imbalances = [term.at(origin) for term in terms_of(scene.all_effects, RotorImbalance)]
     size = jnp.sum(jnp.abs(unbalances))
@@ -338,11 +327,8 @@ def _unbalance(scene: Scene, unbalances: Array, rotor_unbalance: Array, turn: Ar
 
 
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
-    """Return the natural frequencies that turning loads excite, rad/s, ascending.
-
-    For a gyroscopic rotor these are the frequencies of the whirls at the rotor speed that are not backward circles. Missing
-    frequencies are infinite.
-    """
+    """Return the natural frequencies that turning loads excite, rad/s, ascending; for a gyroscopic rotor those of the whirls at
+    the rotor speed that are not backward circles. Missing frequencies are infinite."""
     if scene.mounting.gyroscopic is None:
         return estimated_frequencies(scene)
     whirls = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])

@@ -56,15 +56,10 @@ def _exciter_units(exciter: Exciter) -> tuple[list[Array], ExciterState]:
 
 
 def error_scale(state: State, unit: State) -> State:
-    """Return the scales by which differences between states are divided, one for each part of the state.
+    """Return the scales by which differences between states are divided, a scalar for each part of the `State`.
 
-    The scale of displacements and of velocities is their largest modulus, but at least the natural unit, because these values
-    of a machine at rest are 0. The scale of angles and of their rates is the natural unit: 1 rad, and the rotor speed.
-
-    **Arguments**: `state`: a `State`, or several states whose arrays have a leading axis; `unit`: its `natural_units`.
-
-    **Returns** `State` with a scalar in each place. If the values are known, the scalars are computed by NumPy, without
-    compilation.
+    The scale of displacements and of velocities is their largest modulus in one or several states, but at least the natural
+    `unit`, because these values of a machine at rest are 0. That of angles and rates is the natural unit.
     """
     xp = array_module((state, unit))
 
@@ -76,13 +71,8 @@ def error_scale(state: State, unit: State) -> State:
         if unit.spin is not None and exciter_state.spin is not None:
             drilling, slip = unit.spin.drilling, unit.spin.slip
             slip = None if slip is None else tuple(xp.asarray(slip[0]) for _ in exciter_state.angle)
-            # A spin can grow without bound.
-            spin = Spin(
-                None
-                if drilling is None or exciter_state.spin.drilling is None
-                else largest(exciter_state.spin.drilling, drilling),
-                slip,
-            )
+            own = exciter_state.spin.drilling  # it can grow without bound
+            spin = Spin(None if drilling is None or own is None else largest(own, drilling), slip)
         return ExciterState(
             tuple(xp.asarray(unit.angle[0]) for _ in exciter_state.angle),
             tuple(xp.asarray(unit.rate[0]) for _ in exciter_state.rate),
@@ -98,12 +88,8 @@ def error_scale(state: State, unit: State) -> State:
 
 
 def scaled_error(a: State, b: State, scale: State) -> Array:
-    """Return the largest difference between the entries of two states, each relative to the `scale` of its part.
-
-    **Arguments**: `a`, `b`: two states, or two sequences of states whose arrays have a leading axis; `scale`: see
-    `error_scale`.
-
-    **Returns** a scalar, computed by NumPy if the states are known; NaN if one of them is not finite.
+    """Return the largest difference between the entries of two states, or two sequences of states, relative to the
+    `error_scale` of its part; NaN if one of them is not finite.
 
     >>> import numpy as np, jaxvib as jv
     >>> a, b = (jv.State(np.array([x]), np.zeros(1), (np.array([3.0]),), (np.array([50.0]),)) for x in (2e-3, 1e-3))
@@ -133,16 +119,11 @@ def estimated_error(
 
         difference * share + 2 eps (steps + radians)
 
-    If an effect or a drive is not smooth, or if the acceleration of a drive jumps within a step, the share is 2: the error then
-    depends on the positions of the steps relative to the kinks and jumps, and both runs may have the same error. Rounding adds
-    2 eps for each step and for each radian of the fastest motion, whose phase depends on rounded times. `ensemble` omits this
-    term, because equal steps cause much smaller rounding errors.
-
-    **Arguments**: `difference`: see `scaled_error`; `share`: error of a smooth motion, relative to the difference; `steps`:
-    number of steps of the run; `radians`: phase of the fastest motion over the run, rad; `ends_at_jumps`: True if steps end at
-    the jumps of the drives, False for equal steps.
-
-    **Returns** a scalar, or an array with one value for each run.
+    If an effect or a drive is not smooth, or if the acceleration of a drive jumps within a step (not if the step
+    `ends_at_jumps`), the share is 2 instead of that of a smooth motion: the error then depends on the positions of the steps
+    relative to the kinks and jumps, and both runs may have the same error. Rounding adds 2 eps for each step and for each
+    radian of the fastest motion, whose phase depends on rounded times. `ensemble` omits this term, because equal steps cause
+    much smaller rounding errors.
     """
     is_smooth = not scene.not_smooth and (ends_at_jumps or not any(exciter.drive.jump_ts() for exciter in scene.exciters))
     factor = share if is_smooth else 2.0

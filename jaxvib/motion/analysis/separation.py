@@ -61,12 +61,9 @@ def _wrap_angle(angle: np.ndarray) -> np.ndarray:
 
 
 def nearly_coincident_pairs(scene: Scene, k: int, angle: np.ndarray) -> list[tuple[int, int]]:
-    """Return the numbers of two loads of each group of nearly coincident loads of exciter `k`.
+    """Return the numbers of two loads of each group of nearly coincident loads of exciter `k`, from their angles (nt, count).
 
-    The loads of a group stay at nearly one angle on one track.
     All loads of a track form a group if they stay within `NEARLY_ONE_ANGLE`; otherwise neighbours within `CLUSTER_ANGLE` do.
-
-    **Arguments**: `angle` (nt, count) of the loads, rad.
     """
     pairs = []
     for track in tracks(scene, k):
@@ -96,10 +93,7 @@ def would_separate(scene: Scene, segment: Trajectory) -> bool:
 
 
 def smallest_distance(scene: Scene, segment: Trajectory) -> float:
-    """Return the smallest distance of the centres of two loads on one track, in diameters; infinite for loads without a size.
-
-    Only neighbours by angle are compared, because the nearest loads are neighbours.
-    """
+    """Return the smallest distance of the centres of two loads on one track, in diameters; infinite without a size."""
     distances = [math.inf]
     for k, (exciter, state) in enumerate(zip(scene.exciters, segment.state.exciters, strict=True)):
         ball_radius = getattr(exciter.loads, "ball_radius", None)
@@ -123,11 +117,8 @@ def overlap(scene: Scene, segment: Trajectory) -> bool:
 
 
 def separation_rate(scene: Scene, segment: Trajectory, k: int = 0, pair: tuple[int, int] = (0, 1)) -> float:
-    """Return the growth rate, 1/s, of small differences between angles of loads at nearly one angle; negative for decay.
-
-    **Arguments**: `segment`: an evenly sampled part of a run of `scene`, such as `run.window`; `k`: the number of the exciter
-    with the loads, from 0; `pair`: numbers of two of these loads on one track.
-    """
+    """Return the growth rate, 1/s, of small differences between the angles of a `pair` of loads of exciter `k` at nearly one
+    angle in an evenly sampled `segment` of a run; negative for decay."""
     phi = np.mean(np.asarray(segment.state.exciters[k].angle[0])[:, pair], axis=1)
     turns = np.floor(abs(phi[-1] - phi[0]) / (2.0 * np.pi))
     covered = np.abs(phi[-1] - phi) <= 2.0 * np.pi * turns if turns else np.ones(phi.size, bool)

@@ -67,11 +67,9 @@ _MAX_WINDOW_TURNS = 256
 
 
 class _Tolerance(WrappedController):
-    """Step size controller with errors relative to the largest entry of a block of variables, such as all parts of Y.
-
-    An error relative to each entry alone would be too strict, because the real or imaginary part of an amplitude is often 0.
-    `blocks`: the number of variables in each block; only absolute errors count in the last one, the phases.
-    """
+    """Step size controller with errors relative to the largest entry of a block of variables, such as all parts of Y, because
+    the real or imaginary part of an amplitude is often 0. `blocks`: the number of variables in each block; only absolute errors
+    count in the last one, the phases."""
 
     controller: diffrax.AbstractStepSizeController
     blocks: tuple[int, ...] = eqx.field(static=True)
@@ -229,11 +227,8 @@ def envelope(
 
 
 def _with_separation_status(run: Envelope) -> Envelope:
-    """Return the run with another status if it has settled in a motion that is unstable.
-
-    The status is `would_separate` for loads of one exciter at nearly one angle, and `unstable` for exciters that turn at one
-    speed.
-    """
+    """Return the run with the status `would_separate` (loads of one exciter at nearly one angle) or `unstable` (exciters that
+    turn at one speed) if it has settled in a motion that is unstable."""
     if not (float(run.drift) < SETTLED_DRIFT and status_name(run.status) == "done"):
         return run
     phase, time, rate = (np.asarray(x) for x in (run.window.phase, run.window.time, run.window.load_speed))

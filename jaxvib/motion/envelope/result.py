@@ -13,7 +13,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit
 from jaxvib.equations.linear import linear_model, peak_force
-from jaxvib.equations.torque_balance import resultant_of
+from jaxvib.equations.torque_balance import mass_owners, resultant_of
 from jaxvib.machine.drives.drive import Motor
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction, RotorImbalance
@@ -92,7 +92,6 @@ _OFFSET = "no spring returns the machine to its place: amplitudes include its di
 
 
 def _moves_without_spring(scene: Scene) -> bool:
-    """Return True if a machine can move without the force of a spring."""
     eigenvalues = np.linalg.eigvalsh(np.asarray(scene.machine.carrier().stiffness))
     return bool(eigenvalues[0] <= np.finfo(eigenvalues.dtype).eps ** 0.75 * max(eigenvalues[-1], 0.0))
 
@@ -158,7 +157,8 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         scene, window = self.scene, self.window
         turn = jnp.mean(jnp.exp(1j * window.phase), axis=0)
         force = peak_force(self.omega**2 * resultant_of(linear_model(scene), turn))
-        rates = zip(scene.exciters, window.rotor_speeds, _split(scene, window.load_speed), strict=True)
+        load_speeds = jnp.split(window.load_speed, np.cumsum(np.bincount(mass_owners(scene)))[:-1], axis=1)
+        rates = zip(scene.exciters, window.rotor_speeds, load_speeds, strict=True)
         torques = [_torque_of(each, window.time, speed, rate) for each, speed, rate in rates]
         powers = [
             jnp.mean(each.direction * n * torque)
@@ -210,12 +210,6 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         return plot_histories(self, unit=unit, ax=ax)
 
 
-def _split(scene: Scene, speeds: Array) -> list[Array]:
-    """Return the load speeds (nt, count) of each exciter from those of all exciters in one array."""
-    counts = [1 if each.loads is None else each.loads.count for each in scene.exciters]
-    return jnp.split(speeds, np.cumsum(counts)[:-1], axis=1)
-
-
 def _torque_of(exciter: Exciter, time: Array, speed: Array, load_speed: Array) -> Array:
     """Return the torque of a drive, N m, in its direction, over the times (nt,)."""
     n, rates, loads = exciter.direction * speed, exciter.direction * load_speed, exciter.loads
@@ -231,9 +225,7 @@ def plot_histories(run: Envelope, *, resonances: Sequence[float] = (), unit: Spe
     from jaxvib.draw.motion.histories import amplitude_histories  # slow import
 
     kept, structure = run.window if run.trajectory is None else run.trajectory, run.scene.machine.structure()
-    exciters = run.scene.exciters
-    counts = [1 if e.loads is None else e.loads.count for e in exciters]
-    is_load = np.repeat([e.loads is not None for e in exciters], counts)
+    is_load = np.array([e.loads is not None for e in run.scene.exciters])[mass_owners(run.scene)]
     return amplitude_histories(
         np.asarray(kept.time),
         np.asarray(kept.amplitude),

@@ -254,10 +254,8 @@ def _turned_motors(scene: Scene) -> list[int]:
 
 
 def _peaks(run: Envelope) -> tuple[np.ndarray, float]:
-    """Return the largest amplitudes of a run, and the largest magnitude of the force on the foundation, N.
-
-    The largest magnitude of the vector Re(F exp(i theta)) within a turn is sqrt((sum |F_k|^2 + |sum F_k^2|)/2).
-    """
+    """Return the largest amplitudes of a run, and the largest magnitude of the force on the foundation, N: within a turn that
+    of the vector Re(F exp(i theta)) is sqrt((sum |F_k|^2 + |sum F_k^2|)/2)."""
     trajectory, model = run.trajectory, assemble(run.scene)
     assert trajectory is not None
     each = model.carrier.foundation_force(trajectory.displacement.T, trajectory.velocity.T)

@@ -177,11 +177,8 @@ def _with_shifts_jvp(
 
 
 class _Step(NamedTuple):
-    """Step in which contacts begin.
-
-    **Attributes**: `start` and `end`, states of the integrator with a common number of turns; `t0`, `t1`; `args` of the
-    equations; `system`.
-    """
+    """Step from `t0` to `t1` in which contacts begin, with the states `start` and `end` of the integrator, which have a common
+    number of turns, and the `args` of the equations of the `system`."""
 
     start: IntegratorState
     end: IntegratorState
@@ -200,11 +197,8 @@ class _Step(NamedTuple):
         return jax.jvp(lambda y: self.system.term.vf(t, y, self.args), (self.at(share),), (direction,))[1]
 
     def change(self, begins: Array, share: Array, shift: Array) -> IntegratorState:
-        """Return the change of the derivative of the end of the step.
-
-        **Arguments** (n,): `begins`: True for contacts that begin; `share` of the step at which they do; `shift`: the variation
-        dp of their penetration there, 0 for other contacts.
-        """
+        """Return the change of the derivative of the end of the step by contacts (n,) that begin (`begins`) at a `share` of the
+        step; `shift`: the variation dp of their penetration there, 0 for other contacts."""
         first, last = jnp.min(jnp.where(begins, share, 1.0)), jnp.max(share)
         within = last + _MARGIN * (1.0 - last)
         velocity = self.velocity(within, begins, shift)

@@ -12,7 +12,6 @@ from jax import Array
 from jaxvib.equations.linear import LinearModel, linear_model
 from jaxvib.equations.sliding import kinematics
 from jaxvib.equations.state import State
-from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.terms import LoadInteraction, SupportForce
 from jaxvib.machine.loads import Loads
@@ -56,12 +55,7 @@ _MAX_IMPLICIT_SIZE = 64
 def fastest_decay(scene: Scene) -> Array:
     """Return the fastest decay rate, 1/s, due to the machine with its loads, `machine_decay`, or to a motor, `motor_poles`."""
     drives = [exciter.drive for exciter in jax.lax.stop_gradient(scene).exciters if not exciter.drive.ideal]
-    return functools.reduce(jnp.maximum, [machine_decay(scene), *map(_motor_decay, drives)])
-
-
-def _motor_decay(drive: Drive) -> Array:
-    """Return the fastest decay rate of the speed and the states of a motor, 1/s."""
-    return jnp.max(-motor_poles(drive).real)
+    return functools.reduce(jnp.maximum, [machine_decay(scene), *(jnp.max(-motor_poles(drive).real) for drive in drives)])
 
 
 @cached
@@ -110,12 +104,9 @@ def _load_decay(loads: Loads, speed: Array, accelerance: Array) -> Array:
 
 
 def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rodas4 | None:
-    """Return the implicit method if it takes less time than explicit steps, otherwise None.
-
-    That is the case if the state has at most 64 entries and a decay is more than 100 times as fast as the motion.
-    """
-    size = sum(np.size(leaf) for leaf in jax.tree.leaves(state))
-    return Rodas4() if size <= _MAX_IMPLICIT_SIZE and float(fastest_decay(scene)) > _STIFF_RATE_RATIO * float(fastest) else None
+    """Return the implicit method if it takes less time than explicit steps, otherwise None."""
+    is_small = sum(np.size(leaf) for leaf in jax.tree.leaves(state)) <= _MAX_IMPLICIT_SIZE
+    return Rodas4() if is_small and float(fastest_decay(scene)) > _STIFF_RATE_RATIO * float(fastest) else None
 
 
 def fastest_motion(scene: Scene, per_contact: float = 1.0) -> Array:
@@ -200,11 +191,8 @@ def rate_at(scene: Scene, displacements: Array) -> Array:
 
 
 def equal_step_length(fastest: float, decay: float, per_radian: float, step: float | None = None) -> tuple[float, bool]:
-    """Return the length of equal steps, s, and True if implicit steps are necessary.
-
-    **Arguments**: `fastest`: rate of the motion, rad/s; `decay`: fastest decay rate, 1/s; `per_radian`: number of explicit
-    steps per radian of the motion; `step`: prescribed length of the steps, s, or None.
-    """
+    """Return the length of equal steps, s, and True if implicit steps are necessary, for the `fastest` rate of the motion,
+    rad/s, the fastest `decay`, 1/s, a number of explicit steps `per_radian` of the motion, or a prescribed length `step`, s."""
     if step is not None:
         return step, decay * step > _MAX_DECAY_PER_STEP
     if decay > _STIFF_RATE_RATIO * fastest:
@@ -234,11 +222,8 @@ def advice(scene: Scene) -> str:
     decay, motion = float(fastest_decay(scene)), float(frequency_bounds(scene)[0])
     if not decay > 10.0 * motion:
         return ""
-    causes = (
-        "machine.damping makes vibrations",
-        "friction at a support (force/width) makes vibrations",
-        "loads.drag makes speeds of loads",
-    )
+    vibrations = ("machine.damping makes vibrations", "friction at a support (force/width) makes vibrations")
+    causes = (*vibrations, "loads.drag makes speeds of loads")
     rates = (*_carrier_decays(scene), machine_decay(scene))
     name = next((cause for cause, rate in zip(causes, rates, strict=True) if float(rate) >= decay), None)
     name = name or "a motor makes its speed or its currents"
@@ -252,8 +237,5 @@ def advice(scene: Scene) -> str:
 def _carrier_decays(scene: Scene) -> tuple[Array, ...]:
     """Return the fastest decay rates due to the damping of the carrier without and with its nonlinear supports, 1/s."""
     linear = linear_model(scene)
-    return tuple(_fastest(linear, damping) for damping in (linear.carrier.damping, _damping(linear)))
-
-
-def _fastest(linear: LinearModel, damping: Array) -> Array:
-    return jnp.max(hermitian_modes(relative_to(linear.mass, damping)[0])[0])
+    squares = (relative_to(linear.mass, damping)[0] for damping in (linear.carrier.damping, _damping(linear)))
+    return tuple(jnp.max(hermitian_modes(square)[0]) for square in squares)
