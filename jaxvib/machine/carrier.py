@@ -20,11 +20,7 @@ from jaxvib.units import Number, count, number, numbers
 
 
 class BodyPoint(Readable):
-    """Point of one of several bodies.
-
-    **Attributes**: `at` (2,): the point (x, y), m from the body's centre of mass, None for the centre itself; `body`: number of
-    the body, from 0.
-    """
+    """Point (x, y) of one of several bodies, m from its centre of mass; None for the centre itself. Bodies count from 0."""
 
     at: Array | None
     body: int = eqx.field(static=True)
@@ -395,10 +391,7 @@ def shape_and_dtype(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
 def _structure(
     rest: Hashable, kinds: tuple[tuple[tuple[int, ...], np.dtype], ...], precision: np.dtype, platform: int | None
 ) -> tuple[Carrier, Mount]:
-    """Trace the carrier and the mount once for all machines of one structure and one `precision`.
-
-    The result is cached because a trace takes longer than many runs.
-    """
+    """Trace the carrier and the mount once for each structure and `precision`, because a trace takes longer than many runs."""
     machine, position = jax.tree.unflatten(rest, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
 
     def shapes(machine: Machine, position: Array | None) -> tuple[Carrier, Mount]:

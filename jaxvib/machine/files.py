@@ -80,10 +80,8 @@ Tables: TypeAlias = dict[str, Any]
 
 
 def suggest_name(name: str, allowed: list[str], present: Container[str] = ()) -> str:
-    """Return the end of an error message about an unknown name: the most similar allowed name, and all allowed names.
-
-    A name that is already `present` in the same table is not suggested.
-    """
+    """Return the end of an error message about an unknown name: the most similar allowed name that is not `present` in the same
+    table, and all allowed names."""
     similar = difflib.get_close_matches(name, [other for other in allowed if other not in present], n=1)
     question = f"did you mean {similar[0]!r}? " if similar else ""
     return f"{question}allowed: {', '.join(allowed)}"

@@ -315,10 +315,7 @@ def _require_room(loads: CircularLoads, r: Array) -> None:
 
 
 def side_by_side(count: int, ratio: Array) -> Array:
-    """Return (2 j - N + 1) arcsin(r/R), (count,) rad: the angles of touching loads j = 0 .. N - 1, relative to their middle.
-
-    `ratio` is r/R.
-    """
+    """Return (2 j - N + 1) arcsin(`ratio`), (count,) rad: angles of touching loads j = 0 .. N - 1, relative to their middle."""
     angle = jnp.arcsin(ratio)
     return jnp.arange(1 - count, count, 2, dtype=angle.dtype) * angle
 

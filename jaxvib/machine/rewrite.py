@@ -114,11 +114,8 @@ def _value_at(tables: object, path: _Path) -> object:
 
 
 def _rewritten_line(line: str, entry: re.Match[str], read: object, old: object, new: object, is_other_machine: bool) -> str:
-    """Return a line with the value `new`, SI, in place of its value `read`, which is `old` in SI.
-
-    If the machine has changed, a damping that is given as a ratio is written as a number: the coefficient has stayed the same,
-    but the ratio has not.
-    """
+    """Return a line with the value `new`, SI, in place of its value `read`, which is `old` in SI. If the machine has changed, a
+    damping ratio becomes a number, because it is no longer the same although the damping is."""
     if old is None or new is None or (_is_close(old, new) and not (is_other_machine and _RELATIVE.search(entry[3]))):
         return line
     comment = f"; {entry[6]}" if entry[6] else ""

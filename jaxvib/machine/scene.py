@@ -167,11 +167,7 @@ def unbalance(*, force: Number, at: Number) -> Array:
 
 
 def read_unbalance(drive: Drive, unbalance: Number | None, unbalance_mass: Number | None) -> tuple[Array | None, Array | None]:
-    """Return the unbalance S, kg m, and its mass m, kg, as arrays; None for a value that is absent.
-
-    **Raises** `InputError` for a mass without an unbalance, values that are not allowed, and a motor with less inertia than
-    S^2/m.
-    """
+    """Return the unbalance S, kg m, and its mass m, kg, as arrays; None for an absent value. **Raises** errors of `Exciter`."""
     if unbalance_mass is not None and unbalance is None:
         raise InputError("unbalance_mass", f"is {quoted(unbalance_mass)} without an unbalance; give unbalance=..., in kg m")
     try:
@@ -470,10 +466,7 @@ def _read_exciters(
 
 
 def read_effects(effects: object) -> tuple[Effect, ...]:
-    """Return effects in the order of scene files.
-
-    **Raises** `InputError` for values that are not effects, and for effects that occur twice but may occur only once.
-    """
+    """Return effects in the order of scene files. **Raises** `InputError` for other values, and for forbidden repetitions."""
     if isinstance(effects, Effect):
         effects = (effects,)
     if not isinstance(effects, (tuple, list)):
@@ -491,10 +484,8 @@ def read_effects(effects: object) -> tuple[Effect, ...]:
 
 
 def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
-    """**Raises** `InputError` if one of two numbers that are added is lost in rounding errors. Traced numbers are not checked.
-
-    The error occurs if the loads are too heavy or too light for the machine, or their drag is too weak for their inertia.
-    """
+    """**Raises** `InputError` if known numbers would be lost in rounding errors: the loads are too heavy or too light for the
+    machine, or their drag is too weak for their inertia."""
     parts = getattr(machine, "mass", None), loads.mass, getattr(loads, "drag", None), drive.speed
     when_known(functools.partial(_require_comparable, loads.count), *parts)
 

@@ -11,11 +11,8 @@ from jaxvib.results.fields import as_text
 
 
 def mass_names(scene: Scene) -> tuple[str, ...]:
-    """Return the names of the loads, and of the rotors of exciters without loads.
-
-    The first load has the name "1" in a scene with one exciter; with several exciters, "2.1" is the first load of exciter 2, or
-    "2" is its rotor if it has no loads. A single exciter without loads has no names.
-    """
+    """Return the names of the loads, and of the rotors of exciters without loads: "1" for the first load of a single exciter,
+    "2.1" for that of exciter 2, "2" for its rotor if it has no loads; none for a single exciter without loads."""
     counts = [0 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters]
     if len(counts) == 1:
         return tuple(str(j + 1) for j in range(counts[0]))

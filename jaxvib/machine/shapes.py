@@ -37,10 +37,8 @@ def _is_of_package(part: Part) -> bool:
 
 
 def _once_for_each_structure(check: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that checks a part, with the other parts on which its result depends, by tracing.
-
-    Parts of the same structure, shapes and default dtype are traced once. Parts of the package are not checked.
-    """
+    """Return a function that checks a part outside the package by tracing, once for each structure, shapes and default dtype of
+    the part and of the other parts on which its result depends."""
 
     @functools.lru_cache(maxsize=256)
     def on_shapes(structure: Hashable, shapes: tuple[tuple[Shape, np.dtype], ...], dtype: np.dtype) -> None:
@@ -57,8 +55,7 @@ def _once_for_each_structure(check: Callable[..., None]) -> Callable[..., None]:
 
 def require_machine(machine: Machine, place: Place) -> None:
     """**Raises** `InputError` for a carrier, or a mount at the `place`, whose matrices do not fit each other, and for a mass
-    matrix that is not symmetric and positive definite.
-    """
+    matrix that is not symmetric and positive definite."""
     if _is_of_package(machine):
         return
     carrier, mount = shapes_of(machine, place)

@@ -101,11 +101,8 @@ class TorusBalls(Loads):
     def drilling_spin(
         self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, slip: tuple[Array, ...] | None = None
     ) -> DrillingSpin:
-        """Return s' = (a' (w B - R f') + c_f a' - c_a f' sin a)/r and the forces (2/5) m r s (B a', - rho sin a f').
-
-        c_f and c_a are the slips along the coordinates, 0 for a rolling ball. A ball that does not rotate in space has s = w
-        cos a.
-        """
+        """Return s' = (a' (w B - R f') + c_f a' - c_a f' sin a)/r and the forces (2/5) m r s (B a', - rho sin a f'), with the
+        slips c_f and c_a along the coordinates, 0 for a rolling ball. A ball that does not rotate in space has s = w cos a."""
         (_, a), (turn, climb), m, r = u, rate, self.mass, self.ball_radius
         arm, up = self._arm(a), jnp.sin(a)
         lever = _ROLLING * m * r
@@ -122,10 +119,7 @@ class TorusBalls(Loads):
         return NormalForce(m * (centrifugal - sum(normal[axis] * x for axis, x in g.items())), (-m * normal[0], -m * normal[1]))
 
     def natural_frequency(self, speed: Array) -> Array:
-        """Return w sqrt((R + rho) / (kappa rho)), rad/s.
-
-        This is the frequency at which balls that turn with the rotor oscillate about the outer equator.
-        """
+        """Return w sqrt((R + rho) / (kappa rho)), rad/s, of the oscillation of turning balls about the outer equator."""
         return speed * jnp.sqrt((self.radius + self.gap) / (self.inertia_factor() * self.gap))
 
 

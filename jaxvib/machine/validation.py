@@ -75,12 +75,8 @@ def validate_scene(scene: Scene) -> Scene:
 
 
 def require_double(scene: Scene, purpose: str) -> Scene:
-    """Return `validate_scene(scene)`.
-
-    **Raises** `InputError` if JAX computes in single precision.
-
-    **Arguments**: `purpose`: what needs double precision, as the subject of a sentence, such as "a search".
-    """
+    """Return `validate_scene(scene)`. **Raises** `InputError` in single precision; the `purpose`, such as "a search", is the
+    subject of its sentence."""
     if isinstance(scene, Scene) and float_dtype() != np.float64:
         raise InputError(
             "scene",
@@ -91,10 +87,8 @@ def require_double(scene: Scene, purpose: str) -> Scene:
 
 
 def allowed_unknowns(scene: Scene) -> Array | None:
-    """Return a Boolean, True if the constructors allow the traced parameters of a scene.
-
-    The result is None if no parameter is traced, because the values are then already validated. It is also None if the traced
-    values are known, as under `grad` without `jit`, and allowed.
+    """Return a Boolean, True if the constructors allow the traced parameters of a scene; None if no parameter is traced, or if
+    the traced values are known, as under `grad` without `jit`, and allowed.
 
     >>> import equinox as eqx, jax, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -113,10 +107,7 @@ def allowed_unknowns(scene: Scene) -> Array | None:
 
 
 def _allowed_value(scene: Scene) -> Array | None:
-    """Return None if the constructors allow the parameters of a scene, otherwise False.
-
-    All parameters have values here, as under `grad` without `jit`.
-    """
+    """Return None if the constructors allow the parameters of a scene, which have known values here, otherwise False."""
     try:
         validate_scene(scene)
     except InputError:
@@ -211,16 +202,11 @@ def implausible_numbers(scene: Scene) -> list[str]:
             if 0.0 < value < _MIN_STIFFNESS_RATIO * np.max(springs):
                 name = names[k] if supports else f"machine.stiffness[{k}]"
                 note(name, f"{value:g} N/m, but another one is {np.max(springs):g} N/m", "N/m", f"{value:g} N/mm")
-    if supports and mass >= _MIN_MASS and 0.0 < np.sum(supports) * _MAX_SAG < STANDARD_GRAVITY * mass:
-        sag = f"{STANDARD_GRAVITY * mass / float(np.sum(supports)):.3g} m"
-        note(
-            "machine.supports.stiffness", f"so small that the machine sags by {sag}", "N/m", f"{float(np.max(supports)):g} N/mm"
-        )
-    stiffness = float(np.sum(getattr(scene.machine, "stiffness", 0.0)))
-    if mass >= _MIN_MASS and 0.0 < stiffness * _MAX_SAG < STANDARD_GRAVITY * mass:
-        sag = f"{STANDARD_GRAVITY * mass / stiffness:.3g} m"
-        largest = float(np.max(scene.machine.stiffness))  # pyright: ignore[reportAttributeAccessIssue]
-        note("machine.stiffness", f"so small that the machine sags by {sag}", "N/m", f"{largest:g} N/mm")
+    for name, stiffness in (("supports.stiffness", supports), ("stiffness", getattr(scene.machine, "stiffness", 0.0))):
+        total = float(np.sum(stiffness))
+        if mass >= _MIN_MASS and 0.0 < total * _MAX_SAG < STANDARD_GRAVITY * mass:
+            value = f"so small that the machine sags by {STANDARD_GRAVITY * mass / total:.3g} m"
+            note(f"machine.{name}", value, "N/m", f"{float(np.max(stiffness)):g} N/mm")
     return notes
 
 
@@ -229,13 +215,11 @@ _SWING_SHARE = 0.7246113537767085
 
 
 def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
-    """Return 0.7246 S g, the least constant torque that turns a hanging unbalance over the top, and L(0), the torque of the
-    motor at rest, N m. S contains the static imbalances.
+    """Return, for each exciter, 0.7246 S g, the least constant torque that turns a hanging unbalance over the top, and the
+    torque of the motor at rest, N m; None without a motor, an unbalance or gravity, or if the torque at rest changes in a run.
 
-    The unbalance swings past the height at which the torque would hold it: torque x > S g (1 - cos x) for every angle x.
-
-    The list has an entry for each exciter. An entry is None if the exciter has no motor or no unbalance, if the torque at rest
-    changes during a run (`Motor.starting_torque`), or without gravity.
+    S contains the static imbalances. The unbalance swings past the height at which the torque would hold it:
+    torque x > S g (1 - cos x) for every angle x.
     """
     gravity = total_gravity(scene.all_effects)
     found: list[tuple[Array, Array] | None] = []
@@ -257,11 +241,8 @@ def first_moment(exciter: Exciter) -> Array | None:
 
 
 def weight_accelerations(scene: Scene) -> dict[int, float]:
-    """Return S g / I, rad/s^2: the largest angular acceleration of a rotor of inertia I by the weight of its unbalance S.
-
-    The keys are the numbers, from 0, of the exciters with a motor and an unbalance. At the speed w, the weight changes the
-    speed of the rotor within a turn by the share S g / (I w^2).
-    """
+    """Return S g / I, rad/s^2, by the numbers, from 0, of the exciters with a motor and an unbalance S. At the speed w the
+    weight changes the speed of the rotor of inertia I within a turn by the share S g / (I w^2)."""
     g = float(np.hypot.reduce([float(each) for each in total_gravity(scene.all_effects).values()] or [0.0]))
     found = {}
     for k, exciter in enumerate(scene.exciters):
@@ -278,9 +259,7 @@ the working speeds of the templates of screens, and 0.29 to 0.36 at their lowest
 
 def weight_notes(scene: Scene, slowest: Mapping[int, float]) -> list[str]:
     """Return a sentence about the exciter on whose speed the weight of its unbalance acts most, if this effect is large.
-
-    `slowest`: lowest speed, rad/s, of stable averaged motions, for each exciter by its number from 0.
-    """
+    `slowest`: lowest speed, rad/s, of stable averaged motions by the number of the exciter."""
     shares = {k: each / slowest[k] ** 2 for k, each in weight_accelerations(scene).items() if k in slowest}
     k = max(shares, key=lambda k: shares[k], default=None)
     if k is None or shares[k] < _MIN_SHOWN_WEIGHT:

@@ -113,10 +113,11 @@ class Drive(Part):
 
 
 class Directed(Drive):
-    """Drive that turns its rotor in a direction: angles, speeds and torques are those of `drive` times `direction`.
+    """Drive that turns its rotor in a direction: angles, speeds and torques are those of `drive` times `direction`, everything
+    else, including the attribute `speed`, is that of `drive`.
 
     `direction` is an array of 1 or -1, so that one compiled program serves both directions. None means clockwise;
-    signs are then changed without a product. The attribute `speed` is that of `drive`, without a sign.
+    signs are then changed without a product.
     """
 
     drive: Drive
@@ -131,42 +132,33 @@ class Directed(Drive):
         return -value if self.direction is None else self.direction * value
 
     def _undirected(self, rotor: Rotor) -> Rotor:
-        """Return the states of the rotor with the signs of `drive`."""
         return None if rotor is None else (self._directed(rotor[0]), self._directed(rotor[1]), *rotor[2:])
 
     @property
     def largest_speed(self) -> Array:
-        """Largest speed of the drive."""
         return self.drive.largest_speed
 
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
-        """Return the speed of the drive in the direction."""
         return self._directed(self.drive.rotor_speed(t, self._undirected(rotor)))
 
     def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
-        """Return the angle of the drive in the direction."""
         return self._directed(self.drive.rotor_angle(t, self._undirected(rotor)))
 
     def rotor_acceleration(self, t: Array) -> Array | None:
-        """Return the acceleration of the drive in the direction."""
         acceleration = self.drive.rotor_acceleration(t)
         return None if acceleration is None else self._directed(acceleration)
 
     def torque_and_inertia(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> tuple[Array, Array] | None:
-        """Return the torque of the drive in the direction, and its inertia."""
         motor = self.drive.torque_and_inertia(t, self._directed(speed), states)
         return None if motor is None else (self._directed(motor[0]), motor[1])
 
     def state_units(self) -> tuple[Array, ...]:
-        """Return the typical magnitudes of the states of the drive."""
         return self.drive.state_units()
 
     def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
-        """Return the time derivatives of the states of the drive."""
         return self.drive.state_rates(t, self._directed(speed), states)
 
     def jump_ts(self) -> tuple[Array, ...]:
-        """Return the times of the jumps of the drive."""
         return self.drive.jump_ts()
 
 
@@ -523,41 +515,32 @@ class MotorWrapper(Motor):
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """No-load speed of the motor."""
         return self.motor.speed
 
     @property
     def largest_speed(self) -> Array:
-        """Largest speed of the motor."""
         return self.motor.largest_speed
 
     @property
     def is_smooth(self) -> bool:
-        """True if the motor's torque has all derivatives."""
         return self.motor.is_smooth
 
     @property
     def inertia(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Inertia of the motor's rotor."""
         return self.motor.inertia
 
     @property
     def dips(self) -> int:
-        """Number of dips of the motor's torque."""
         return self.motor.dips
 
     def state_units(self) -> tuple[Array, ...]:
-        """Return the typical magnitudes of the states of the motor."""
         return self.motor.state_units()
 
     def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
-        """Return the rates of the `states` of the motor at time `t` (s) and the rotor's `speed` (rad/s)."""
         return self.motor.state_rates(t, speed, states)
 
     def starting_torque(self) -> Array | None:
-        """Return the torque at rest when a run begins, N m; None if that of the motor changes afterwards."""
         return None if self.motor.starting_torque() is None else super().starting_torque()
 
     def jump_ts(self) -> tuple[Array, ...]:
-        """Return the times of the motor's jumps."""
         return self.motor.jump_ts()

@@ -65,9 +65,8 @@ def total_gravity(effects: Iterable["Effect"]) -> dict[int, Array]:
 def has_half_turn_symmetry(effects: Iterable["Effect"]) -> bool:
     """Return True if phi -> phi + pi, q -> -q leaves the equations with these `effects` unchanged.
 
-    In a jam the vibration then has odd harmonics only, and the deviation of the load angle even ones. Some friction laws keep
-    this symmetry. Gravity on the loads and an imbalance break it. For every effect other than friction the result is False,
-    because the symmetry is not examined.
+    In a jam the vibration then has odd harmonics only, and the deviation of the load angle even ones. Effects other than
+    friction are not examined: the result is then False.
     """
     terms = [term for effect in effects for term in effect.terms()]
     return all(isinstance(term, ContactFriction) and term.is_half_turn_symmetric for term in terms)

@@ -215,10 +215,7 @@ _NEWTON_STEPS = 5
 
 
 def _loss(ratio: Array) -> Array:
-    """Return -log e of a damping `ratio` zeta.
-
-    It is (pi - 2 beta) tan beta with sin beta = zeta if zeta <= 1, otherwise 2 gamma coth gamma with cosh gamma = zeta.
-    """
+    """Return -log e of a damping `ratio` zeta, see `LoadContact`."""
     near = ratio - 1.0
     middle = jnp.abs(near) < 1e-3
     under, over = jnp.where(ratio < 0.999, ratio, 0.5), jnp.where(ratio > 1.001, ratio, 2.0)
@@ -229,11 +226,7 @@ def _loss(ratio: Array) -> Array:
 
 
 class Tracks(NamedTuple):
-    """Tracks of loads at several stations.
-
-    **Attributes** (count,): `stations`, m; `follower`: the number of the next load on the same track, and `turns`: 1 if it
-    follows a turn later.
-    """
+    """Tracks of loads at `stations`, m; `follower`: the next load on the same track, `turns`: 1 if it follows a turn later."""
 
     stations: Array
     follower: Array
@@ -256,11 +249,8 @@ class Tracks(NamedTuple):
 
 
 def _clearances(loads: Loads, u: tuple[Array, ...], tracks: Tracks | None) -> list[Array]:
-    """Return the distances between surfaces, negative for an overlap.
-
-    The k-th array contains the distances of each load to the k-th load after it; each pair occurs once. On a circle there is
-    only k = 1, the next load on the same track.
-    """
+    """Return the distances, negative for an overlap, of each load to the k-th load after it; each pair occurs once. On a circle
+    there is only k = 1, the next load on the same track."""
     r = ball_radius(loads)
     if isinstance(loads, CircularLoads):
         (phi,) = u

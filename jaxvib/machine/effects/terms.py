@@ -47,9 +47,7 @@ class GravityField:
 @final
 @dataclass(frozen=True)
 class LoadPotential:
-    """Potential energy of each load as a function of the position of this load.
-
-    The energy is a single-valued function of the position. The mean of its torque over the angle of a turn is therefore 0.
+    """Potential energy of each load: a single-valued function of its position, whose mean torque over a turn is therefore 0.
 
     **Attributes**: `energy` of loads at `u`, (count,) J; `is_smooth`: True if the force has all derivatives.
     """

@@ -42,13 +42,8 @@ _SECTIONS: dict[str, type[eqx.Module]] = {
 class NamedNumber(NamedTuple):
     """Parameter of a scene, or array of parameters with one unit.
 
-    **Attributes**
-
-    - `name`
-    - `path` of attributes and indices from the scene to the array
-    - `entry` of the array; None for the whole array
-    - `size`: number of parameters
-    - `spec` of the field
+    **Attributes**: `path` of attributes and indices from the scene to the array; `entry` of the array, None for all of it;
+    `size`: number of parameters; `spec` of the field.
     """
 
     name: str
@@ -85,10 +80,8 @@ class NamedNumber(NamedTuple):
         return jnp.reshape(leaf if self.entry is None else _row_by_row(leaf)[self.entry], (-1,))
 
     def value(self, given: Number, field: str) -> float:
-        """Return a user's value in SI.
-
-        **Raises** `InputError` that names `field`, for a wrong unit and a value out of bounds.
-        """
+        """Return a user's value in SI. **Raises** `InputError` that names `field`, for a wrong unit or a value out of
+        bounds."""
         return float(number(given, self.unit, field, **self.spec.bounds._asdict()))
 
     def single(self, scene: Scene) -> tuple[NamedNumber, ...]:
@@ -213,11 +206,8 @@ def _steps(part: eqx.Module, steps: Sequence[Any]) -> tuple[_Path, NumberSpec]:
 
 
 def find_number(scene: Scene, name: str, field: str) -> NamedNumber:
-    """Return the parameter, or the array of parameters, with the name `name`.
-
-    **Raises** `InputError` that names `field`, for a name that the scene does not have, and for the name of a discrete value,
-    such as a count.
-    """
+    """Return the parameter, or the array of parameters, with the name `name`. **Raises** `InputError` that names `field`, if
+    the scene has no such parameter."""
     named, field = numbers_of(scene), f"{field}.{name}"
     if not isinstance(name, str):
         raise InputError(field, f"is not the name of a parameter; {suggest_name(str(name), list(named))}")
@@ -265,11 +255,8 @@ def put_numbers(scene: Scene, parameters: Sequence[NamedNumber], values: Array |
 
 
 def present_numbers(scene: Scene, array: NamedNumber, field: str) -> tuple[NamedNumber, ...]:
-    """Return the array, or only its entries other than 0 if the array keeps its zeros.
-
-    An absent spring or damper is added only if the user names its entry. **Raises** `InputError` that names `field`, for an
-    array that keeps its zeros and is 0 in every entry.
-    """
+    """Return the array, or only its entries other than 0 if it keeps its zeros: only a named entry adds a spring or a damper.
+    **Raises** `InputError` that names `field` if no entry is left."""
     values = np.asarray(array.leaf(scene))
     if not array.keeps_zeros(scene) or np.all(values != 0.0):
         return (array,)
@@ -287,10 +274,7 @@ def put_present(scene: Scene, array: NamedNumber, value: float | Array) -> Scene
 
 
 def read_value(name: str, value: Number) -> float:
-    """Return a value in SI for the parameter `name` of any scene.
-
-    **Raises** `InputError` for a name that no part of a scene has, a wrong unit, and a value out of bounds.
-    """
+    """Return a value in SI for the parameter `name` of any scene. **Raises** `InputError` for a wrong name or value."""
     spec, index = spec_of(name), re.search(r"\[(\d+)\]$", str(name))
     entry = int(index[1]) if index else None
     if spec is None or (len(spec.units) > 1 and (entry or 0) >= len(spec.units)):
@@ -301,10 +285,8 @@ def read_value(name: str, value: Number) -> float:
 
 
 def spec_of(name: str) -> NumberSpec | None:
-    """Return the specification of a parameter from its name alone; None if no kind of part has such a field.
-
-    If several kinds have the field, the specification of an array takes precedence.
-    """
+    """Return the specification of a parameter from its name alone; None if no kind of part has such a field. If several kinds
+    have it, the specification of an array takes precedence."""
     part, _, last = re.sub(r"\[\d+\]", "", str(name)).rpartition(".")
     part = re.sub(r"(\.(motor|reference))+$", "", part.removeprefix("exciters."))  # a drive within a drive
     if part.startswith("effects."):

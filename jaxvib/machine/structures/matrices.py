@@ -71,11 +71,8 @@ class MatrixMachine(Machine):
         return self._all_rows(place, name)[:2]
 
     def require_valid(self) -> None:
-        """**Raises** `InputError` for replaced arrays whose shapes do not fit, and for an indefinite mass or stiffness matrix.
-
-        Only the symmetric parts of the matrices are examined, because a sweep or a design may change one of two symmetric
-        entries without the other.
-        """
+        """**Raises** `InputError` for arrays whose shapes do not fit, and for a mass or stiffness matrix whose symmetric part
+        is indefinite: a sweep or a design may change one of two symmetric entries without the other."""
         size, rows = self.places_rows.shape[-1], self.foundation
         for name in ("mass", "damping", "stiffness", "gyroscopic"):
             if (matrix := getattr(self, name)) is not None and matrix.shape != (size, size):
@@ -167,10 +164,7 @@ def from_matrices(
 
 
 def _lowest_modes(mass: Array, stiffness: Array, number: int) -> Array:
-    """Return the lowest real normal modes (nd, `number` or more), with the modal masses 1.
-
-    There are more than `number` if further modes have the same natural frequency as the last one.
-    """
+    """Return the lowest real normal modes (nd, `number`) with modal masses 1, and all further ones of equal frequency."""
     square, inverse = relative_to(mass, stiffness)
     squares, modes = hermitian_modes(square)
     equal = when_known(lambda values: _number_of_equal(values, number), squares)

@@ -188,11 +188,8 @@ class _Bodies(Machine):
         return np.tile([0.0, 1.0, 0.0], self.body_count)
 
     def moment_rows(self, about: Array) -> Array:
-        """Return the rows (2, nd), see `Machine.moment_rows`.
-
-        **Raises** `InputError` unless exactly one body stands on the foundation: the distances between several bodies
-        are not known.
-        """
+        """Return the rows (2, nd), see `Machine.moment_rows`. **Raises** `InputError` unless exactly one body stands on the
+        foundation, because the distances between bodies are not known."""
         on_foundation = [each for each in self.supports if each.to is None]
         bodies = sorted({each.body for each in on_foundation})
         if len(bodies) != 1:

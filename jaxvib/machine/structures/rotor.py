@@ -97,11 +97,8 @@ class Rotor(Machine):
         return dataclasses.replace(carrier, **changed) if changed else carrier
 
     def mount(self, at: Place = None) -> Mount:
-        """Return the mount at the exciter's station.
-
-        If each load has a separate station, the rows are those of the centre of mass and of the tilt of the axis, and the
-        station of each load is its lever.
-        """
+        """Return the mount at the exciter's station. If each load has its own station, this is its lever, and the rows are
+        those of the centre of mass and of the tilt of the axis."""
         skew = np.zeros((4, 4))
         skew[2, 3], skew[3, 2] = 1.0, -1.0
         station = self.stations if at is None else jnp.asarray(at)
@@ -115,11 +112,8 @@ class Rotor(Machine):
         )
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Return the matrix that gives the displacement of the point of the axis at a distance from the centre of mass, m.
-
-        If `place` is None, the point is the common station of the loads, or the centre of mass if each load has its own
-        station.
-        """
+        """Return the rows of the point of the axis at a distance from the centre of mass, m; None is the common station of the
+        loads, or the centre of mass if each load has its own station."""
         if isinstance(place, (int, np.integer)):
             raise InputError(
                 name, f"is {place}, which numbers a platform; on a rotor give a position, m from the centre of mass"
@@ -138,10 +132,7 @@ class Rotor(Machine):
         return jnp.eye(2, 4, dtype=self.mass.dtype), jnp.eye(2, 4, 2, dtype=self.mass.dtype)
 
     def support_rows(self) -> tuple[Array, Array]:
-        """Return the rows of the force on each support.
-
-        If `stiffness_terms` or `damping_terms` replace the supports, return those of one support that carries the whole force.
-        """
+        """Return the rows of the force on each support, or on one support if `stiffness_terms` or `damping_terms` are given."""
         if self.stiffness_terms is not None or self.damping_terms is not None:
             return super().support_rows()
         translation, tilt = self._directions()
