@@ -440,10 +440,11 @@ def scene_text(scene: Scene) -> str:
 
     require_known(scene, "scene", "scene_text", "print the scene outside")
     text = tomli_w.dumps({name: table for name, table in _scene_tables(scene, with_display_units).items() if table})
-    return re.sub(r"\[\n.*?\n\]", lambda array: _in_one_line(array[0]), text, flags=re.S)
+    return re.sub(r"\[\n.*?\n\]", lambda array: in_one_line(array[0]), text, flags=re.S)
 
 
-def _in_one_line(array: str) -> str:
+def in_one_line(array: str) -> str:
+    """Return the text of a TOML array in one line."""
     return " ".join(array.split()).replace("[ ", "[").replace(", ]", "]")
 
 

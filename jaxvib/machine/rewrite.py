@@ -7,7 +7,7 @@ import re
 import tomllib
 from collections.abc import Sequence
 
-from jaxvib.machine.files import scene_from_toml, scene_to_toml
+from jaxvib.machine.files import in_one_line, scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.units.reading import SEVERAL
 
@@ -119,7 +119,7 @@ def _rewritten_line(line: str, entry: re.Match[str], read: object, old: object, 
     if old is None or new is None or (_is_close(old, new) and not (is_other_machine and _RELATIVE.search(entry[3]))):
         return line
     comment = f"; {entry[6]}" if entry[6] else ""
-    former = " ".join(entry[3].split()).replace(", ]", "]").replace("[ ", "[")
+    former = in_one_line(entry[3])
     return f"{entry[1]}{_with_unit(read, old, new)}  # was {former}{comment}"
 
 

@@ -21,12 +21,9 @@ _MIDDLE = (NODES - 1) / 2.0
 
 
 def _hermite() -> tuple[np.ndarray, np.ndarray]:
-    """Return matrices (4, 3) and (4, 4) that give the even and the odd coefficients of `_polynomial`.
-
-    They are multiplied by sums and differences of the values, and of the slopes, at the two inner points (-1/2 and 1/2) and at
-    the two outer points (-3/2 and 3/2). All values are relative to the mean of the two inner values; the sum of the inner
-    values is therefore 0 and is omitted.
-    """
+    """Return matrices (4, 3) and (4, 4) from sums and differences of the values and slopes, at the two inner points and at the
+    two outer ones, to the even and the odd coefficients of `_polynomial`. Values are relative to the mean of the inner ones,
+    whose sum is therefore 0 and is omitted."""
     nodes, even = np.asarray([[0.5], [1.5]]), np.asarray([0, 2, 4, 6])
 
     def inverse(powers: np.ndarray) -> np.ndarray:
@@ -39,11 +36,8 @@ _EVEN, _ODD = _hermite()
 
 
 def _extrapolation() -> tuple[np.ndarray, np.ndarray]:
-    """Return two matrices (2, 8) for extrapolation from the values and slopes of four samples.
-
-    They give the value and the slope of the polynomial through the samples: the first matrix at one step before the first
-    sample, the second matrix at one step after the last sample.
-    """
+    """Return the matrices (2, 8) from the values and slopes of four samples to value and slope of the polynomial through them,
+    one step before the first sample and one step after the last sample."""
     powers = np.arange(2 * NODES)
 
     def rows(positions: np.ndarray) -> np.ndarray:
@@ -101,10 +95,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     share, inner = _extrema_between(x, v)
 
     def maxima(sign: Array) -> tuple[Array, Array, Array]:
-        """Maxima of `sign` times the motion over the first half of the samples, the second half and the step between them.
-
-        Of equal maxima the first is returned.
-        """
+        """First maxima of `sign` times the motion over the first half of the samples, the second half and the step between."""
         samples, between = sign * x, sign * inner
         largest = jnp.maximum(between, samples[:-1])
         spans = (0, half), (half, n), (half - 1, half + 1)
@@ -134,11 +125,8 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
 
 
 def extremum_value(x: Array, v: Array, position: Array) -> Array:
-    """Return the value at an extremum. Its derivatives include the change of the position between samples.
-
-    **Arguments**: x, v (4,): four samples and their slopes as in `locate_extrema`; `position`: that of the extremum, in steps
-    from the first of the four samples.
-    """
+    """Return the value at an extremum, whose derivatives include the change of the `position`, in steps from the first of the
+    four samples x (4,) with the slopes v (4,), see `locate_extrema`."""
     polynomial, s = _polynomial(x, v), position - _MIDDLE
     slope = _derivative(polynomial)
     curved = _at(_derivative(slope), s)
@@ -167,11 +155,8 @@ def between(begin: Sequence[Array], end: Sequence[Array], s: Array) -> tuple[Arr
 
 
 def greatest(values: Array) -> Array:
-    """Return the maximum of numbers (n,), with the derivatives of the largest one.
-
-    The derivatives of `jnp.max` are 0/0 if the compiler recomputes the maximum with another rounding, because none of the
-    numbers then equals it.
-    """
+    """Return the maximum of numbers (n,), with the derivatives of the largest one. Those of `jnp.max` are 0/0 if the compiler
+    recomputes the maximum with another rounding, because none of the numbers then equals it."""
     return values[jnp.argmax(values)]
 
 
@@ -192,10 +177,8 @@ def step_extrema(x: Array, v: Array) -> tuple[Array, Array]:
 
 
 def _cubic_extremum(rise: Array, begin: Array, end: Array) -> tuple[Array, Array]:
-    """Return True where a motion has an extremum between two samples, and its position from 0 to 1 on the cubic polynomial.
-
-    **Arguments**: `rise` of the values, and slopes at the `begin` and at the `end`, times the sampling step.
-    """
+    """Return True where a motion has an extremum between two samples, and its position from 0 to 1 on the cubic polynomial with
+    the `rise` of the values and the slopes `begin` and `end`, times the sampling step."""
     turns = begin * end < 0.0
     bend = 3.0 * rise - 2.0 * begin - end
     root = jnp.sqrt(jnp.where(turns, jnp.abs(bend**2 - 3.0 * (begin + end - 2.0 * rise) * begin), 1.0))
@@ -204,12 +187,8 @@ def _cubic_extremum(rise: Array, begin: Array, end: Array) -> tuple[Array, Array
 
 
 def _extrema_between(x: Array, v: Array) -> tuple[Array, Array]:
-    """Return the position of the extremum in each step between two samples, from 0 to 1, and the value at this position.
-
-    In a step without an extremum the value is that of the first sample. **Arguments**: x, v (n,): samples and slopes.
-
-    **Returns** two arrays (n - 1,).
-    """
+    """Return, for each step between samples x with slopes v (n,), the position of the extremum, from 0 to 1, and the value
+    there (that of the first sample in a step without an extremum), both (n - 1,)."""
     n, rise, begin, end, origin = len(x), x[1:] - x[:-1], v[:-1], v[1:], -0.5
     # A sample beyond each end, on the polynomial of the outermost four. The samples of each step are then slices, which are
     # read several times as fast as samples at given indices.
@@ -235,10 +214,7 @@ def _extrema_between(x: Array, v: Array) -> tuple[Array, Array]:
 
 
 def _polynomial(x: Sequence[Array] | Array, v: Sequence[Array] | Array) -> list[Array]:
-    """Return the 8 coefficients, lowest power first, of the polynomial through four values and slopes.
-
-    The values and slopes are those at -3/2, -1/2, 1/2 and 3/2.
-    """
+    """Return the 8 coefficients, lowest power first, of the polynomial through values and slopes at -3/2, -1/2, 1/2 and 3/2."""
     # Values are relative to the mean of the inner samples, so that a common offset causes no rounding error.
     inner = x[1] + x[2]
     even = x[0] + x[3] - inner, v[2] - v[1], v[3] - v[0]

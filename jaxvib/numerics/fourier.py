@@ -89,27 +89,19 @@ def _synthesis(orders: np.ndarray, theta: np.ndarray) -> np.ndarray:
 
 
 def analyzed(values: Array, matrix: np.ndarray) -> Array:
-    """Return the complex harmonics (..., K) of real values (..., M) at the points.
-
-    **Arguments**: `matrix` (M, 2K): `Grid.analysis` or `deviation_analysis`. A product of real matrices needs half of the
-    operations of a complex product.
-    """
+    """Return the complex harmonics (..., K) of real values (..., M) at the points by the `matrix` (M, 2K) `Grid.analysis` or
+    `deviation_analysis`. A product of real matrices needs half of the operations of a complex product."""
     return jax.lax.complex(*jnp.split(values @ matrix, 2, -1))
 
 
 def synthesized(harmonics: Array, matrix: np.ndarray) -> Array:
-    """Return the values (..., M) at the points from harmonics c (..., K): Re sum_k c_k exp(i k theta_l).
-
-    **Arguments**: `matrix` (2K, M): `Grid.synthesis` or `deviation_synthesis`.
-    """
+    """Return the values (..., M) at the points from harmonics c (..., K): Re sum_k c_k exp(i k theta_l), by the `matrix`
+    (2K, M) `Grid.synthesis` or `deviation_synthesis`."""
     return jnp.concatenate([harmonics.real, harmonics.imag], -1) @ matrix
 
 
 def deviation_analysis(grid: Grid) -> np.ndarray:
-    """Return the matrix (M, 2J) from values of psi to the real parts of its harmonics followed by the imaginary parts.
-
-    See `analyzed`.
-    """
+    """Return the matrix (M, 2J) from values of psi to the real, then the imaginary parts of its harmonics, see `analyzed`."""
     return _analysis(grid.deviation_orders, grid.theta) * np.tile(grid.deviation_weights, 2) / grid.theta.size
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.custom_batching import custom_vmap
+from jaxtyping import PyTree
 from numpy.typing import NDArray
+
+T = TypeVar("T")
 
 _MAX_UNROLLED_EQUATIONS = 8
 """Largest number of equations for which `eliminate` is as fast as a library call for each system of a batch."""
@@ -224,10 +227,8 @@ def _unrolled_solve(a: Array, b: Array) -> Array:
 
 @_unrolled_solve.defjvp
 def _unrolled_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return x and its tangent x', the solution of a x' = b' - a' x.
-
-    Both are computed from the same adjugate, with half the operations of an automatic derivative of `_unrolled_solve`.
-    """
+    """Return x and its tangent x', the solution of a x' = b' - a' x, from one adjugate: half the operations of an automatic
+    derivative."""
     (a, b), (da, db) = primals, tangents
     adjugate, determinant = _adjugate(a)
     x = _times(adjugate, b) / determinant
@@ -286,42 +287,36 @@ def eigenvalues(matrix: Array) -> Array:
     return pair[0]
 
 
-@custom_vmap
-def eigenvalues_in_turn(matrix: Array) -> Array:
-    """Return the complex eigenvalues (n,) of a matrix (n, n), without eigenvectors.
+def _in_turn(function: Callable[[Array], T]) -> Callable[[Array], T]:
+    """Return a function that calls the library for one matrix of a batch after the other, see `solve_in_turn`."""
+    each = custom_vmap(function)
 
-    The library is called for one matrix of a batch after the other, see `solve_in_turn`.
-    """
+    @each.def_vmap
+    def _(size: int, is_mapped: list[bool], matrices: Array) -> tuple[T, PyTree[bool]]:
+        results = jax.lax.map(each, matrices)
+        return results, jax.tree.map(lambda _: True, results)
+
+    return each
+
+
+@_in_turn
+def eigenvalues_in_turn(matrix: Array) -> Array:
+    """Return the complex eigenvalues (n,) of a matrix (n, n), without eigenvectors."""
     return eigenvalues(matrix)
 
 
-@eigenvalues_in_turn.def_vmap
-def _eigenvalues_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tuple[Array, bool]:
-    return jax.lax.map(eigenvalues_in_turn, matrix), True
-
-
-@custom_vmap
+@_in_turn
 def eigenvectors_in_turn(matrix: Array) -> tuple[Array, Array]:
-    """Return the complex eigenvalues (n,) and eigenvectors (n, n) of a matrix (n, n), see `eigenvalues_in_turn`."""
+    """Return the complex eigenvalues (n,) and eigenvectors (n, n) of a matrix (n, n)."""
     values, vectors = jnp.linalg.eig(matrix)
     return values, vectors
 
 
-@eigenvectors_in_turn.def_vmap
-def _eigenvectors_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tuple[tuple[Array, Array], tuple[bool, bool]]:
-    return jax.lax.map(eigenvectors_in_turn, matrix), (True, True)
-
-
-@custom_vmap
+@_in_turn
 def svd_in_turn(matrix: Array) -> tuple[Array, Array, Array]:
-    """Return the singular value decomposition U, s, V^T of a matrix (n, n), see `eigenvalues_in_turn`."""
+    """Return the singular value decomposition U, s, V^T of a matrix (n, n)."""
     left, values, right = jnp.linalg.svd(matrix)
     return left, values, right
-
-
-@svd_in_turn.def_vmap
-def _svd_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tuple[tuple[Array, ...], tuple[bool, ...]]:
-    return jax.lax.map(svd_in_turn, matrix), (True, True, True)
 
 
 def complex_product(matrix: Array, other: Array) -> Array:
@@ -338,11 +333,8 @@ def complex_product(matrix: Array, other: Array) -> Array:
 
 
 def refine_solution(product: Callable[[Array], Array], inverse: Callable[[Array], Array], b: Array, norm: Array) -> Array:
-    """Return x of A x = b, with A x = `product(x)`, an approximate solution `inverse(b)` and the row-sum `norm` of A.
-
-    The solution is corrected by its residual until only rounding errors are left: usually no correction is needed, and there
-    are at most 4.
-    """
+    """Return x of A x = b, with A x = `product(x)`, an approximate solution `inverse(b)` and the row-sum `norm` of A, corrected
+    by its residual, usually 0 and at most 4 times, until only rounding errors are left."""
     eps = jnp.finfo(norm.dtype).eps
 
     def residual(x: Array) -> tuple[Array, Array]:
@@ -377,10 +369,8 @@ def solve_definite(a: Array, b: Array) -> Array:
 
 @_compiled
 def eliminate(a: Array, b: Array) -> Array:
-    """Return x (n,) or (n, m) of a x = b, by elimination with pivots.
-
-    It replaces library calls, which can deadlock for large batches in one program (jaxlib 0.10, two cores).
-    """
+    """Return x (n,) or (n, m) of a x = b, by elimination with pivots, because library calls for large batches in one program
+    can deadlock (jaxlib 0.10, two cores)."""
     n = a.shape[0]
     row = jnp.arange(n)
 

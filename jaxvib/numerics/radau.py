@@ -45,10 +45,8 @@ collocation."""
 
 
 def _forms() -> np.ndarray:
-    """Return the coefficients of the formulas of x_i and x'_i in `transition`, (3 powers of h, 2, stages, stages + 2).
-
-    The last axis contains the coefficients of all k_j, of x and of x'.
-    """
+    """Return the coefficients of the formulas of x_i and x'_i in `transition`, (3 powers of h, 2, stages, stages + 2), the last
+    axis for all k_j, x and x'."""
     forms, ones, stages = np.zeros((3, 2, _STAGES, _STAGES + 2)), np.ones(_STAGES), slice(0, _STAGES)
     forms[2, 0, :, stages], forms[0, 0, :, -2], forms[1, 0, :, -1] = _WEIGHTS @ _WEIGHTS, ones, NODES
     forms[1, 1, :, stages], forms[0, 1, :, -1] = _WEIGHTS, ones
@@ -97,11 +95,8 @@ def flow(
     dtype: jnp.dtype,
     max_steps: int | None = None,
 ) -> Array:
-    """Return the transition matrix (2 m, 2 m) of (x, x') over a `duration` of x'' = P(t) x + R(t) x', in equal steps.
-
-    **Arguments**: `slopes(t)`: [P, R] (m, 2 m); `size` m; `duration`, s; `steps`: their number, a Python number or a scalar
-    array; `max_steps`: the `limit` of `repeat`.
-    """
+    """Return the transition matrix (2 m, 2 m) of (x, x') over a `duration`, s, of x'' = P(t) x + R(t) x', in equal `steps`,
+    with [P, R] = `slopes(t)` (m, 2 m) and m = `size`; `max_steps`: the `limit` of `repeat`."""
     h = jnp.asarray(duration / steps, dtype)
 
     def step(k: Array, over: Array) -> Array:

@@ -102,11 +102,8 @@ def next_share(
     before: tuple[Numbers, Numbers],
     tolerance: float | np.floating,
 ) -> Numbers:
-    """Return the next point of the search for a root, as a fraction of the way from `newest` to `other`.
-
-    **Arguments**: `xp`: the library, numpy or jax.numpy; `newest`, `other`: ends (x, f(x)) of the bracket, numbers or arrays;
-    `before`: the point that was removed from the bracket last; `tolerance` of x, relative.
-    """
+    """Return the next point of the search for a root, as a fraction of the way from `newest` to `other`, the ends (x, f(x)) of
+    the bracket. `xp`: numpy or jax.numpy; `before`: the point that was removed last; `tolerance` of x, relative."""
     (a, fa), (b, fb), (c, fc) = newest, other, before
     xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
     safe = (1.0 - xp.sqrt(1.0 - xi) < phi) & (phi < xp.sqrt(xi))
@@ -116,9 +113,6 @@ def next_share(
 
 
 def _nonzero(slope: Array) -> Array:
-    """Replace a slope of 0 by a tiny one, which prevents an overflow.
-
-    At a fold the slope is 0 and the derivative does not exist; the status of the result states this.
-    """
+    """Replace a slope of 0 by a tiny one, which prevents an overflow at a fold, where no derivative exists."""
     tiny = jnp.finfo(slope.dtype).tiny ** 0.5
     return jnp.where(jnp.abs(slope) < tiny, tiny, slope)

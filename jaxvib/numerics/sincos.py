@@ -34,10 +34,8 @@ _TERMS = {np.dtype(np.float64): 8, np.dtype(np.float32): 5}
 
 
 def _parts(dtype: np.dtype) -> tuple[float, float, float]:
-    """Return pi as a sum of three numbers.
-
-    The first two have 22 unused bits (single precision: 11), so that their products with numbers up to 2^22 (2^11) are exact.
-    """
+    """Return pi as a sum of three numbers, the first two with 22 unused bits (single precision: 11), so that their products
+    with numbers up to 2^22 (2^11) are exact."""
     digits, spare = (53, 22) if dtype == np.float64 else (24, 11)
     parts, rest = [], _PI
     for _ in range(2):
@@ -50,11 +48,8 @@ def _parts(dtype: np.dtype) -> tuple[float, float, float]:
 
 @functools.cache
 def _polynomial(terms: int) -> tuple[float, ...]:
-    """Return the coefficients of P(z), lowest power first, with sin r = r + r z P(z), z = r^2 up to (pi/2)^2.
-
-    The highest powers of Taylor's series are removed one after another by Chebyshev polynomials (economization). The error
-    exceeds that of the best polynomial by a few percent.
-    """
+    """Return the coefficients of P(z), lowest power first, with sin r = r + r z P(z), z = r^2 up to (pi/2)^2: Taylor's series
+    economized by Chebyshev polynomials, whose error exceeds that of the best polynomial by a few percent."""
     scale = 2 / (_PI / 2) ** 2
     chebyshev = [[Fraction(1)], [Fraction(-1), scale]]
     series = [Fraction((-1) ** k, math.factorial(2 * k + 1)) for k in range(1, terms + 8)]

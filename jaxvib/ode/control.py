@@ -1,5 +1,6 @@
 """Step-size controllers for diffrax."""
 
+import functools
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -114,10 +115,8 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
             size = self.tolerance * (unit + relative * jnp.maximum(jnp.abs(a), jnp.abs(b)))
             return jnp.max(jnp.abs(error) / size)
 
-        ratios = jax.tree.leaves(jax.tree.map(ratio, y_error, y0, y1_candidate, self.unit, self.relative))
-        e = ratios[0]
-        for other in ratios[1:]:
-            e = jnp.maximum(e, other)
+        ratios = jax.tree.map(ratio, y_error, y0, y1_candidate, self.unit, self.relative)
+        e = functools.reduce(jnp.maximum, jax.tree.leaves(ratios))
         e = jax.lax.stop_gradient(jnp.clip(jnp.where(jnp.isnan(e), jnp.inf, e), 1e-8, 1e8))
         root = jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(e)))))
         accept = e <= 1.0
@@ -137,10 +136,8 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
 def step_success(
     accept: BoolScalarLike, start: RealScalarLike, last_end: RealScalarLike, end: RealScalarLike
 ) -> diffrax.RESULTS:
-    """Return the outcome of a step that ended at `last_end`.
-
-    After a rejected step, the next step from `start` to `end` must be shorter: `end` must lie between `start` and `last_end`.
-    """
+    """Return the outcome of a step that ended at `last_end`. After a rejected step, `end` of the next step must lie between its
+    `start` and `last_end`."""
     shorter = (end > start) & (end < last_end)
     return diffrax.RESULTS.where(accept | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)
 

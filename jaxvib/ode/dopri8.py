@@ -77,20 +77,14 @@ def dense_stages(stages: Array) -> Array:
 
 
 def linear_combination(weights: Array, stages: Array) -> Array:
-    """Return sum_j weights_j stages_j; weights (..., stages), stages (stages, ...).
-
-    XLA computes a matrix product once and vectorizes it. An unrolled sum would be recomputed, with its weights, for each use of
-    one of its entries.
-    """
+    """Return sum_j weights_j stages_j; weights (..., stages), stages (stages, ...). XLA computes a matrix product once; it
+    would repeat an unrolled sum, with its weights, for each use of an entry."""
     return jnp.tensordot(weights.astype(stages.dtype), stages, 1, precision="highest")
 
 
 class Dopri8Interpolation(StepInterpolation):
-    """Motion within a step: y0 + (t - t0) sum_j w_j(s) k_j with the fraction s of the step and the rates k_j of the stages.
-
-    The polynomials w_j are those of diffrax. **Attributes**: `y0`, the state at the start of the step; `stages` (10, n), see
-    `dense_stages` and `ravel`.
-    """
+    """Motion within a step: y0 + (t - t0) sum_j w_j(s) k_j with the fraction s of the step, the rates k_j of the `stages`
+    (10, n), see `dense_stages`, and the polynomials w_j of diffrax."""
 
     y0: Y
     stages: Array

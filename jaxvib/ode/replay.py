@@ -146,10 +146,8 @@ _reverse_tangents = primitive(
 
 
 def forward_only(outputs: T, field: str, problem: str) -> T:
-    """Return the outputs; their reverse derivatives raise `InputError`, where JAX would raise an error about its loops.
-
-    The values must be the last ones of a computation that has no reverse derivative, because JAX transposes these first.
-    """
+    """Return the outputs; their reverse derivatives raise `InputError` instead of JAX's error about loops. They must be the
+    last values of a computation without a reverse derivative, because JAX transposes these first."""
     if not CAN_DEFINE_PRIMITIVES:
         return outputs
     numbers, others = eqx.partition(outputs, eqx.is_inexact_array)
@@ -220,11 +218,7 @@ def _with_replay(inputs: _Inputs, controller: diffrax.AbstractStepSizeController
 
 
 class _Record(NamedTuple):
-    """Record of a run.
-
-    **Attributes**: `steps`: its number of steps; `ends` (max_steps,): the end of each step, s; `states`: the states after every
-    n-th step, see `_spacing`.
-    """
+    """Number of `steps` of a run, their `ends` (max_steps,), s, and the `states` after every n-th step, see `_spacing`."""
 
     steps: Array
     ends: Array
@@ -232,12 +226,8 @@ class _Record(NamedTuple):
 
 
 class _Slopes(NamedTuple):
-    """State of the backward pass.
-
-    **Attributes**: derivatives with respect to the `state`, the `numbers` (arrays of arguments and equations), the `end`, the
-    `first_step`, the `jumps` of the field and the saved `times`; `ahead`: index of the last saved time that the pass has not
-    reached yet.
-    """
+    """State of the backward pass: derivatives with respect to the fields, of which `numbers` are the arrays of arguments and
+    equations; `ahead`: index of the last saved time that the pass has not reached yet."""
 
     state: Y
     numbers: PyTree[Array | None]
@@ -298,9 +288,8 @@ def _backward(
 class _BackwardPass:
     """Backward pass over the steps of a run, from the last one to the first.
 
-    **Attributes**: the `record` of the run, with one state for each `every` steps, and the initial state `y0`; `solver` and
-    `controller`; the `numbers` of arguments and equations that are differentiated, and the `others`; `saved`: the derivatives
-    with respect to saved states.
+    **Attributes**: the `record`, with one state for each `every` steps; the `numbers` of arguments and equations that are
+    differentiated, and the `others`; `saved`: the derivatives with respect to saved states.
     """
 
     record: _Record
@@ -431,11 +420,8 @@ def _with_tolerances(solver: diffrax.AbstractSolver, controller: diffrax.Abstrac
 
 
 def _share_of_end(controller: diffrax.AbstractStepSizeController, count: Array, j: Array) -> Array:
-    """Return the derivative of the start of step j of `count` with respect to the end of the run.
-
-    With constant steps, the start of step j > 1 is j/count of the end (see `diffrax.ConstantStepSize`), and the end of the
-    first step is the `first_step`. The steps of an adaptive controller do not depend on the end, except for the last one.
-    """
+    """Return the derivative of the start of step j of `count` with respect to the end of the run: j/count for j > 1 with
+    constant steps, whose first one ends at `first_step`; with adaptive steps only the last one depends on the end."""
     if isinstance(controller, diffrax.ConstantStepSize):
         return jnp.where((j > 1) | (count == 1), j / count, 0.0)
     return jnp.where(j == count, 1.0, 0.0)
@@ -457,11 +443,8 @@ def _jump_times(controller: diffrax.AbstractStepSizeController) -> Array | None:
 
 
 class _Saved(NamedTuple):
-    """Derivatives with respect to all saved states.
-
-    **Attributes**: `times`, ascending, and `states`: the derivatives at these times; `last`: the derivative with respect to the
-    state at the end; `places`: index of each time in the concatenated lists of times.
-    """
+    """Derivatives with respect to the saved `states` at ascending `times`, and to the `last` state; `places`: index of each
+    time in the concatenated lists of times."""
 
     times: Array
     states: Y

@@ -52,12 +52,8 @@ Linearization: TypeAlias = tuple[Callable[[Array], Callable[[Array], Array]], Ar
 
 
 class _Interpolation(StepInterpolation):
-    """Continuous extension, of order 3, of the method: a cubic in the fraction s of the step with `coefficients` c (2, n).
-
-        y = (1 - s) y0 + s (y1 + (1 - s) (c_0 + s c_1))
-
-    The interpolation does not use the rates at the ends of a step, because these are not accurate for stiff equations.
-    """
+    """Cubic (1 - s) y0 + s (y1 + (1 - s) (c_0 + s c_1)) in the fraction s of the step, of order 3, with `coefficients` c (2,
+    n), without the rates at the ends of the step, which are inaccurate for stiff equations."""
 
     y0: Array
     y1: Array
@@ -152,10 +148,7 @@ def _dense_linearization(terms: Terms, t: RealScalarLike, y: Array, args: Args) 
 
 
 def _jacobian(terms: Terms, t: RealScalarLike, y: Array, args: Args) -> tuple[Array, Array]:
-    """Return df/dy (n, n) and df/dt (n,), by forward mode with the tangents along a last axis.
-
-    This axis is padded to a multiple of the CPU's vector width.
-    """
+    """Return df/dy (n, n) and df/dt (n,), by forward mode with the tangents along a last axis, padded to whole CPU vectors."""
     n = y.shape[0]
     directions = jnp.eye(n + 1, -(-(n + 1) // VECTOR) * VECTOR, dtype=y.dtype)
 

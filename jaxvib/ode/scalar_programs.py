@@ -30,11 +30,8 @@ _MAX_RECOMPUTED = 8
 
 
 def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
-    """Return the same program without repeated operations and without operations whose results are not used.
-
-    Equations from automatic differentiation contain the same operations many times. A third to a half of all operations are
-    removed.
-    """
+    """Return the same program without repeated and unused operations, a third to a half of those that automatic differentiation
+    creates."""
     first: dict[Var, Var | Literal] = {}
     done: dict[tuple[object, ...], JaxprEqn] = {}
     kept: list[tuple[JaxprEqn, list[Var | Literal]]] = []
@@ -131,11 +128,8 @@ def _variables(atoms: Iterable[Var | Literal]) -> list[Var]:
 
 
 def substituted(program: ClosedJaxpr, chosen: Callable[[JaxprEqn, Atoms], Replacement | None]) -> ClosedJaxpr:
-    """Return the program in which some operations are replaced by other operations.
-
-    **Arguments**: `chosen`: function of an operation and its inputs. It returns the operations that replace this operation, and
-    the variable of their result, or None to keep the operation. The operation must have one result.
-    """
+    """Return the program in which operations with one result are replaced: `chosen`, a function of an operation and its inputs,
+    returns the operations in its place and the variable of their result, or None to keep it."""
     instead: dict[int, Var] = {}
     equations: list[tuple[JaxprEqn, Atoms]] = []
 

@@ -171,10 +171,7 @@ def _by_primitive(primitive: Primitive) -> Callable[..., Scalar]:
 
 
 def elementwise(rule: Callable[..., Scalar]) -> Rule:
-    """Return the rule for arrays that applies a rule for scalars to each entry.
-
-    An argument of shape () is used for all entries, which `clamp` requires.
-    """
+    """Return the rule for arrays that applies a rule for scalars to each entry; an argument of shape () applies to all."""
 
     def apply(*given: Scalars, **params: object) -> Scalars:
         whole = np.broadcast_arrays(*given) if len(given) > 1 else list(given)
@@ -256,10 +253,7 @@ def _pad(x: Scalars, value: Scalars, *, padding_config: Sequence[tuple[int, int,
 
 
 def primitive_of(function: _Function, *arguments: ArrayLike) -> Primitive:
-    """Return the primitive of a public function of JAX that consists of a single primitive.
-
-    **Raises** `NotScalarizable` if the function consists of several primitives, or of none.
-    """
+    """Return the only primitive of a public function of JAX. **Raises** `NotScalarizable` if it has several or none."""
     equations = jax.make_jaxpr(function)(*arguments).jaxpr.eqns
     if len(equations) != 1:
         raise NotScalarizable(f"{function} is made of {len(equations)} operations")
@@ -274,11 +268,8 @@ def inlined() -> tuple[Primitive, ...]:
 
 @functools.cache
 def rules() -> dict[Primitive, Rule]:
-    """The rule of each primitive that has one; primitives are found by tracing public functions, not by their names.
-
-    A function that consists of several operations in another version of JAX has no rule. Programs with this function are not
-    rewritten on scalars.
-    """
+    """The rule of each primitive that has one; primitives are found by tracing public functions, not by their names. A function
+    of several primitives in another version of JAX has no rule, and its programs stay on arrays."""
     x, v, yes = np.float32(1.0), np.ones((2, 2), np.float32), np.True_
     z = np.complex64(1.0)
     maps: list[tuple[_Function, tuple[ArrayLike, ...], Callable[..., Scalar]]] = [

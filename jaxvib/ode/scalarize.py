@@ -118,11 +118,8 @@ def scalar_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Ar
 
 
 def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr | None:
-    """Return `scalar_program`, or None for a program that has no such form.
-
-    There is no such form if an operation has no rule on scalars, if there are too many operations, or if this version of JAX
-    does not give access to its programs.
-    """
+    """Return `scalar_program`, or None if an operation has no rule on scalars, if there are too many operations, or if this
+    version of JAX does not give access to its programs."""
     if not HAS_JAXPRS:
         return None
     try:
@@ -133,10 +130,8 @@ def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTre
 
 
 def arrays_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr | None:
-    """Trace `function` on arrays, with the sines and cosines of `jaxvib.numerics.sincos`.
-
-    **Returns** None if this version of JAX does not give access to its programs.
-    """
+    """Trace `function` on arrays, with the sines and cosines of `jaxvib.numerics.sincos`; return None if this version of JAX
+    does not give access to its programs."""
     if not HAS_JAXPRS:
         return None
     known: dict[Var, list[Var]] = {}

@@ -51,10 +51,8 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
 def write_table(
     table: Mapping[str, np.ndarray], path: str | Path, *, decimal_comma: bool = False, unique: bool = False
 ) -> Path:
-    """Write columns, given by their headers, to a CSV file.
-
-    With `unique`, equal rows that follow each other are written once. They occur at points where two pieces of a curve meet.
-    """
+    """Write columns, given by their headers, to a CSV file. With `unique`, equal rows in succession, such as the common end of
+    two pieces of a curve, are written once."""
     path = Path(path)
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n", delimiter=";" if decimal_comma else ",")
@@ -65,11 +63,8 @@ def write_table(
 
 
 def main_axis(result: eqx.Module) -> str:
-    """Return the name of the most frequent first axis of the arrays of a result; "" if no array has an axis.
-
-    If this axis has only one point (such as the axis of segments of a single spectrum), the name of the longest axis with
-    coordinates is returned instead (such as the axis of frequencies), if there is one.
-    """
+    """Return the name of the most frequent first axis of the arrays of a result, or, if this axis has only one point (segments
+    of a single spectrum), that of the longest axis with coordinates (frequencies); "" without axes."""
     arrays = [(name, axes, values) for name, axes, values, _ in columns(result) if axes and values.ndim == len(axes)]
     counts = collections.Counter(axes[0] for _, axes, _ in arrays)
     main = max(counts, key=lambda axis: counts[axis], default="")
@@ -122,12 +117,8 @@ def _label(labels: Labels, axis: str, k: int, n: int) -> str:
 
 
 def _own_unit(unit: str, axes: tuple[str, ...], place: tuple[int, ...], units: Sequence[str]) -> str:
-    """Return the unit of a column; a `unit` such as "m or rad" becomes that of the coordinate of the column.
-
-    In a table along the coordinates a column has their common unit; if their units differ, `unit` is returned.
-
-    **Arguments**: `place`: indices of the column along the `axes` after the first; `units` of the coordinates.
-    """
+    """Return the unit of a column: a `unit` such as "m or rad" becomes that of the column's coordinate, or of all coordinates
+    in a table along them, unless they differ. `place`: indices of the column along the `axes` after the first."""
     is_of_one = "coordinate" in axes[1:] and len(units) > 0
     return one_unit(unit, [units[place[axes.index("coordinate") - 1]]] if is_of_one else units)
 

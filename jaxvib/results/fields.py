@@ -90,11 +90,8 @@ def part(*axes: str, prefix: str = "") -> Part:
 
 
 def as_text(write: Callable[[T], str], read: Callable[[str], T], labels: Callable[[T], Labels]) -> AsText:
-    """Return the metadata of a field that is stored as text in files and plain data.
-
-    **Arguments**: `write` and `read`: conversion to the text and from it; `labels`: function of the field's value that returns
-    labels of axes.
-    """
+    """Return the metadata of a field that is stored as text in files and plain data, by `write` to the text and `read` from it;
+    `labels`: function from the field's value to labels of axes."""
     return {"write": write, "read": read, "labels": labels}
 
 

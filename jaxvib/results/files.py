@@ -210,10 +210,7 @@ def _class(kind: type, base: type) -> str:
 
 
 def _decoded(value: Any, arrays: Mapping[str, np.ndarray], read: Callable[[str], object] | None = None) -> Any:
-    """Return the value that `_encoded` stored as `value`.
-
-    **Arguments**: `read`: the function `read` of `as_text`, for a field that is stored as text.
-    """
+    """Return the value that `_encoded` stored as `value`; `read` as in `as_text`, for a field that is stored as text."""
     if isinstance(value, str) and CONTROL.search(value):
         raise ValueError("control characters")
     if isinstance(value, list):
@@ -262,11 +259,8 @@ def _rebuilt(kind: type, fields: Mapping[str, Plain], arrays: Mapping[str, np.nd
 
 
 def _class_named(name: str, base: type) -> Any:
-    """Return the class with a name in a file, from its module or, if the class has moved, from the public names of the package.
-
-    **Raises** `ValueError` for a class that neither package defines, or that is not of the kind of `base`: a named tuple for
-    `tuple`, a dataclass for `object`, a status for `equinox.Enumeration`.
-    """
+    """Return the class with a name in a file, from its module or, if it has moved, from the public names of the package.
+    **Raises** `ValueError` unless one of our packages defines it and it is a `base`: a named tuple, a dataclass or a status."""
     module, _, inner = name.partition(":")
     if module.split(".")[0] not in _PACKAGES or not inner.isidentifier():
         raise ValueError(f"{name} is not a class of a result")
@@ -274,11 +268,8 @@ def _class_named(name: str, base: type) -> Any:
         found = getattr(importlib.import_module(module), inner)
     except (ImportError, AttributeError):
         found = getattr(sys.modules[module.split(".")[0]], inner)
-    ours = isinstance(found, type) and issubclass(found, base) and found.__module__.split(".")[0] in _PACKAGES
-    if (
-        not ours
-        or (base is tuple and not hasattr(found, "_fields"))
-        or (base is object and not dataclasses.is_dataclass(found))
-    ):
+    is_ours = isinstance(found, type) and issubclass(found, base) and found.__module__.split(".")[0] in _PACKAGES
+    is_kind = {tuple: hasattr(found, "_fields"), object: dataclasses.is_dataclass(found)}.get(base, True)
+    if not (is_ours and is_kind):
         raise ValueError(f"{name} is not a class of a result")
     return found

@@ -38,10 +38,7 @@ def member(enumeration: type[Status], names: str | np.ndarray) -> Status:
 
 
 def status_names(status: eqx.Enumeration) -> np.ndarray:
-    """Return the names of the members of a status of any shape, as an array of texts of the same shape.
-
-    **Raises** `TypeError` for a traced status, which has no value.
-    """
+    """Return the names of the members of a status as an array of the same shape. **Raises** `TypeError` for a traced status."""
     (numbers,) = jax.tree.leaves(status)
     try:
         numbers = np.asarray(numbers)

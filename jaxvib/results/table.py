@@ -153,10 +153,7 @@ def read_table(path: str | Path, needs: str) -> TextTable:
 
 
 def is_number(cell: str, mark: str | None) -> bool:
-    """Return True for the text of a finite number.
-
-    `mark` is the character between columns; if it is not a comma, the number may have a decimal comma.
-    """
+    """Return True for the text of a finite number, which may have a decimal comma unless `mark`, between columns, is one."""
     try:
         # Python would read "1_000".
         return "_" not in cell and bool(np.isfinite(float(cell if mark == "," else cell.replace(",", "."))))

@@ -82,10 +82,7 @@ def program_folder() -> Path | None:
 
 @contextlib.contextmanager
 def compiled_anew() -> Iterator[None]:
-    """Disable both caches within the context, in order to measure compile times.
-
-    Only programs that this process has not used before are compiled; the others are still in memory.
-    """
+    """Disable both caches within the context, to measure the compile times of programs that this process has not used yet."""
     folder, enabled = program_folder(), bool(jax_option("jax_enable_compilation_cache"))
     set_program_folder(None)
     jax.config.update("jax_enable_compilation_cache", False)

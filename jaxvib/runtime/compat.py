@@ -52,10 +52,8 @@ equations as operations on scalars, and integrates them on arrays, which is slow
 def rewritten(
     program: ClosedJaxpr, equations: Sequence[tuple[JaxprEqn, list[Var | Literal]]], results: list[Var | Literal]
 ) -> ClosedJaxpr:
-    """Return the `program` with its operations replaced by `equations` (each with new inputs) and its results by `results`.
-
-    The program is returned unchanged if JAX does not allow the replacement.
-    """
+    """Return the `program` with its operations replaced by `equations` (each with new inputs) and its results by `results`; the
+    same program if JAX does not allow it."""
     try:
         changed = [equation.replace(invars=inputs) for equation, inputs in equations]
         return program.replace(jaxpr=program.jaxpr.replace(eqns=changed, outvars=results))
@@ -103,30 +101,23 @@ def value_of(number: object) -> object:
 
 
 def evaluating() -> contextlib.AbstractContextManager[None]:
-    """Evaluate operations on concrete numbers immediately, even inside a transformation.
-
-    Without JAX's private context manager these operations are traced.
-    """
+    """Evaluate operations on concrete numbers immediately, even inside a transformation, unless JAX lacks the private
+    context."""
     context = getattr(getattr(jax, "core", None), "eval_context", contextlib.nullcontext)
     return context()
 
 
 @contextlib.contextmanager
 def without_source_locations() -> Iterator[None]:
-    """Trace without recording the source location of each operation.
-
-    This saves a part of the time until a program is compiled. If JAX lacks the private option, nothing is changed.
-    """
+    """Trace without recording the source location of each operation, which saves time, if JAX has the private option."""
     limit = getattr(sys.modules.get("jax._src.config"), "traceback_in_locations_limit", None)
     with contextlib.nullcontext() if limit is None else limit(0):
         yield
 
 
 def backend_started() -> bool:
-    """Return True if JAX has started a backend, after which compiler flags have no effect; False if that is unknown.
-
-    A private attribute is necessary, because the public functions of JAX start a backend.
-    """
+    """Return True if JAX has started a backend, after which compiler flags have no effect; False if that is unknown. The public
+    functions of JAX would start a backend."""
     return bool(getattr(sys.modules.get("jax._src.xla_bridge"), "_backends", None))
 
 
@@ -320,10 +311,7 @@ def ulps_below(x: Array, number: int) -> Array:
 
 
 def enumeration_of(item: object) -> type[eqx.Enumeration]:
-    """Return the `equinox.Enumeration` of a member or an array of members.
-
-    If Equinox lacks the attribute, the name of the enumeration is read from the representation.
-    """
+    """Return the `equinox.Enumeration` of members, by the name in their representation if Equinox lacks the attribute."""
     enumeration = getattr(item, "_enumeration", None)
     if enumeration is None:
         module, _, name = repr(item).split("<")[0].rpartition(".")
@@ -332,10 +320,7 @@ def enumeration_of(item: object) -> type[eqx.Enumeration]:
 
 
 def enumeration_names(enumeration: type[eqx.Enumeration]) -> tuple[str, ...]:
-    """Return the names of the members in the order of their numbers.
-
-    If Equinox lacks its table of names, they are read from the source of the enumeration.
-    """
+    """Return the names of the members in the order of their numbers, from the source if Equinox lacks its table of names."""
     members = getattr(enumeration, "_name_to_item", None)
     if members is not None:
         return tuple(members)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
+import operator
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import TypeVar
@@ -88,12 +89,7 @@ def in_chunks(
     The last chunk is padded with copies of the last case. Under a JAX transformation the chunks are computed one after another
     within the program.
 
-    **Arguments**
-
-    - `size`: number of cases in a chunk
-    - `function`: function of trees of arrays (size, ...) and of the `shared` values
-    - `cases`: trees of arrays (n, ...)
-    - `shared`: values that are the same for all cases
+    **Arguments**: `function` of trees of arrays (size, ...) and of the `shared` values; `cases`: trees of arrays (n, ...).
 
     **Returns** the tree of the function's results with NumPy arrays (n, ...), or with JAX arrays under a transformation.
 
@@ -169,20 +165,13 @@ def in_background(*tasks: Callable[[], object]) -> None:
     `task = lambda: integrate.prepare(...)`. A later call of the `cached` function waits for its program, and raises the error
     if there was one.
     """
-
-    def run(task: Callable[[], object]) -> None:
-        task()
-
-    with_options = _same_options(run)
+    with_options = _same_options(operator.call)
     for task in tasks:
         _threads().submit(with_options, task, None)
 
 
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
-    """Return the pool of threads other than the caller's.
-
-    The pool is reused, because starting threads takes longer than submitting a run. Callers cancel tasks that have not begun
-    instead of waiting for them; therefore a task may itself use threads.
-    """
+    """Return the pool of threads other than the caller's, which is reused because starting threads takes longer than submitting
+    a run. Callers cancel tasks that have not begun instead of waiting; therefore a task may itself use threads."""
     return ThreadPoolExecutor(max(64, cores()))

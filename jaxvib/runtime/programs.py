@@ -72,10 +72,8 @@ class CachedFunction(Generic[P, T]):
         return self._transformed(tracers, arrays_on_device(leaves), treedef, args, kwargs)
 
     def is_ready(self, *args: P.args, **kwargs: P.kwargs) -> bool:
-        """Return True if a call does not have to load or compile a stored program.
-
-        The program is in memory already, or the call uses none, because it cannot be stored or an argument is traced.
-        """
+        """Return True if a call does not have to load or compile a stored program: the program is in memory already, or the
+        call uses none, because it cannot be stored or an argument is traced."""
         leaves, treedef = jax.tree.flatten((args, kwargs))
         return any(map(traced, leaves)) or self.stored.is_ready(leaves, treedef)
 
@@ -101,10 +99,7 @@ def _is_simple(tracer: object) -> bool:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class _CallSignature:
-    """Call of a cached function.
-
-    **Attributes**: the `function`; its `arguments` with slots in place of arrays; `outputs`: the structure of the last result.
-    """
+    """Call of a cached `function`: its `arguments` with slots in place of arrays; `outputs`: structure of the last result."""
 
     function: CachedFunction
     arguments: Skeleton
@@ -157,10 +152,8 @@ def _is_none(x: object) -> bool:
 def _differentiable(
     call: _CallSignature, active: Sequence[bool], arrays: Sequence[Array]
 ) -> tuple[Callable[..., tuple[list[Array], list[Array]]], list[Array]]:
-    """Return a function of the active arrays, and these arrays.
-
-    The function returns the floating-point outputs and, as auxiliary data, all outputs.
-    """
+    """Return a function from the active arrays to the floating-point outputs and, as auxiliary data, all outputs; and these
+    arrays."""
 
     def function(*active_arrays: Array) -> tuple[list[Array], list[Array]]:
         outputs = call.split(call(_replaced(active, arrays, active_arrays)))

@@ -124,10 +124,7 @@ class StoredFunction(Generic[T]):
         return self._look_up(leaves, treedef)[1] is not _UNKNOWN
 
     def _look_up(self, leaves: Sequence[object], treedef: Hashable) -> tuple[Any, _Program | None]:
-        """Return the key of a call and its program in memory.
-
-        The program is `_UNKNOWN` if it is not in memory, and None if `jitted` has to compile it.
-        """
+        """Return the key of a call and its program: `_UNKNOWN` if not in memory, None if `jitted` has to compile it."""
         if is_debugging():
             return (), None
         call = (program_folder(), treedef, tuple(map(leaf_key, leaves)), _sharding_of(leaves), _options())
@@ -221,11 +218,8 @@ def _skeleton(structure: Description) -> Skeleton:
 
 @dataclasses.dataclass
 class _Program:
-    """Function of all arrays of the arguments, compiled by `jax.jit`.
-
-    **Attributes**: `run`; `result`: the structure of the result; `size` of the stored form, bytes; `used`: a counter that
-    orders programs by their last use.
-    """
+    """Function `run` of all arrays of the arguments, compiled by `jax.jit`; `result`: structure of the result; `size` of the
+    stored form, bytes; `used`: a counter that orders programs by their last use."""
 
     run: Callable[..., list[Array]]
     result: Skeleton
@@ -273,10 +267,8 @@ _UNKNOWN = _Program(lambda *_: [], Skeleton(()))
 
 
 def _evict_least_recently_used() -> None:
-    """Free the least recently used programs beyond `MAX_PROGRAMS_IN_MEMORY` and `MAX_PROGRAM_MEMORY`.
-
-    The most recently used program is never freed, even if it exceeds the limit alone.
-    """
+    """Free the least recently used programs beyond `MAX_PROGRAMS_IN_MEMORY` and `MAX_PROGRAM_MEMORY`, never the last one
+    used."""
     with _functions_lock:
         functions = list(_functions)
     programs = [

@@ -73,10 +73,8 @@ class Skeleton:
 
 
 def leaf_key(leaf: Any) -> Hashable:
-    """Return the part of a leaf on which a program depends.
-
-    It is the abstract value of an array (shape, dtype, weak type), otherwise the leaf itself with its Python type.
-    """
+    """Return the part of a leaf on which a program depends: the shape, dtype and weak type of an array, otherwise the leaf
+    itself with its Python type."""
     if isinstance(leaf, (jax.Array, np.ndarray, np.generic)):
         return jax.typeof(leaf)
     return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 equals -0.0, but their programs differ

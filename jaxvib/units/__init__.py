@@ -55,10 +55,7 @@ _COLLECTED_CONDITIONS: contextvars.ContextVar[list[Array] | None] = contextvars.
 
 @contextlib.contextmanager
 def conditions_of_traced_values() -> Iterator[list[Array]]:
-    """Collect conditions instead of checking traced values while parts of a scene are built.
-
-    The yielded list receives a traced Boolean for each traced value, True if the value is allowed.
-    """
+    """Collect in the yielded list a Boolean for each traced value, True if it is allowed, while parts of a scene are built."""
     conditions: list[Array] = []
     token = _COLLECTED_CONDITIONS.set(conditions)
     try:
@@ -116,11 +113,8 @@ def number(
 
 
 def known_number(value: Number, unit: str, field: str, *, low: float = -math.inf, open_low: bool = False) -> Any:
-    """Return one number as `number` does; a number that is not a JAX array is returned as a NumPy array.
-
-    A compiled program that is called with a NumPy array copies this array to the device. A separate copy before the call takes
-    ten times as long.
-    """
+    """Return one number as `number` does, but as a NumPy array unless it is a JAX array: a compiled program copies it to the
+    device ten times as fast as a separate copy before the call."""
     return _number(value, unit, field, Bounds(low, open_low))
 
 
@@ -255,11 +249,8 @@ def random_numbers(seed: object) -> np.random.Generator:
 
 
 def validate_tolerance(value: float, name: str, dtype: np.dtype, roundings: float) -> float:
-    """Return a tolerance or an accuracy, which must be less than 1 and at least `roundings` times the machine epsilon of
-    `dtype`.
-
-    **Raises** `InputError` for other values.
-    """
+    """Return a tolerance or an accuracy. **Raises** `InputError` unless it is less than 1 and at least `roundings` times the
+    machine epsilon of `dtype`."""
     precision = float(jnp.finfo(dtype).eps)
     is_python_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not (is_python_number and roundings * precision <= value < 1.0):

@@ -285,10 +285,8 @@ def _quantity(magnitude: float, written: str, value: str, unit: str | None, fiel
 
 
 def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
-    """Return the magnitude in `unit` of a pint quantity that the user wrote as `text`.
-
-    **Raises** `InputError` for another dimension, and for 1/s without an angle if `unit` is that of a speed.
-    """
+    """Return the magnitude in `unit` of a pint quantity that the user wrote as `text`. **Raises** `InputError` for another
+    dimension, and for 1/s without an angle if `unit` is that of a speed."""
     import pint
 
     if not hasattr(given, "units"):  # a quantity of another library
