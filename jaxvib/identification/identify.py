@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -12,8 +13,10 @@ import numpy as np
 from jaxvib.boundary import call_user, is_real, validated
 from jaxvib.display import Drawn, Onto
 from jaxvib.errors import ComputationError, InputError, quoted
+from jaxvib.identification.alternatives.clocks import clock_notes
+from jaxvib.identification.alternatives.descriptions import description_notes
+from jaxvib.identification.alternatives.laws import law_notes
 from jaxvib.identification.checks import FitStatus, coverage_notes, resembles, status_of
-from jaxvib.identification.descriptions import description_notes
 from jaxvib.identification.directions import (
     Direction,
     combined_information,
@@ -268,6 +271,9 @@ def identify(
     fitted = fit_with_torques(problem, starts)
     fitted = _near_first_values(scene, problem, fitted)
     found = _interpret(scene, problem, fitted)
+    if found.status_name == "patterned":
+        notes = clock_notes(fitted) or law_notes(fitted, found.scene, runs, unknown, known or {})
+        found = dataclasses.replace(found, notes=(*notes, *found.notes))
     if throw and not resembles(fitted):
         raise ComputationError(found.status_name, "; ".join([found.message, *found.notes]))
     return found

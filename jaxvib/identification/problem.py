@@ -24,7 +24,7 @@ from jaxvib.identification.response import BLOCK, SEGMENT, Samples, Unknowns, ro
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.supports import FrictionSupport, Stop
-from jaxvib.machine.effects.terms import GravityField, SupportForce
+from jaxvib.machine.effects.terms import ContactFriction, GravityField, LoadResistance, SupportForce, Term
 from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import require_double
@@ -324,16 +324,22 @@ def _require_included(scene: Scene, runs: Sequence[MeasuredRun]) -> None:
                 kind,
                 "is a nonlinear support, which the model of a 'force' channel does not contain; leave out the channel",
             )
-        if not is_support and not has_term([effect], GravityField):
+        is_friction = has_loads(scene) and all(_resists_loads(term) for term in terms)
+        if not is_support and not is_friction and not has_term([effect], GravityField):
             raise InputError(
                 kind,
-                "is not included in identify, which allows gravity, cubic supports, stops and supports with dry friction; "
-                "remove the effect",
+                "is not included in identify, which allows gravity, friction of loads, cubic supports, stops and supports with "
+                "dry friction; remove the effect",
             )
     if any(scene.machine.mounting(exciter.place).gyroscopic is not None for exciter in scene.exciters):
         raise InputError(
             "scene.machine", f"is of kind {scene.machine.kind!r} with gyroscopic forces, which identify does not include"
         )
+
+
+def _resists_loads(term: Term) -> bool:
+    """Return True for a term that dissipates energy of loads, and is smooth while they slip against the rotor."""
+    return isinstance(term, ContactFriction) or (isinstance(term, LoadResistance) and term.is_smooth)
 
 
 def _singles(scene: Scene, names: Sequence[str], field: str = "unknown") -> list[NamedNumber]:

@@ -61,7 +61,7 @@ def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     def begun(chosen: slice, unbalance: np.ndarray) -> Problem:
         linear = linear_at(weighted._replace(runs=begins[chosen]), x, unbalance)
         guided = weighted._replace(runs=runs[chosen])
-        return guided._replace(linear=_with_first_states(guided, x, linear))
+        return guided._replace(linear=with_first_states(guided, x, linear))
 
     costs = np.array([[project(begun(slice(r, r + 1), each), x).cost for each in unbalances] for r in range(len(runs))])
     turns = [samples.turn for samples in runs]
@@ -73,13 +73,13 @@ def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     first = begun(slice(None), unbalances[best_index])
     trial, free = minimize(first, x)[0], minimize(weighted, x)[0]
     trial = minimize(weighted._replace(linear=trial.linear), trial.x)[0]
-    of_free = weighted._replace(linear=_with_first_states(weighted, free.x, free.linear))
+    of_free = weighted._replace(linear=with_first_states(weighted, free.x, free.linear))
     free = project(of_free, _with_open_stops(weighted, free.x, free.linear))
     best = free if free.cost < _SAME_COST * trial.cost else trial
     return problem._replace(linear=best.linear), best.x
 
 
-def _with_first_states(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
+def with_first_states(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
     """Return the linear unknowns with the displacements of the first states in m. In the linear response these unknowns are
     displacements times a frequency."""
     first = linear.copy()

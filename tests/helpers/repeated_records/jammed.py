@@ -25,18 +25,20 @@ def turning(t):
     return 90.0 * t + t**2, 90.0 + 2.0 * t, 2.0
 
 
-def _rates(t, y, numbers, phase):
-    """Return the rates of states (6, cases)."""
+def _rates(t, y, numbers, phase, lever=0.0, air=0.0):
+    """Return the rates of states (6, cases); for `lever` and `air` see `accelerations`."""
     m1, m2, k1, k2, c1, c2, k, c, s, m, drag = np.array([list(each.values()) for each in numbers]).T
     x1, x2, v1, v2, angle, rate = y
     theta, speed, change = turning(t)
     inertia, moment = 1.4 * m * RADIUS**2, m * RADIUS
     link, pull = k * (x1 - x2) + c * (v1 - v2), drag * RADIUS**2 * (speed - rate)
-    # (m2 + 2 m) a2 + 2 moment cos turn = force,  inertia turn + moment cos a2 = pull
+    pull = pull + lever * moment * rate**2 - air * np.abs(rate) * rate  # without the part of the normal force by a2
+    coupling = moment * np.cos(angle) + lever * m * np.sin(angle)
+    # (m2 + 2 m) a2 + 2 moment cos turn = force,  inertia turn + coupling a2 = pull
     force = s * (speed**2 * np.sin(theta + phase) - change * np.cos(theta + phase)) - k2 * x2 - c2 * v2 + link
     force = force + 2.0 * moment * (rate**2 * np.sin(angle) - pull / inertia * np.cos(angle))
-    a2 = force / (m2 + 2.0 * m - 2.0 * (moment * np.cos(angle)) ** 2 / inertia)
-    return np.stack([v1, v2, (-k1 * x1 - c1 * v1 - link) / m1, a2, rate, (pull - moment * np.cos(angle) * a2) / inertia])
+    a2 = force / (m2 + 2.0 * m - 2.0 * moment * np.cos(angle) * coupling / inertia)
+    return np.stack([v1, v2, (-k1 * x1 - c1 * v1 - link) / m1, a2, rate, (pull - coupling * a2) / inertia])
 
 
 def first_state(impact=0.1):
@@ -50,12 +52,16 @@ def first_state(impact=0.1):
     return np.array([*steady.imag, *(w * steady.real + impact), angle, w])
 
 
-def accelerations(numbers, starts, phases):
-    """Return the accelerations (cases, n, 2) of both masses for a list of numbers, first states and phases of the unbalance."""
+def accelerations(numbers, starts, phases, lever=0.0, air=0.0):
+    """Return the accelerations (cases, n, 2) of both masses for a list of numbers, first states and phases of the unbalance.
+
+    **Arguments**: `lever` of rolling friction of each ball, m: its torque is the lever times the normal force; `air`: drag of
+    the air on each ball, N m s^2: its torque is -air times the squared speed of the ball.
+    """
     size, phases = len(numbers), np.array(phases)
 
     def rates(t, y):
-        return _rates(t, y.reshape(STATES, size), numbers, phases).ravel()
+        return _rates(t, y.reshape(STATES, size), numbers, phases, lever, air).ravel()
 
     first = np.stack(starts, axis=1).ravel()
     run = solve_ivp(rates, (TIMES[0], TIMES[-1]), first, "DOP853", t_eval=TIMES, rtol=1e-10, atol=1e-12)
@@ -64,10 +70,11 @@ def accelerations(numbers, starts, phases):
 
 
 @functools.cache
-def clean(impact=0.1, added=0.0, drag=1.5):
-    """Return the accelerations (n, 2) without noise; `added`: mass on the first platform, kg; `drag` of the balls."""
+def clean(impact=0.1, added=0.0, drag=1.5, lever=0.0, air=0.0):
+    """Return the accelerations (n, 2) without noise; `added`: mass on the first platform, kg; `drag` of the balls; for `lever`
+    and `air` see `accelerations`."""
     numbers = TRUTH | {"machine.mass[0]": TRUTH["machine.mass[0]"] + added, "loads.drag": drag}
-    return accelerations([numbers], [first_state(impact)], [PHASE])[0]
+    return accelerations([numbers], [first_state(impact)], [PHASE], lever, air)[0]
 
 
 def _slopes(names, impact):
@@ -115,6 +122,6 @@ def scene_of(numbers):
     return scene_with(numbers, jv.balls(count=2, mass=numbers["loads.mass"], radius=RADIUS, drag=numbers["loads.drag"]))
 
 
-def jammed_record(noise, rng, impact=0.1, added=0.0, drag=1.5, **options):
-    """Return a record of both accelerometers and the tachometer; for `added` and `drag` see `clean`."""
-    return record(TIMES, clean(impact, added, drag), noise, rng, turning=turning, **options)
+def jammed_record(noise, rng, impact=0.1, added=0.0, drag=1.5, lever=0.0, air=0.0, **options):
+    """Return a record of both accelerometers and the tachometer; for `added`, `drag`, `lever` and `air` see `clean`."""
+    return record(TIMES, clean(impact, added, drag, lever, air), noise, rng, turning=turning, **options)

@@ -230,10 +230,7 @@ def test_loads_that_are_not_included_are_refused():
     hung = jv.pendulums(count=2, mass=0.8, radius=RADIUS, drag=1.5)
     several = [exciter, jv.Exciter(drive=jv.ConstantSpeed(50.0), unbalance=0.1)]
     refused(jv.Scene(scene.machine, exciters=several), "has 2 exciters, one of them with loads; identify needs loads")
-    refused(
-        scene.replace(loads=hung, effects=jv.DryFriction(coefficient=0.01, diameter=0.02)),
-        "dry_friction is not included in identify",
-    )
+    refused(scene.replace(loads=hung, effects=jv.StaticImbalance("9 g m")), "static_imbalance is not included in identify")
     torus = jv.torus_balls(count=1, mass=0.1, radius=RADIUS, tube=0.02, ball_radius=0.01, drag=1.0)
     refused(
         jv.Scene(scene.machine, torus, exciter.drive), "scene.loads is of kind 'torus_ball'; identify needs loads on a circle"

@@ -7,7 +7,7 @@ import pytest
 from run_ups_by_scipy import TRUTH, accelerations, record, scene_of
 
 import jaxvib as jv
-from jaxvib.identification.descriptions import description_notes
+from jaxvib.identification.alternatives.descriptions import description_notes
 from jaxvib.identification.problem import build_problem
 
 TIMES = np.arange(0.0, 16.0, 0.01)
