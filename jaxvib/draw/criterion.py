@@ -68,9 +68,8 @@ def criterion_chart(
     balancing: list[list[float | None]],
     exact: list[list[float]] | None = None,
     at: float | None = None,
-    unit: SpeedUnit | None = None,
 ) -> None:
-    """Draw the `functional` of the criterion (S,), kg m^2, over the rotor `speed` (S,), rad/s, drawn in `unit`.
+    """Draw the `functional` of the criterion (S,), kg m^2, over the rotor `speed` (S,), rad/s.
 
     The intervals `balancing` of the criterion (start, end), rad/s, are shaded; None is an open end. The intervals `exact` of
     the exact stability, rad/s, are bars at the bottom. `at` is the working speed, rad/s. The functional spans many decades
@@ -83,7 +82,7 @@ def criterion_chart(
     'criterion f, kg m²'
     """
     size = np.abs(functional[np.isfinite(functional)])
-    unit, scale = speed_unit(unit)
+    unit, scale = speed_unit()
     speed = scale * speed
     ax.plot(speed, functional, color="black", linewidth=1.0)
     width = float(np.median(size[size > 0.0])) if np.any(size > 0.0) else 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from jaxvib.display import Drawn, Onto, speed_unit
 from jaxvib.draw.style import COLORS, GUIDE, color_of, legend_above, panels
@@ -35,13 +36,10 @@ _MAX_SHOWN_POINTS = 4000
 
 
 def recording_chart(
-    signals: Sequence[tuple[str, np.ndarray, np.ndarray]],
-    speed: tuple[np.ndarray, np.ndarray] | None = None,
-    *,
-    ax: Onto = None,
-) -> Drawn:
+    signals: Sequence[tuple[str, np.ndarray, np.ndarray]], speed: tuple[np.ndarray, np.ndarray] | None = None
+) -> Figure:
     """Draw one panel for each signal (label, times s, values), and a last one for the `speed` (times s, rad/s) of the rotor."""
-    figure, axes = panels(len(signals) + (speed is not None), size=(9.0, 1.9), share_x=True, ax=ax)
+    figure, axes = panels(len(signals) + (speed is not None), size=(9.0, 1.9), share_x=True)
     for axis, (label, time, values) in zip(axes, signals, strict=False):
         axis.plot(*_extremes(time, values), color=COLORS[0], lw=0.6)
         axis.set_ylabel(label)
@@ -50,7 +48,7 @@ def recording_chart(
         axes[-1].plot(speed[0], factor * speed[1], color=COLORS[1])
         axes[-1].set_ylabel(f"rotor speed, {unit}")
     axes[-1].set_xlabel("time, s")
-    return figure if ax is None else ax
+    return figure
 
 
 def _extremes(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -116,14 +116,12 @@ def phase_circles(
     *,
     weights: np.ndarray | None = None,
     imbalance: complex = 0.0,
-    resultant: bool = True,
     ax: Onto = None,
 ) -> Drawn:
     """Draw angles of loads (count,) rad as points on a circle, one circle for each (title, angles).
 
     A black arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel.
-    `resultant`: False for masses that turn in different directions, whose mean has no meaning. `weights` and `imbalance`: see
-    `draw_circle`. `ax` must contain one axes object for each circle.
+    `weights` and `imbalance`: see `draw_circle`. `ax` must contain one axes object for each circle.
     """
     columns = max(len(sets), 1) if ax is not None else min(max(len(sets), 1), 4)
     rows = 1 if ax is not None else -(-max(len(sets), 1) // columns)
@@ -131,7 +129,7 @@ def phase_circles(
     for k, axis in enumerate(axes):
         axis.set_axis_off()
         if k < len(sets):
-            draw_circle(axis, *sets[k], weights=weights, imbalance=imbalance, resultant=resultant)
+            draw_circle(axis, *sets[k], weights=weights, imbalance=imbalance)
     return figure if ax is None else ax
 
 
@@ -150,7 +148,8 @@ def draw_circle(
 
     `weights` (count,), whose sum is 1, are those of the mean; default: equal ones. An orange arrow shows the `imbalance` of the
     rotor, relative to the unbalance of all loads at one angle. `numbers` (count,) of the loads, from 0; default: 0, 1, ...
-    `plural`: name of the points, for the label of many at one angle.
+    `resultant`: False for masses that turn in different directions, whose mean has no meaning. `plural`: name of the points,
+    for the label of many at one angle.
     """
     axis.set(aspect="equal", xlim=(-1.6, 1.6), ylim=(-1.35, 1.35))
     axis.set_axis_off()

@@ -55,7 +55,7 @@ def regimes_chart(
 
     Points are filled for stable regimes, hollow for unstable ones.
 
-    **Arguments**: `resonances`, rad/s; `names` (count,) of the masses; `resultant`, see `phase_circles`; `ax`: as many axes
+    **Arguments**: `resonances`, rad/s; `names` (count,) of the masses; `resultant`, see `draw_circle`; `ax`: as many axes
     as there are panels.
 
     >>> import numpy as np

@@ -64,7 +64,7 @@ def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -
     return [row for row in rows if row is not None]
 
 
-def gravity_share(radius: float, omega: float, g: float = _G) -> float:
+def gravity_share(radius: float, omega: float) -> float:
     """Return g/(R Omega^2): the share of gravity in the normal force of a load at `radius`, m, with the speed `omega`, rad/s.
 
     >>> round(100.0 * gravity_share(0.08, 169.6), 3)      # percent, of the published rotor's pendulums in their first jam
@@ -73,7 +73,7 @@ def gravity_share(radius: float, omega: float, g: float = _G) -> float:
     Source: Artyunin and Sumenkov 2019, who state that it is below 0.5 %. This is true for load speeds above sqrt(g/(0.005 R)),
     which is 157 rad/s for R = 0.08 m.
     """
-    return g / (radius * omega**2)
+    return _G / (radius * omega**2)
 
 
 def _row(name: str, value: float, limit: float, note: str) -> NumberRow:

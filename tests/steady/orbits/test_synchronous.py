@@ -245,9 +245,6 @@ def test_single_precision_finds_the_motion(general, orbit):
     assert float(found.speed) == pytest.approx(float(orbit.speed), rel=1e-5)
 
 
-GRADED = ("exciters[0].unbalance", "exciters[1].drive.speed", "machine.mass")
-
-
 def with_numbers(scene, numbers):
     where = lambda s: (s.exciters[0].unbalance, s.exciters[1].drive.speed, s.machine.mass)  # noqa: E731
     return eqx.tree_at(where, scene, tuple(numbers))
