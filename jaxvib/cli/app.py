@@ -441,7 +441,7 @@ def _remedy_hint(arguments: list[str], error: InputError) -> str:
 
 
 def _failed(wants_json: bool, code: int, error: dict[str, str | None]) -> int:
-    click.echo(legible(f"jaxvib: {error['message']}"), err=True)
+    note(legible(f"jaxvib: {error['message']}"))
     if wants_json:
         click.echo(json.dumps({"error": error}, indent=2))
     return code

@@ -56,8 +56,8 @@ def fields_of(result: object, *names: str) -> dict[str, object]:
 
 
 def note(text: str) -> None:
-    """Print a line on stderr, in place of the line of the elapsed time on a terminal."""
-    click.echo(("\r\x1b[K" if sys.stderr.isatty() else "") + text, err=True)
+    """Print a text on stderr; on a terminal in lines that fit, in place of the line of the elapsed time."""
+    click.echo(f"\r\x1b[K{_wrapped(text)}" if sys.stderr.isatty() else text, err=True)
 
 
 def write_file(path: Path, text: str) -> None:

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import jaxvib as jv
-from jaxvib.cli.app import table, tolerance_table
+from jaxvib.cli.app import run, table, tolerance_table
 from jaxvib.cli.optimize import _few_machines_texts, _quantities_with_ranges
 from jaxvib.cli.output import Output
 from optimize import Design, DesignSpace, ToleranceRange, amplitude, foundation_force, worst
@@ -48,6 +48,16 @@ def test_a_report_has_the_requested_title(tmp_path, title, heading):
     page = (tmp_path / "report.html").read_text()
     assert f"<h1>{heading}</h1>" in page and ("<p>A. Author</p>" in page) == (title is not None)
     assert "<code>jaxvib simulate</code>" in page
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_notes_fit_on_a_terminal(capsys, monkeypatch, is_terminal):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: is_terminal, raising=False)
+    monkeypatch.setenv("COLUMNS", "80")
+    run(["describe", "nothing like it"])
+    lines = capsys.readouterr().err.replace("\r\x1b[K", "").splitlines()
+    assert lines[0].startswith("jaxvib: name is 'nothing like it'; allowed: machines,")
+    assert (max(map(len, lines)) <= 80) == is_terminal == (len(lines) > 1)
 
 
 def test_title_of_a_narrow_table_stays_on_one_line():
