@@ -18,7 +18,7 @@ from jax import Array
 from jaxvib.boundary import call_user
 from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted, within
-from jaxvib.machine.carrier import Machine, read_place
+from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drives.controlled import SwitchedOff
 from jaxvib.machine.drives.drive import Motor
 from jaxvib.machine.effects.base import static_imbalances, total_gravity
@@ -334,7 +334,6 @@ def _rebuild(scene: Scene) -> None:
                 if shape := np.shape(0.0 if (value := getattr(exciter, name)) is None else value):
                     raise InputError(name, f"is an array of shape {shape}; the shape () is needed")
             read_unbalance(exciter.drive, exciter.unbalance, exciter.unbalance_mass)
-            read_place(exciter.at)
             scene.machine.mounting(exciter.place)
             for effect in exciter.effects:
                 _rebuild_part(effect, f"effects.{effect.kind}")

@@ -24,7 +24,7 @@ from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.units import Numbers, numbers
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_finite, when_known
 
 LoadMasses = Literal["fixed", "none"]
 
@@ -102,8 +102,7 @@ class Whirl(Result):
     - `directivity`: (ns, nd) (f - b)/(f + b), where the ellipse of the motion is the sum of a forward circle of the radius f
       and a backward circle of the radius b. It is 1 for a forward circle, 0 for a straight line, and -1 for a backward circle.
       No force that turns with the rotor excites a motion of the directivity -1. For a rotor that tilts, f and b are root sums
-      of squares over the displacement of the axis, m, and its tilts, rad. The directivity of a motion that does not oscillate
-      has no meaning
+      of squares over the displacement of the axis, m, and its tilts, rad. It is NaN for a motion that does not oscillate
     - `critical`: the critical speeds
     - `status`: a `WhirlStatus`; motions that are lost in rounding errors are NaN
     """
@@ -237,7 +236,7 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
             -values.real[chosen],
             turns & (_sense(model.mount, chosen_shapes) > 0.0) & ~straight,
             straight,
-            _directivity(model.mount, chosen_shapes),
+            jnp.where(turns, _directivity(model.mount, chosen_shapes), jnp.nan),
             error[nearest][chosen] > MAX_EIGENVALUE_ERROR,
         )
 
@@ -338,7 +337,8 @@ def _mirrored(model: LinearModel) -> LinearModel:
 
 
 def _require_springs(stiffness: np.ndarray) -> None:
-    """**Raises** `InputError` if a motion of the rotor has no spring."""
+    """**Raises** `InputError` if a motion of the rotor has no spring, `ComputationError` for stiffnesses that overflow."""
+    require_finite("stiffnesses of the machine", stiffness)
     if not _has_all_springs(stiffness):
         within, advice = (
             (", within single precision", ", or use double precision") if stiffness.dtype.itemsize < 8 else ("", "")

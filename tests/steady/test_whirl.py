@@ -144,6 +144,7 @@ def test_an_overdamped_motion_has_its_slower_decay(translation, tilt):
     np.testing.assert_array_equal(found.speed, 0.0)
     np.testing.assert_allclose(found.decay[0], sorted([translation[0]] * 2 + [tilt[0]] * 2), rtol=1e-6)
     assert not np.any(found.forward) and found.summary().count("(overdamped)") == 4
+    assert np.all(np.isnan(found.directivity))
 
 
 @pytest.mark.parametrize("speed", [1.0, 20.0, 60.0, 3e3])
@@ -220,3 +221,11 @@ def test_clockwise_rotors_whirl_at_their_own_speed(direction):
     right = sorted((s for s in np.linalg.eigvals(flow) if s.imag > 0.0), key=lambda s: s.imag)
     np.testing.assert_allclose(found.speed[0] * 1j - found.decay[0], right, rtol=1e-9)
     assert found.sense[0].tolist() == ["backward", "forward"]
+
+
+def test_stiffnesses_that_overflow_have_a_status():
+    shaft = dict(mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(1e308, 1e308), damping=400.0)
+    machine = jv.rotor(**shaft, position=(0.165, -0.155))
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+    with pytest.raises(jv.ComputationError, match=r"^overflow: stiffnesses of the machine are not finite"):
+        jv.whirl(scene, [0.0])
