@@ -161,4 +161,10 @@ def _balance_text(states: jv.BalancedStates, stabilities: list[BalancedStability
             if spans
             else "stable at none of the speeds between these two"
         )
+    if answer == "stable" or any(map(len, stable)):
+        reached = (
+            "stable: small disturbances decay. A start from rest need not reach this motion, because the loads may jam at a "
+            "resonance: jaxvib modes lists the jams, jaxvib simulate --until 100s shows a start"
+        )
+        lines.append(textwrap.fill(reached, 80))
     return "\n".join(lines)

@@ -173,8 +173,8 @@ def _drag_document(limits: jv.DragLimits | None) -> list[dict[str, Any]]:
     return [{name: getattr(limits, name)[k] for name in names} for k in np.flatnonzero(np.isfinite(limits.factor))]
 
 
-def _drag_lines(scene: jv.Scene, limits: jv.DragLimits | None) -> list[str]:
-    """Return a table of the greatest drags; an empty list if there is none."""
+def _drag_lines(scene: jv.Scene, limits: jv.DragLimits | None, *, points: bool = False) -> list[str]:
+    """Return a table of the greatest drags; an empty list if there is none. `points`: True for limits of point loads."""
     from jaxvib.display import speed_unit  # slow imports, which --help does not need
     from jaxvib.machine.loads import CircularLoads
 
@@ -186,7 +186,10 @@ def _drag_lines(scene: jv.Scene, limits: jv.DragLimits | None) -> list[str]:
     equal = isinstance(scene.loads, CircularLoads) and scene.loads.drag.ndim == 0
     of_load = "drag, N s/m" if equal else "drag of load 1, N s/m"
     head = [f"resonance, {unit}", of_load, "times the scene's", f"loads, {unit}"]
-    return [table("greatest drag: with a larger one no jam exists at the resonance", head, rows)] if rows else []
+    lines = [table("greatest drag: with a larger one no jam exists at the resonance", head, rows)] if rows else []
+    if lines and points and getattr(scene.loads, "ball_radius", None) is not None:
+        lines.append("loads count as points: touching balls jam only up to a smaller drag")
+    return lines
 
 
 def _mode_document(jam: jv.Jam, growth: float) -> dict[str, Any]:
@@ -251,7 +254,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
         stable_jams = [f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam in jams if jam.stable]
         reached = _reached_lines(scene, output, [f"the jam at {each}" for each in stable_jams], balanced)
         if not rows:
-            return "\n".join([f"no jam at {rotor}", *reached, *_drag_lines(scene, limits)])
+            return "\n".join([f"no jam at {rotor}", *reached, *_drag_lines(scene, limits, points=True)])
         conclusion = (
             f"loads can stay jammed at {', '.join(stable_jams)}"
             if stable_jams
@@ -262,7 +265,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
             for jam, measures_of_jam in zip(jams, measures, strict=True)
             if measures_of_jam is not None
         ]
-        drags = _drag_lines(scene, limits)
+        drags = _drag_lines(scene, limits, points=True)
         rows_of_force = [table(title, head, rows), *_force_lines(scene)]
         return "\n".join([conclusion, *reached, *rows_of_force, *measure_texts, *drags, *_left_out(scene)])
 

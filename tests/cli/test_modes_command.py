@@ -8,7 +8,7 @@ import numpy as np
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.cli.modes import _left_out
+from jaxvib.cli.modes import _drag_lines, _left_out
 from jaxvib.machine.files import TEMPLATES
 
 
@@ -35,6 +35,23 @@ def test_modes_writes_table_and_figure(typed, tmp_path):
     assert "several motions are stable: mode 3, balanced loads\n" in out and "machine.toml --until 100s --start spin_up" in out
     assert (tmp_path / "figures" / "branches.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "figures" / "modes.json").read_text())["rotor_speed"] == 150.0
+
+
+def test_drag_limits_of_balls_at_any_phases_are_those_of_points():
+    """Touching balls have the unbalance of a chain."""
+    balls = jv.balls(count=3, mass=0.8, ball_radius=0.03, radius=0.12, drag=1.5)
+    table = jv.Scene(jv.one_mass(mass=120.0, stiffness=5e4, damping=300.0), balls, jv.ConstantSpeed(60.0))
+    touching, points = jv.drag_limits(table), jv.drag_limits(equal_points(table))
+    chain = (1.0 + 2.0 * np.cos(2.0 * np.arcsin(0.03 / 0.12))) / 3.0
+    np.testing.assert_allclose(touching.factor / points.factor, chain**2, rtol=1e-2)
+    said = "loads count as points: touching balls jam only up to a smaller drag"
+    assert _drag_lines(table, points, points=True)[-1] == said and said not in _drag_lines(table, touching)
+
+
+def equal_points(table):
+    loads = table.loads
+    points = jv.balls(count=loads.count, mass=loads.mass, radius=loads.radius, drag=loads.drag)
+    return jv.Scene(table.machine, points, table.drive)
 
 
 def test_modes_name_a_resonance_without_a_peak(typed, tmp_path):

@@ -92,7 +92,9 @@ def drag_limits(scene: Scene, *, phases: bool = False) -> DragLimits:
       the sum (w^4/2) |sum_j S_j exp(i a_j)|^2 Im h, whose modulus is largest for equal angles a_j. S_j = m_j R_j is the
       unbalance of a load, and h is the receptance of the point that carries the loads, for a rotating force
     - Loads at several points of a rotor, or unequal loads, jam at unequal phases. With `phases`, `factor` is the largest one
-      of all phases that a search finds
+      of all phases that a search finds. Loads then count as points, see `phase_jams`. Balls with a `ball_radius` that touch
+      each other have a smaller common unbalance, and jam only up to a smaller drag. For equal loads at one point, the limit
+      without `phases` includes this
 
     **Arguments**
 
