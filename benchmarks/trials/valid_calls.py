@@ -246,7 +246,7 @@ def calls() -> Iterator[Callable[[], Call]]:
         kind = {"tolerance": 1e-8, "error": 1e-4, "number": 200}[steps]
         yield call(f"simulate by {name}", lambda name=name: _by_steps(name), value=kind)
     # Accuracy
-    cost = dict(quantity="amplitude", mode=3, until=None, tolerances=(1e-3,), solvers=("default",), repeats=1)
+    cost = dict(quantity="final_state", mode=None, until=0.2, tolerances=(1e-3,), solvers=("default",), repeats=1)
     yield call("work_precision", scene=s, **cost)
     yield call("compare_tiers", scene=s, factors=[1.0], mode=3)
     yield call("harmonic_convergence", scene=s, omega=[10.0], points=(4, 6))
@@ -541,7 +541,7 @@ def phases() -> jv.PhaseJams:
 
 @functools.cache
 def cost_of() -> jv.Cost:
-    return jv.work_precision(scene(), "amplitude", mode=3, tolerances=(1e-3,), solvers=("default",), repeats=1)
+    return jv.work_precision(scene(), "final_state", until=0.2, tolerances=(1e-3,), solvers=("default",), repeats=1)
 
 
 def _by_steps(name: str) -> Callable[..., Any]:
