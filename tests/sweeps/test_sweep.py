@@ -165,6 +165,8 @@ def test_what_cannot_be_a_folder(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(jv.InputError, match="cannot be written"):
         run_study(STUDY, "/proc/study.zarr")
+    with pytest.raises(jv.InputError, match=r"cannot be written \(File name too long\)"):
+        run_study(STUDY, tmp_path / ("a" * 400))
     with pytest.raises(jv.InputError, match="not the store of a sweep"):
         run_study(STUDY, tmp_path / "file")
 
