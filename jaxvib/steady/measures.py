@@ -374,7 +374,7 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
     carrier = model.carrier
     lengths = np.flatnonzero(np.asarray(carrier.units) == "m")
     amplitude, (displacement, w) = motion.amplitude[lengths], at_positive_speed(motion.displacement, motion.speed)
-    has_weight = scene.machine.places != "shaft" or has_term(scene.effects, GravityField)
+    has_weight = scene.machine.places not in ("shaft", "point") or has_term(scene.effects, GravityField)
     sag = weight_deflection(model) if has_weight else None
     static, dynamic, side = support_loads(model, w, displacement, sag)
     forced = motion.exciter_force != 0.0  # True for NaN

@@ -280,6 +280,7 @@ def test_texts_of_rotors_state_the_rotating_force():
     circle = 0.1 * 29.0**2  # N, not sqrt(2) times as much
     ratio = 4e4 / (4e4 - 50.0 * 29.0**2)
     assert f"the foundation receives {abs(ratio):.3g} times the exciter's rotating {circle:.4g} N" in near.summary()
+    assert "static" not in near.summary()  # the axis may be vertical
     assert "zone D" in near.summary() and near.notes() == [] and max(near.acceleration) > 1.0
     far = jv.vibration_measures(rotor, jv.response(rotor, speeds=[40.0]).vibration())
     assert "of the exciter's rotating 160 N, 100 % reach the foundation" in far.summary()
