@@ -5,18 +5,18 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-import jaxvib.code_changes  # noqa: F401  before all other imports, which it watches
+import jaxvib.code_changes  # noqa: F401  before all other modules, because it watches their imports
 
 
-def _homes() -> dict[str, str]:
-    """Return the module of each public name, as a dictionary; read from the imports of the stub `__init__.pyi`."""
+def _modules_of_names() -> dict[str, str]:
+    """Return the module of each public name, read from the imports of the stub `__init__.pyi`."""
     stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     return {alias.name: str(node.module) for node in imports for alias in node.names}
 
 
-_HOMES = _homes()
-__all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
+_MODULE_OF_NAME = _modules_of_names()
+__all__ = sorted(_MODULE_OF_NAME)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
@@ -25,14 +25,15 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version  # slow import
 
         return version("jaxvib")
-    if name not in _HOMES:
+    if name not in _MODULE_OF_NAME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    # `start` makes the settings of `prepare_cpu` and `use_cache`, which a user may call with other arguments.
-    if not _HOMES[name].startswith(("jaxvib.errors", "jaxvib.runtime")):
+    # `start` calls `prepare_cpu` and `use_cache` with default arguments. These two functions, which a user may call first with
+    # other arguments, are in `jaxvib.runtime`.
+    if not _MODULE_OF_NAME[name].startswith(("jaxvib.errors", "jaxvib.runtime")):
         from jaxvib.runtime.startup import start
 
         start()
-    value = globals()[name] = getattr(importlib.import_module(_HOMES[name]), name)
+    value = globals()[name] = getattr(importlib.import_module(_MODULE_OF_NAME[name]), name)
     return value
 
 

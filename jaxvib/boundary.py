@@ -62,8 +62,9 @@ def validated(function: F) -> F:
 
     A list given in place of an array is converted to an array of floats, and an array given in place of a list to a list.
 
-    **Raises** `InputError` for an argument of another type, and for a traced argument if the function needs its value;
-    `TypeError`, as Python does, for a name that the function does not have.
+    **Raises** `InputError` for an argument of another type, for a traced argument if the function needs its value, and if
+    JAX's option `jax_numpy_dtype_promotion` is 'strict' but must be 'standard'; `TypeError`, as Python does, for a missing
+    argument and for an unknown name.
 
     >>> from pathlib import Path
     >>> @validated
@@ -133,7 +134,7 @@ def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> 
 
 
 def _resolved(kind: Any, names: Mapping[str, Any]) -> Any:
-    """Return an annotation without strings, and `Any` for one that only type checkers can resolve."""
+    """Evaluate an annotation that is a string; return `Any` for one that only type checkers can resolve."""
     names = dict(names)
     for _ in range(6):  # the value of an alias may be a string too, and some names are imported by type checkers only
         if not isinstance(kind, str):
@@ -148,9 +149,9 @@ def _resolved(kind: Any, names: Mapping[str, Any]) -> Any:
 
 
 def require_fields(part: Any, place: str) -> None:
-    """Check the fields of a dataclass, and of those in it, against their annotations.
+    """Check the fields of a dataclass, and of the dataclasses in it, against their annotations.
 
-    Numbers may have any value and shape, and may be traced. **Raises** `InputError` for other objects.
+    Numbers may have any value and shape, and may be traced. **Raises** `InputError` for a field of another type.
 
     **Arguments**: `part`, an instance of a dataclass; `place`: its name in messages.
 

@@ -1,8 +1,8 @@
 """Comparison of the code of this process with the source files.
 
 The keys of stored programs contain a digest of the source files. The code of a process differs from these files if a file was
-edited after the import of jaxvib, or if a function, a constant or a member of a class was replaced (by a mock, a notebook, a
-patch). Such a process must neither store programs nor read stored ones.
+edited after the import of jaxvib. It also differs if a mock, a notebook or a patch replaced a function, a constant or a member
+of a class. Such a process must neither store programs nor read stored ones.
 
 The class of each module of the package is replaced by a class that records which names are set from outside; other modules are
 not changed. The members of classes are compared with those at the import, and files by their modification times. This does not
@@ -62,9 +62,13 @@ class _WatchedModule(ModuleType):
 class _Code:
     """Original definitions and files of the watched modules, and the current state of the code.
 
-    **Attributes**: `stamps` of the source files at the import; `originals`: first values of names that were set from outside;
-    `members` of the classes at the import; `doubtful`: modules whose code may differ from the source files since their import;
-    `was_set`: True if a name was set since the last comparison; `last_differences`: result of the last comparison.
+    **Attributes**
+
+    - `stamps` of the source files at the import, and `members` of the classes at the import
+    - `originals`: first values of names that were set from outside
+    - `doubtful`: modules whose code may already have differed from the source files at the import
+    - `was_set`: True if a name was set since the last comparison
+    - `last_differences`: result of the last comparison
     """
 
     def __init__(self) -> None:
@@ -83,7 +87,7 @@ class _Code:
         self.was_set = True
 
     def differences(self) -> Iterator[tuple[object, ...]]:
-        """Yield owner, name and current value of each replaced definition, then edited files and modules of unknown source."""
+        """Yield owner, name and current value of each replaced definition, then the edited files and the `doubtful` modules."""
         for (module, name), original in list(self.originals.items()):
             if (value := vars(module).get(name, _ABSENT)) is not original:
                 yield module, name, value
@@ -152,13 +156,13 @@ def digest_of_sources() -> str:
     return digest.hexdigest()
 
 
-def code_state(*, look: bool = False) -> CodeState:
+def code_state(*, compare: bool = False) -> CodeState:
     """Return the state of the code in this process.
 
-    **Arguments**: `look`: True compares modules, classes and files (about 2 ms); False, the default, compares them only after a
+    **Arguments**: `compare`: True to compare modules, classes and files (about 2 ms); by default they are compared only after a
     name of a module was set.
     """
-    if look or _code.was_set:
+    if compare or _code.was_set:
         digest_of_sources()  # before the comparison, which then confirms that the digest is that of the imported code
         _code.update()
     return _code.state

@@ -39,7 +39,7 @@ GRAVITIES = "g0"
 
 
 class _CurrentUnits:
-    """Display units of this process: that of speeds, and True in `si` for SI units of all other quantities."""
+    """Display units of this process: `speed` is the unit of speeds; `si` is True for SI units of all other quantities."""
 
     speed: SpeedUnit = "rpm"
     si = False
@@ -47,10 +47,10 @@ class _CurrentUnits:
 
 @validated
 def display_units(*, speed: SpeedUnit = "rpm", si: bool = False) -> None:
-    """Set the units of all texts, tables and figures of this process; without arguments, the units that are usual in
+    """Set the units of all texts, tables and figures of this process. Without arguments, set the units that are usual in
     engineering.
 
-    The command-line option `--unit` sets `speed`; with `--unit SI` speeds are in rad/s, and `si` is True.
+    The command-line option `--unit` sets `speed`; `--unit SI` stands for `speed="rad/s", si=True`.
 
     **Arguments**
 
@@ -89,7 +89,7 @@ def speed_unit(unit: SpeedUnit | None = None) -> tuple[SpeedUnit, float]:
 
 
 def shown_unit(unit: str, size: float) -> tuple[str, float]:
-    """Return the display unit of values of about `size`, and the factor from the SI value to it.
+    """Return the display unit of values of about `size`, given in the SI `unit`, and the factor from the SI unit to it.
 
     >>> shown_unit("m", 0.02), shown_unit("N", 120.0), shown_unit("rad/s^2", 10.0)[0]
     (('mm', 1000.0), ('N', 1.0), 'rpm/s')
@@ -131,7 +131,7 @@ def quantity_text(values: ArrayLike, unit: str, digits: int = 5, between: str = 
     """
     numbers = np.atleast_1d(np.asarray(values, float))
     shown, factor = shown_unit(unit, float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers))))
-    # NumPy's numbers would warn of an overflow.
+    # `tolist` returns Python's numbers, because NumPy's would warn of an overflow.
     return between.join(_without_exponent(f"{factor * x:.{digits}g}") for x in numbers.tolist()) + f" {shown}"
 
 

@@ -118,8 +118,8 @@ def require_one_of(value: object, allowed: Iterable[str], field: str) -> None:
 def require_path(value: object, field: str) -> Path:
     """Return a path.
 
-    **Raises** `InputError` for a value that is not a path, for an empty path, for a path of more than 4096 characters, and for
-    one with the character NUL or a lone surrogate.
+    **Raises** `InputError` for a value that is not a path, and for a path that is empty, has more than 4096 characters, or
+    contains the character NUL or a lone surrogate.
 
     >>> require_path(3, "path")
     Traceback (most recent call last):
@@ -155,9 +155,10 @@ def with_ending(path: str | Path, ending: str) -> Path:
 
 @contextlib.contextmanager
 def written(path: Path) -> Iterator[Path]:
-    """Yield the path of a temporary file in the same folder, which replaces the file at `path` at the end of the context.
+    """Yield the path of a temporary file. At the end of the context, this file replaces the file at `path`.
 
-    An existing file at `path` is unchanged until then. **Raises** `InputError` if the file cannot be written.
+    An existing file at `path` is unchanged until then. If `path` is a device, such as /dev/null, `path` itself is yielded.
+    **Raises** `InputError` if the file cannot be written.
 
     >>> import pathlib, tempfile
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "a.txt"
@@ -191,7 +192,8 @@ def written(path: Path) -> Iterator[Path]:
 def optional_module(name: str, extra: str) -> ModuleType:
     """Import the module `name` of an optional package.
 
-    **Raises** `InputError` if the package is missing, with the command that installs it by the `extra` of this project.
+    **Raises** `InputError` if the package is missing. The message states the command that installs it, with the `extra` of
+    jaxvib.
     """
     try:
         return importlib.import_module(name)

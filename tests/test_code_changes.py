@@ -109,19 +109,19 @@ CHANGES = {
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_every_kind_of_replacement_is_noticed(change):
-    before = code_changes.code_state(look=True)
+    before = code_changes.code_state(compare=True)
     assert before.is_on_disk
     with CHANGES[change]():
-        within = code_changes.code_state(look=True)
+        within = code_changes.code_state(compare=True)
         assert not within.is_on_disk and within.number > before.number
-        assert code_changes.code_state(look=True) == within
-    after = code_changes.code_state(look=True)
+        assert code_changes.code_state(compare=True) == within
+    after = code_changes.code_state(compare=True)
     assert after.is_on_disk and after.number > within.number
 
 
 def test_a_replacement_that_came_and_went_counts_too():
     """JAX may hold programs that other functions traced meanwhile."""
-    before = code_changes.code_state(look=True)
+    before = code_changes.code_state(compare=True)
     with mock.patch.object(jam, "peak_force"):
         pass
     assert code_changes.code_state().number > before.number and code_changes.code_state().is_on_disk
@@ -131,8 +131,8 @@ def test_a_replacement_that_came_and_went_counts_too():
 def test_a_removed_definition_is_noticed(owner, name):
     with pytest.MonkeyPatch.context() as patch:
         patch.delattr(owner, name)
-        assert not code_changes.code_state(look=True).is_on_disk
-    assert code_changes.code_state(look=True).is_on_disk
+        assert not code_changes.code_state(compare=True).is_on_disk
+    assert code_changes.code_state(compare=True).is_on_disk
 
 
 def test_use_of_the_package_is_no_replacement():
@@ -145,7 +145,7 @@ def test_use_of_the_package_is_no_replacement():
             inspect.signature(owner)
         if not getattr(owner, "_is_protocol", False):  # it has no instances, and `isinstance` would require the new attribute
             copyreg._slotnames(owner)  # by copy and pickle
-    assert code_changes.code_state(look=True).is_on_disk
+    assert code_changes.code_state(compare=True).is_on_disk
 
 
 def test_caches_of_replaced_functions_are_emptied():
@@ -183,39 +183,39 @@ def toy(tmp_path):
 
 def test_an_edit_after_the_import_is_noticed(toy):
     path, _ = toy("x = 1.0\n")
-    assert code_changes.code_state(look=True).is_on_disk
+    assert code_changes.code_state(compare=True).is_on_disk
     path.write_text("x = 22.0\n")
-    assert not code_changes.code_state(look=True).is_on_disk
+    assert not code_changes.code_state(compare=True).is_on_disk
 
 
 def test_a_removed_source_is_noticed(toy):
     path, _ = toy("x = 1.0\n")
     path.unlink()
-    assert not code_changes.code_state(look=True).is_on_disk
+    assert not code_changes.code_state(compare=True).is_on_disk
 
 
 def test_a_module_without_a_digested_source_is_in_doubt(toy):
     path, module = toy("x = 1.0\n")
-    assert code_changes.code_state(look=True).is_on_disk
+    assert code_changes.code_state(compare=True).is_on_disk
     del code_changes._code.stamps[str(path)]
     code_changes.watch(module)
-    assert not code_changes.code_state(look=True).is_on_disk
+    assert not code_changes.code_state(compare=True).is_on_disk
 
 
 def test_a_module_reloaded_is_in_doubt(toy):
     """Others hold what it defined before."""
     _, module = toy("x = 1.0\n")
     importlib.reload(module)
-    assert not code_changes.code_state(look=True).is_on_disk
+    assert not code_changes.code_state(compare=True).is_on_disk
 
 
 def test_stale_bytecode_is_in_doubt(toy):
     """Python runs it if the source was changed within a second and has the same size."""
     _, module = toy("x = 1.0\n", seconds=1e9)
     os.utime(module.__cached__, (1e9, 1e9))
-    assert code_changes.code_state(look=True).is_on_disk
+    assert code_changes.code_state(compare=True).is_on_disk
     _, module = toy("x = 2.0\n", seconds=1e9 + 0.5)
-    assert module.x == 1.0 and not code_changes.code_state(look=True).is_on_disk
+    assert module.x == 1.0 and not code_changes.code_state(compare=True).is_on_disk
 
 
 CODE = """

@@ -107,7 +107,7 @@ class StoredFunction(Generic[T]):
         if program is _UNKNOWN:
             folder, *_, sharding, _ = call
             with self.lock:
-                key = (_current_code(look=True), call)
+                key = (_current_code(compare=True), call)
                 program = self.ready.get(key, _UNKNOWN)
                 if program is _UNKNOWN:
                     with evaluating():  # inside a transformation JAX would trace these transfers
@@ -191,7 +191,7 @@ class StoredFunction(Generic[T]):
         exported = export.deserialize(bytearray(stored))  # the former `exported` would keep its trace, 1 to 3 MB, in memory
         (structure, result), name = results[0], self.function.__name__
         program = _Program(_compiled(name, exported, sharding), result, len(stored))
-        if path is None or structure is None or code_state(look=True) != state:  # the code changed during the trace
+        if path is None or structure is None or code_state(compare=True) != state:  # the code changed during the trace
             return program
         head = json.dumps({"structure": structure}).encode() + b"\n"
         with contextlib.suppress(OSError):  # a full disk or a read-only folder: the program still works in this process
@@ -363,9 +363,9 @@ _traced_code = [code_state()]
 """State of the code from which the functions in JAX's caches were traced."""
 
 
-def _current_code(*, look: bool = False) -> CodeState:
+def _current_code(*, compare: bool = False) -> CodeState:
     """Return the state of the code, see `code_state`; after a change, clear all caches that depend on the former code."""
-    state = code_state(look=look)
+    state = code_state(compare=compare)
     if state != _traced_code[0]:
         with _clearing_lock:
             if state != _traced_code[0]:

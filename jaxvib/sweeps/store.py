@@ -55,7 +55,7 @@ def versions() -> dict[str, str]:
 
     The digest also shows whether parts of jaxvib were replaced in this process.
     """
-    changed = "" if code_state(look=True).is_on_disk else " with changes in this process"
+    changed = "" if code_state(compare=True).is_on_disk else " with changes in this process"
     return {name: importlib.metadata.version(name) for name in _PACKAGES} | {"sources": digest_of_sources()[:16] + changed}
 
 
