@@ -60,7 +60,7 @@ def read_number_of_place(place: object, allowed: str, last: int, name: str) -> i
 
 
 def on_body(at: int | Array | None, body: int) -> Place:
-    """Return the place `at` on the body with this number."""
+    """Return the place `at` on the body with the number `body`, from 0."""
     return at if body == 0 or isinstance(at, int) else BodyPoint(at, body)
 
 
@@ -255,8 +255,8 @@ class Machine(Part):
     ...     kind: str = eqx.field(static=True, default="table", kw_only=True)
     ...
     ...     def carrier(self):
-    ...         mass, stiffness, no = self.mass[None, None], self.stiffness[None, None], jnp.zeros((1, 1))
-    ...         return jv.Carrier(mass, no, stiffness, foundation_stiffness=stiffness, foundation_damping=no,
+    ...         mass, stiffness, zero = self.mass[None, None], self.stiffness[None, None], jnp.zeros((1, 1))
+    ...         return jv.Carrier(mass, zero, stiffness, foundation_stiffness=stiffness, foundation_damping=zero,
     ...                           coordinates=("y1",))
     ...
     ...     def mount(self, at=None):
@@ -369,9 +369,9 @@ class Machine(Part):
 def shapes_of(machine: Machine, at: Place = None) -> tuple[Carrier, Mount]:
     """Return the names, directions and shapes of the carrier, and of the mount of an exciter at `at`, without values."""
     platform, position = (at, None) if isinstance(at, int) else (None, at)
-    leaves, rest = jax.tree.flatten((machine, position))
+    leaves, treedef = jax.tree.flatten((machine, position))
     try:
-        return _structure(rest, tuple(map(shape_and_dtype, leaves)), jnp.result_type(float), platform)
+        return _structure(treedef, tuple(map(shape_and_dtype, leaves)), jnp.result_type(float), platform)
     except InputError:
         machine.mount(at)  # raises the same error, which then names the place
         raise
@@ -389,10 +389,10 @@ def shape_and_dtype(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
 
 @functools.lru_cache(maxsize=128)
 def _structure(
-    rest: Hashable, kinds: tuple[tuple[tuple[int, ...], np.dtype], ...], precision: np.dtype, platform: int | None
+    treedef: Hashable, kinds: tuple[tuple[tuple[int, ...], np.dtype], ...], precision: np.dtype, platform: int | None
 ) -> tuple[Carrier, Mount]:
     """Trace the carrier and the mount once for each structure and `precision`, because a trace takes longer than many runs."""
-    machine, position = jax.tree.unflatten(rest, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
+    machine, position = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
 
     def shapes(machine: Machine, position: Array | None) -> tuple[Carrier, Mount]:
         return machine.carrier(), machine.mount(position if platform is None else platform)

@@ -11,8 +11,8 @@ from jaxvib.results.fields import as_text
 
 
 def mass_names(scene: Scene) -> tuple[str, ...]:
-    """Return the names of the loads, and of the rotors of exciters without loads: "1" for the first load of a single exciter,
-    "2.1" for that of exciter 2, "2" for its rotor if it has no loads; none for a single exciter without loads."""
+    """Return the names of the loads, and of the rotors of exciters without loads: "2.1" is the first load of exciter 2, and "2"
+    its rotor if it has no loads. The loads of a single exciter have the names "1", "2", ...; its rotor has none."""
     counts = [0 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters]
     if len(counts) == 1:
         return tuple(str(j + 1) for j in range(counts[0]))
@@ -20,7 +20,7 @@ def mass_names(scene: Scene) -> tuple[str, ...]:
 
 
 def axis_labels(scene: Scene) -> dict[str, tuple[str, ...]]:
-    """Return the labels of results of a scene, or of a batch of scenes, by the name of the axis, see
+    """Return the labels of the axes of results of a scene, or of a batch of scenes, by the names of the axes, see
     `jaxvib.results.fields.labels_of`."""
     if np.ndim(scene.exciters[0].drive.speed):
         # The scenes of a batch have the same names. One of them is traced, so that no array is computed.

@@ -59,7 +59,7 @@ class LoadContact(Effect):
     >>> float(jv.LoadContact(stiffness=1e6).stiffness)
     1000000.0
 
-    Source: a linear spring and damper between the centres that never pull (Schwager and Poeschel 2007).
+    Source: a linear spring and a damper between the centres whose force never pulls (Schwager and Poeschel 2007).
     """
 
     stiffness: Array = eqx.field(metadata=unit("N/m", low=0.0, open_low=True, words="stiffness of contacts between loads"))
@@ -226,7 +226,7 @@ def _loss(ratio: Array) -> Array:
 
 
 class Tracks(NamedTuple):
-    """Tracks of loads at `stations`, m; `follower`: the next load on the same track, `turns`: 1 if it follows a turn later."""
+    """Tracks of loads at `stations`, m. `follower`: index of the next load on the track; `turns`: 1 if it follows a turn later."""
 
     stations: Array
     follower: Array

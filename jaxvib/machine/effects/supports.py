@@ -19,8 +19,8 @@ Side = Literal["above", "below", "both"]
 
 
 class _Support(Effect):
-    """Support on the foundation at a platform, or around a rotor's axis at a distance from its centre of mass. A subclass may
-    also act between two platforms."""
+    """Support on the foundation at a platform, or around a rotor's axis at a distance from the rotor's centre of mass. A
+    subclass may also act between two platforms."""
 
     repeatable = True
     platform: eqx.AbstractVar[int | None]
@@ -91,15 +91,16 @@ class CubicSupport(_Support):
         around the rotor's axis.
         """
         carrier = machine.carrier()
-        length = jnp.asarray([unit == "m" for unit in carrier.units])
-        motion = jnp.where(jnp.any(carrier.foundation_stiffness != 0.0, axis=0) & length, jnp.abs(amplitude), 0.0)
-        which = int(jnp.argmax(motion))
-        a = motion[which]
+        is_length = jnp.asarray([each == "m" for each in carrier.units])
+        is_supported = jnp.any(carrier.foundation_stiffness != 0.0, axis=0)
+        motion = jnp.where(is_supported & is_length, jnp.abs(amplitude), 0.0)
+        largest = int(jnp.argmax(motion))
+        a = motion[largest]
         if not float(a) > 0.0:
             return None
-        platform = which + 1 if machine.places == "platform" else None
+        platform = largest + 1 if machine.places == "platform" else None
         position = 0.0 if machine.places == "shaft" else None
-        stiffness = jnp.max(jnp.abs(carrier.foundation_stiffness[:, which])) * 0.04 / (3.0 * a**2)
+        stiffness = jnp.max(jnp.abs(carrier.foundation_stiffness[:, largest])) * 0.04 / (3.0 * a**2)
         return Typical(
             cls(stiffness, platform, position),
             f"mean stiffness 1 % of that of the support at an amplitude of {1e3 * float(a):.3g} mm",

@@ -170,7 +170,10 @@ class Friction(NamedTuple):
         return tuple(lever * size for lever in (self.lever, *self.others))
 
     def signed(self, a: Mapping[int, Array]) -> Friction:
-        """Return friction that is linear in the accelerations: N keeps the sign that it has at `a`."""
+        """Return friction that is linear in the accelerations: N keeps the sign that it has at `a`.
+
+        If `one_sided` is True, the friction of a load with a negative N is 0.
+        """
         sign = jnp.where(self._normal_force(a) < 0.0, 0.0 if self.one_sided else -1.0, 1.0)
         return self._replace(lever=self.lever * sign, others=tuple(lever * sign for lever in self.others))
 
@@ -236,7 +239,8 @@ class SupportForce:
     - `energy`, J: function of x
     - `resistance`: function of x and its rate that returns the dissipative force on the foundation, (k,) N; or None
     - `is_smooth`: True if the force has all derivatives
-    - `stiffness`: largest stiffness of the support, N/m, whose vibration equal steps must resolve; None if it has no limit
+    - `stiffness`: largest stiffness of the support, N/m, whose vibration equal steps must resolve; None if the stiffness is
+      unbounded or 0
     - `damping`, N s/m: largest slope of the resistance over the velocity, for a resistance that acts at every displacement;
       explicit steps must resolve the decay that it causes. None for a contact, and without a resistance
     - `contact_damping`: damping of a contact, N s/m, whose decay equal steps must resolve; None without a damper

@@ -19,7 +19,7 @@ _LOSS = re.compile(r"loss(?:\s+factor)?\s+" + _NUMBER_PATTERN + r"\s+at\s+(.+)")
 
 
 def damping_constants(damping: Numbers, field: str, stiffness: Array, mass: Callable[[], Array] | None = None) -> Numbers:
-    """Return dampings in which texts with a ratio or a loss factor are replaced by constants, N s/m.
+    """Return damping constants, N s/m, from values some of which are texts with a ratio or a loss factor.
 
         "5 %", "5 % of 250 kg":       c = 2 (0.05) sqrt(k m)
         "loss factor 0.1 at 16 Hz":   c = 0.1 k / (2 pi 16 Hz)

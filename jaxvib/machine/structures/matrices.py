@@ -82,7 +82,8 @@ class MatrixMachine(Machine):
 
         def check(mass: np.ndarray | float, stiffness: np.ndarray | float) -> None:
             for name, matrix in (("mass", np.atleast_2d(mass)), ("stiffness", np.atleast_2d(stiffness))):
-                positive = name == "mass" and matrix.dtype == np.float64  # single precision cannot show it
+                # In single precision, rounding can make the smallest eigenvalue of a positive definite matrix negative.
+                positive = name == "mass" and matrix.dtype == np.float64
                 whole = (matrix + matrix.T) / 2.0
                 require_definite(whole, f"machine.{name}", positive=positive, tolerance=_REDUCTION_ERROR)
 
@@ -105,7 +106,7 @@ def from_matrices(
 ) -> MatrixMachine:
     """Return a machine with the matrices of any linear model, such as a finite-element model of a flexible rotor.
 
-        M q'' + (C + n G) q' + K q = forces,        q = Phi r,    K Phi = M Phi diag(w^2),    Phi^T M Phi = m
+        M q'' + (C + n G) q' + K q = forces,        q = Phi r,    K Phi = M Phi diag(w^2),    Phi^T M Phi = m I
 
     A model with more than `reduce` coordinates is reduced to its lowest real normal modes, which are computed without damping
     and rotation. The coordinates of the machine are then the modal amplitudes r, and results for coordinates are values of r.

@@ -149,7 +149,8 @@ def one_mass(*, mass: Number, stiffness: Number, damping: Number) -> Platforms:
     - `stiffness` k of the support, N/m; typical: 1e4 to 1e6. Also a static deflection with the mass or force that causes it,
       "25 mm under 650 kg"
     - `damping` b of the support, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M). Also
-      a ratio of it, "5 %", or a loss factor of rubber at a frequency of vibration, "loss factor 0.1 at 16 Hz": b = 0.1 k/omega
+      a ratio to the critical damping, "5 %", or a loss factor of rubber at a frequency of vibration, "loss factor 0.1 at 16
+      Hz": b = 0.1 k/omega
 
     **Returns** `Platforms`. **Raises** `InputError` for a mass that is not positive or a negative coefficient.
 
@@ -181,7 +182,7 @@ def two_mass(
     - `mass` (2,) of the platforms, kg, loads not included; typical: 50 to 5000
     - `stiffness` (2,) of the supports, N/m; typical: 1e4 to 1e6, 0 without a support
     - `damping` (2,) of the supports, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M) of
-      the platform on its support alone. Also a ratio of it, "5 %", or a loss factor, see `one_mass`
+      the platform on its support alone. Also a ratio to the critical damping, "5 %", or a loss factor, see `one_mass`
     - `link_stiffness` of the link, N/m; typical: 5e4 to 5e6, that is 1 to 10 times that of a support
     - `link_damping` of the link, N s/m; typical: as `damping`. A ratio is relative to the two platforms on the link alone, that
       is to the mass M_1 M_2/(M_1 + M_2)

@@ -194,8 +194,8 @@ def rotor(
     - `damping` (2,) of the supports, N s/m; typical: 100 to 1000; also a ratio "5 %" or a loss factor, see `one_mass`. With
       "5 %" at both supports the translation of the rotor without tilt has this ratio (without `stiffness_terms`)
     - `position` (2,) of the supports along the axis, m from the centre of mass, one side negative; typical: 0.1 to 0.5
-    - `stations` of the loads along the axis, m from the centre of mass, one number for all loads or one for each load (a list
-      of equal numbers counts as one number); typical: -0.3 to 0.3, default 0
+    - `stations` of the loads along the axis, m from the centre of mass: one number for all loads, or one for each load;
+      typical: -0.3 to 0.3, default 0. A list of equal numbers counts as one number
     - `stiffness_terms` (c1, c2, c3) in N/m, N, N m: a list of three in place of the terms that follow from the supports;
       typical: c1 1e6, c2 -2e4 to 2e4, c3 3e4
     - `damping_terms` (b1, b2, b3) in N s/m, N s, N m s: a list of three in place of the terms that follow from the supports;
@@ -243,29 +243,29 @@ def rotor(
     found = {**read(mass=mass), **read(2, stiffness=stiffness)}
     k = found["stiffness"]
     found |= read(2, damping=damping_constants(damping, "machine.damping", k, lambda: found["mass"] * k / jnp.sum(k)))
-    up = read(2, stiffness_up=stiffness_up)["stiffness_up"]
-    resisting = None
+    k_up = read(2, stiffness_up=stiffness_up)["stiffness_up"]
+    c_up = None
     if damping_up is not None:
-        vertical = k if up is None else up
+        vertical = k if k_up is None else k_up
         constants = damping_constants(
             damping_up, "machine.damping_up", vertical, lambda: found["mass"] * vertical / jnp.sum(vertical)
         )
-        resisting = read(2, damping_up=constants)["damping_up"]
+        c_up = read(2, damping_up=constants)["damping_up"]
     return Rotor(
         **found,
-        stations=_without_equal(read(stations=stations)["stations"]),
+        stations=_merge_equal(read(stations=stations)["stations"]),
         transverse_inertia=transverse,
         polar_inertia=polar,
         position=places,
         stiffness_terms=terms("stiffness_terms", stiffness_terms),
         damping_terms=terms("damping_terms", damping_terms),
-        stiffness_up=up,
-        damping_up=resisting,
+        stiffness_up=k_up,
+        damping_up=c_up,
         kind="rotor",
     )
 
 
-def _without_equal(stations: Array) -> Array:
+def _merge_equal(stations: Array) -> Array:
     """Return stations (n,), or one station () if all are equal."""
     distinct = when_known(_distinct, stations)
     stations = stations if distinct is None else jnp.asarray(distinct, stations.dtype)
@@ -379,12 +379,12 @@ def planar_rotor(
     found = read(mass=mass, stiffness=stiffness)
     k = found["stiffness"]
     found |= read(damping=damping_constants(damping, "machine.damping", k, lambda: found["mass"]))
-    up = read(stiffness_up=stiffness_up)["stiffness_up"]
-    resisting = None
+    k_up = read(stiffness_up=stiffness_up)["stiffness_up"]
+    c_up = None
     if damping_up is not None:
-        vertical = damping_constants(damping_up, "machine.damping_up", k if up is None else up, lambda: found["mass"])
-        resisting = read(damping_up=vertical)["damping_up"]
-    return PlanarRotor(**found, stiffness_up=up, damping_up=resisting, kind="planar_rotor")
+        constant = damping_constants(damping_up, "machine.damping_up", k if k_up is None else k_up, lambda: found["mass"])
+        c_up = read(damping_up=constant)["damping_up"]
+    return PlanarRotor(**found, stiffness_up=k_up, damping_up=c_up, kind="planar_rotor")
 
 
 def _require_one_value(**values: Number) -> None:
