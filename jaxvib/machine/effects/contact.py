@@ -226,7 +226,7 @@ def _loss(ratio: Array) -> Array:
 
 
 class Tracks(NamedTuple):
-    """Tracks of loads at `stations`, m. `follower`: index of the next load on the track; `turns`: 1 if it follows a turn later."""
+    """Tracks of loads at `stations`, m. `follower`: index of the next load on the track; `turns`: 1 if it is a turn later."""
 
     stations: Array
     follower: Array
