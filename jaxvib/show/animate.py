@@ -129,7 +129,7 @@ def animate(
     return animation
 
 
-def _scene_of(motion: object, scene: Scene | None) -> Scene | None:
+def _scene_of(motion: Run | Orbit, scene: Scene | None) -> Scene:
     if isinstance(motion, Run):
         if scene is not None:
             raise InputError("scene", "is only for an Orbit, because a run contains its scene; leave it out")
