@@ -153,6 +153,7 @@ class Dimensionless(Readable):
         return self.mass_scale * self.frequency_scale**2 * self.length_unit
 
     def _by_platform(self, others: Array | np.ndarray, exciter: float) -> Array:
+        """Return values in the order of the platforms: `exciter` for the platform with the exciter, between the `others`."""
         others = numpy_if_known(others)  # within `jit` even a slice of a JAX array is traced
         index = min(1, others.shape[0])
         return array_module(others).concatenate([others[:index], np.full(1, exciter, dtype=others.dtype), others[index:]])

@@ -108,8 +108,8 @@ _HINTS = (
 def read_toml(path: str | Path) -> Tables:
     """Return the tables of a TOML file.
 
-    **Raises** `InputError` for a file that is missing, is not TOML, is larger than 16 MB, is nested too deep, or has control
-    characters or numbers of thousands of digits.
+    **Raises** `InputError` for a file that is missing, not TOML, larger than 16 MB or nested too deeply, and for control
+    characters and numbers of thousands of digits.
     """
     return _tables(read_text(path, "a TOML file, in UTF-8 as `jaxvib new ... --out DIR` writes it"), str(path))
 
@@ -361,8 +361,8 @@ def require_fields(table: Mapping[str, object], allowed: Collection[str], sectio
 def build_part(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
     """Return the part that the constructor `build` makes of the fields of a table.
 
-    Tables in these fields (supports, bodies, a drag from its cause, a mass from its material, a drive within a drive) are
-    replaced by their parts or values first.
+    Before the call, tables in these fields are replaced by their parts or values: supports, bodies, a drag from its cause, a
+    mass from its material, and a drive within a drive.
 
     **Raises** `InputError` for an unknown or missing field, which the message names as `section.name`.
     """

@@ -64,7 +64,7 @@ class Loads(Part):
 
     - `mass` of a load, kg; typical: 0.05 to 1
     - `count`: number of loads; typical: 1 to 4
-    - `kind`: its name in scene files
+    - `kind`: name of this kind of loads in scene files
 
     >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
     >>> class Beads(jv.Loads):

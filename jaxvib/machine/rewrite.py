@@ -44,7 +44,7 @@ def rewrite_scene(text: str, scene: Scene) -> str:
     read, new = tomllib.loads(text), tomllib.loads(scene_to_toml(scene))
     try:
         old = tomllib.loads(scene_to_toml(scene_from_toml(text)))
-    except ValueError:  # the text refers to a file of torques, and the folder of this file is not known here
+    except ValueError:  # the text refers to a file of torques, whose folder is not known here
         return scene_to_toml(scene)
     section: _Path = ()
     counts: dict[_Path, int] = {}
@@ -115,7 +115,7 @@ def _value_at(tables: object, path: _Path) -> object:
 
 def _rewritten_line(line: str, entry: re.Match[str], read: object, old: object, new: object, is_other_machine: bool) -> str:
     """Return a line with the value `new`, SI, in place of its value `read`, which is `old` in SI. If the machine has changed, a
-    damping ratio becomes a number, because it is no longer the same although the damping is."""
+    damping ratio becomes a number: the damping is still the same, but the ratio is not."""
     if old is None or new is None or (_is_close(old, new) and not (is_other_machine and _RELATIVE.search(entry[3]))):
         return line
     comment = f"; {entry[6]}" if entry[6] else ""

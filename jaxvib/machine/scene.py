@@ -60,7 +60,7 @@ class Exciter(Part):
     - a direction other than +1 or -1
     - an exciter with neither loads nor an unbalance
     - an `unbalance_mass` without an `unbalance`
-    - the rotor of a motor with less inertia than its unbalance alone, m r^2 = S^2/m
+    - a motor whose rotor has less inertia than the unbalance alone, m r^2 = S^2/m
 
     >>> import jaxvib as jv
     >>> motor = jv.DCMotor("1500 rpm", stall_torque=20.0, inertia=0.05)
@@ -149,8 +149,8 @@ def unbalance(*, force: Number, at: Number) -> Array:
 
     **Arguments** (SI, or strings with a unit, greater than 0)
 
-    - `force` F, N, at that speed; typical: "1 kN" to "200 kN"
-    - `at` w, rad/s: the speed at which the force is stated; typical: "750 rpm" to "3000 rpm"
+    - `force` F, N, at the speed w; typical: "1 kN" to "200 kN"
+    - `at` w, rad/s: the speed for which the catalogue states the force; typical: "750 rpm" to "3000 rpm"
 
     **Returns** S, kg m. **Raises** `InputError` for a wrong unit, a value that is not positive, and a plain number above 700
     for the speed, which was probably meant in rpm.
@@ -176,7 +176,8 @@ def read_unbalance(drive: Drive, unbalance: Number | None, unbalance_mass: Numbe
         if error.field != "unbalance" or not _is_force(unbalance):
             raise
         needs = f"{{ force = '{unbalance}', at = '1500 rpm' }}"
-        problem = f"is {quoted(unbalance)}, a force; state its speed too, as {needs} in a file, by jaxvib.unbalance in Python"
+        advice = f"state the speed of this force too: in a file by {needs}, in Python by jaxvib.unbalance"
+        problem = f"is {quoted(unbalance)}, a force; {advice}"
         raise InputError("unbalance", problem) from error
     if mass is not None and not drive.ideal:
         when_known(_require_inertia, moment, mass, drive.inertia)  # pyright: ignore[reportAttributeAccessIssue]
@@ -276,7 +277,7 @@ class Scene(Part):
                 _require_fit(machine, exciter)
 
     def __repr__(self) -> str:
-        """Return the scene as the text of a scene file with units; traced scenes and own kinds of parts as their fields."""
+        """Return the text of a scene file with units; for a traced scene or a part of a user's class, return the fields."""
         files = importlib.import_module("jaxvib.machine.files")  # imports this module
         try:
             return files.scene_text(self).rstrip()
@@ -310,7 +311,7 @@ class Scene(Part):
         if len(self.exciters) != 1:
             problem = f"has {len(self.exciters)} exciters; this function needs a scene with one exciter"
             instead = "for others use simulate, settle, envelope, response or synchronous_regimes (command regimes)"
-            raise InputError("scene", f"{problem}; {instead}; their parts are scene.exciters[0].drive and so on")
+            raise InputError("scene", f"{problem}; {instead}; parts of an exciter are scene.exciters[0].drive and so on")
         return self.exciters[0]
 
     @property
@@ -413,8 +414,8 @@ def _require_stations(levers: Sequence[Array | None], loads: Loads | None) -> No
 
 
 def _require_fit(machine: Machine, exciter: Exciter) -> None:
-    """**Raises** `InputError` for an effect that does not fit the machine, the loads or the drive, and for loads whose mass or
-    drag would be lost in rounding errors."""
+    """**Raises** `InputError` for an effect that does not fit the machine, the loads or the drive, and for loads that are not
+    comparable with the machine, see `require_comparable`."""
     loads = exciter.loads
     for effect in exciter.effects:
         tilts = any(term.about_tilts for term in terms_of([effect], RotorImbalance))
@@ -502,11 +503,12 @@ def _require_comparable(
     speed = float(speed)
     each = np.broadcast_to(np.asarray(mass, dtype=float), (count,))
     if platforms is not None:
-        whole, total = float(np.sum(platforms)), float(np.sum(each))
-        if not _MIN_RATIO <= total / whole <= 1.0 / _MIN_RATIO:
+        machine_mass, loads_mass = float(np.sum(platforms)), float(np.sum(each))
+        if not _MIN_RATIO <= loads_mass / machine_mass <= 1.0 / _MIN_RATIO:
+            mass_text = f"gives {loads_mass:.3g} kg for all loads on a machine of {machine_mass:.3g} kg"
             raise InputError(
                 "loads.mass",
-                f"gives {total:.3g} kg for all loads on a machine of {whole:.3g} kg; one of them is lost in rounding errors; "
+                f"{mass_text}; one of them is lost in rounding errors; "
                 f"loads may have {_MIN_RATIO:g} to {1.0 / _MIN_RATIO:g} times the machine's mass",
             )
     if drag is not None:

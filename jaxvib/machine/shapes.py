@@ -37,8 +37,8 @@ def _is_of_package(part: Part) -> bool:
 
 
 def _once_for_each_structure(check: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that checks a part outside the package by tracing, once for each structure, shapes and default dtype of
-    the part and of the other parts on which its result depends."""
+    """Return a function that applies a check by tracing, if the class of the first part is not of this package. Parts of equal
+    structure, shapes and default dtype are checked once. The other parts are those on which the check depends."""
 
     @functools.lru_cache(maxsize=256)
     def on_shapes(structure: Hashable, shapes: tuple[tuple[Shape, np.dtype], ...], dtype: np.dtype) -> None:

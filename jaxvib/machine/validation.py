@@ -134,8 +134,8 @@ _MIN_STIFFNESS_RATIO = 5e-3
 """Smallest usual ratio of two stiffnesses of supports."""
 
 _MIN_AMPLITUDE, _MAX_AMPLITUDE = 1e-5, 0.05
-"""Smallest and largest usual amplitude above the resonances of a machine that unbalances excite, the sum of the unbalances
-divided by the mass, m."""
+"""Smallest and largest usual amplitude above the resonances of a machine that unbalances excite, m: the sum of the unbalances
+divided by the mass."""
 
 _MIN_POWER = 0.05
 """Smallest usual rated power of a motor for each kg of the machine, W; usual values are about 1."""
@@ -215,11 +215,12 @@ _SWING_SHARE = 0.7246113537767085
 
 
 def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
-    """Return, for each exciter, 0.7246 S g, the least constant torque that turns a hanging unbalance over the top, and the
-    torque of the motor at rest, N m; None without a motor, an unbalance or gravity, or if the torque at rest changes in a run.
+    """Return two torques for each exciter, N m: the least constant torque that turns its hanging unbalance S over the top,
+    0.7246 S g, and that of the motor at rest. The entry is None without a motor, an unbalance or gravity, or if the torque at
+    rest changes during a run.
 
-    S contains the static imbalances. The unbalance swings past the height at which the torque would hold it:
-    torque x > S g (1 - cos x) for every angle x.
+    S contains the static imbalances. The condition is torque x > S g (1 - cos x) for every angle x: the unbalance swings past
+    the height at which the torque would hold it.
     """
     gravity = total_gravity(scene.all_effects)
     found: list[tuple[Array, Array] | None] = []
@@ -258,7 +259,7 @@ the working speeds of the templates of screens, and 0.29 to 0.36 at their lowest
 
 
 def weight_notes(scene: Scene, slowest: Mapping[int, float]) -> list[str]:
-    """Return a sentence about the exciter on whose speed the weight of its unbalance acts most, if this effect is large.
+    """Return a sentence about the exciter whose speed the weight of its unbalance changes most, if this change is large.
     `slowest`: lowest speed, rad/s, of stable averaged motions by the number of the exciter."""
     shares = {k: each / slowest[k] ** 2 for k, each in weight_accelerations(scene).items() if k in slowest}
     k = max(shares, key=lambda k: shares[k], default=None)
@@ -303,7 +304,7 @@ def start_notes(scene: Scene, exciters: Iterable[int] | None = None) -> list[str
 
 
 def off_notes(scene: Scene) -> list[str]:
-    """Return a sentence about the motors that a run switches off at some time: steady motions are those without them.
+    """Return a sentence about each motor that is switched off during a run: steady motions are those after this time.
 
     >>> import jaxvib as jv
     >>> motor = jv.SwitchedOff(jv.DCMotor(100.0, stall_torque=2.5, inertia=0.5), at="8 s")

@@ -26,7 +26,7 @@ class Drive(Part):
 
     - `speed`: working speed, for which steady states are computed, rad/s: the final speed of an ideal drive, the no-load speed
       of a motor; typical: 60 to 320 (600 to 3000 rpm)
-    - `kind`: its name in scene files
+    - `kind`: name of this kind of drive in scene files
 
     An `IdealDrive` prescribes the rotor speed. With a `Motor` the rotor's angle and speed are states.
 
@@ -113,7 +113,7 @@ class Drive(Part):
 
 
 class Directed(Drive):
-    """Drive that turns its rotor in a direction: angles, speeds and torques are those of `drive` times `direction`, everything
+    """Drive that turns its rotor in a direction: angles, speeds and torques are those of `drive` times `direction`. Everything
     else, including the attribute `speed`, is that of `drive`.
 
     `direction` is an array of 1 or -1, so that one compiled program serves both directions. None means clockwise;
@@ -509,7 +509,8 @@ def kloss_torque(slip: Array, breakdown_torque: Array, breakdown_slip: Array) ->
 
 
 class MotorWrapper(Motor):
-    """Motor that changes the torque of another one, `motor`; everything else is that of `motor`."""
+    """Motor that changes the torque of another one, `motor`. Everything else is that of `motor`, except `supply_frequency`,
+    which is None unless a subclass defines it."""
 
     motor: eqx.AbstractVar[Motor]
 

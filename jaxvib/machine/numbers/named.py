@@ -42,8 +42,8 @@ _SECTIONS: dict[str, type[eqx.Module]] = {
 class NamedNumber(NamedTuple):
     """Parameter of a scene, or array of parameters with one unit.
 
-    **Attributes**: `path` of attributes and indices from the scene to the array; `entry` of the array, None for all of it;
-    `size`: number of parameters; `spec` of the field.
+    **Attributes**: `path` of attributes and indices from the scene to the array; `entry`: index of the parameter in the array,
+    None for all entries; `size`: number of parameters; `spec`: specification of the field.
     """
 
     name: str
@@ -255,8 +255,8 @@ def put_numbers(scene: Scene, parameters: Sequence[NamedNumber], values: Array |
 
 
 def present_numbers(scene: Scene, array: NamedNumber, field: str) -> tuple[NamedNumber, ...]:
-    """Return the array, or only its entries other than 0 if it keeps its zeros: only a named entry adds a spring or a damper.
-    **Raises** `InputError` that names `field` if no entry is left."""
+    """Return the array, or only its entries other than 0 if it keeps its zeros: a spring or damper is added only if its entry
+    is named. **Raises** `InputError` that names `field` if no entry is left."""
     values = np.asarray(array.leaf(scene))
     if not array.keeps_zeros(scene) or np.all(values != 0.0):
         return (array,)

@@ -71,8 +71,8 @@ class MatrixMachine(Machine):
         return self._all_rows(place, name)[:2]
 
     def require_valid(self) -> None:
-        """**Raises** `InputError` for arrays whose shapes do not fit, and for a mass or stiffness matrix whose symmetric part
-        is indefinite: a sweep or a design may change one of two symmetric entries without the other."""
+        """**Raises** `InputError` for arrays whose shapes do not fit, and for an indefinite mass or stiffness matrix. Only the
+        symmetric part is checked, because a sweep or a design may change one of two symmetric entries without the other."""
         size, rows = self.places_rows.shape[-1], self.foundation
         for name in ("mass", "damping", "stiffness", "gyroscopic"):
             if (matrix := getattr(self, name)) is not None and matrix.shape != (size, size):
