@@ -117,8 +117,8 @@ class Averaged(eqx.Module):
     - `port` (levers, p, nd): B and, if loads have stations, T, of each exciter, in the p directions of the mount;
       `input_matrix`: M^-1 times their transposes, (levers, p, nd)
     - `levers` g (levers, count): 1 and, if loads have stations, s_j in m; 0 for the rows of other exciters. None if there would
-      be more rows than coordinates: then `port` and `input_matrix` have a row B_j for each mass, and the equations are solved
-      for the accelerations of the coordinates, so that their cost is linear in the number of masses
+      be more rows than coordinates. `port` and `input_matrix` then have a row B_j for each mass, and the equations are solved
+      for the accelerations of the coordinates; the cost is linear in the number of masses
     - `unbalance` S_j kg m, `inertia` I_j kg m^2, `drag` D_j N m s of each rotating mass, all (count,)
     - `groups` of the exciters' drives, see `Group`
     - `axes`: the p directions of the mount, 0 horizontal, 1 up
@@ -215,8 +215,8 @@ class Averaged(eqx.Module):
             (shift - a - b/shift) dw = Re(c^H dA) + r_w + (b/shift) (r_psi - dOmega),   shift dpsi = dw - dOmega + r_psi
             (shift + i Omega) (dY, dV) = (dV - i Y dOmega + r_Y, dA - i V dOmega + r_V),   dOmega = mean of dw
 
-        Here a and b are the derivatives of a mass's acceleration w' with respect to its speed and its phase, Re(c^H dA) is its
-        derivative along the change dA of the acceleration, and dA follows from the equation of the carrier.
+        Here a and b are the derivatives of a mass's acceleration w' with respect to its speed and its phase. Re(c^H dA) is the
+        change of w' due to the change dA of the acceleration A. dA follows from the equation of the carrier.
         """
         _, rate, forward = self._accelerations(t, state)
         omega, nd = jnp.mean(state.rate), state.velocity.shape[0]
@@ -301,7 +301,10 @@ class Averaged(eqx.Module):
 
     def driving_torque(self, t: Array, speeds: Sequence[Array], rate: Array) -> Array:
         """Return the torque of the drag on each load and of the motor on each unbalance (0 for a prescribed speed), (count,)
-        N m, at the time `t`, s, the `speeds` of `rotor_speeds` and the `rate` of each mass, rad/s."""
+        N m.
+
+        **Arguments**: `t`, s; `speeds` of the rotors, see `rotor_speeds`; `rate` (count,) of the masses, rad/s.
+        """
         if len(self.counts) == 1 and self.counts[0]:
             return self.drag * (speeds[0] - rate)
         torques = []

@@ -211,8 +211,8 @@ class RotorDynamics(eqx.Module):
         return self.drive.torque_and_inertia(motion.time, motion.driven_speed, states)
 
     def _braking_torque(self, motion: Motion, drag_torque: Array, coupling: Axes) -> tuple[Array, list[Array]]:
-        """Return (T, c) of the torque T + c . a, N m, with which loads, gravity and imbalance brake the rotor, with entries of
-        c for the first scalar rows of the mount only, the others being 0."""
+        """Return T and c: loads, gravity and imbalance brake the rotor with the torque T + c . a, N m. c has entries for the
+        first scalar rows of the mount; for the other rows it is 0."""
         torque = self._total(drag_torque)
         torque = torque if motion.weight_torque is None else torque + motion.weight_torque
         by_loads = [self._total(coupling[i], lever) for lever in self.levers for i in self.axes] if coupling else []
@@ -236,8 +236,8 @@ class RotorDynamics(eqx.Module):
         return part._replace(added_mass=added_mass, reaction=[*part.reaction, torque], rotor=rotor)
 
     def _imbalance_derivatives(self, t: Array, state: ExciterState) -> tuple[list[Array], list[Array]] | None:
-        """Return two derivatives of d(theta), the first moment of the unbalance and of the imbalances of the effects for each
-        row of the mount, kg m (kg m^2 for tilts); None without them.
+        """Return two derivatives of d(theta), which has an entry for each row of the mount: the first moment of the unbalance
+        and of the imbalances of the effects, kg m (kg m^2 for tilts). Return None without unbalance and imbalances.
 
         The first derivative is d'. The second is d'' theta'^2 under a motor, and the second time derivative of d under an ideal
         drive.
@@ -272,9 +272,12 @@ class RotorDynamics(eqx.Module):
         return list(first), second
 
     def weight_torque(self, t: Array, state: ExciterState) -> Array | None:
-        """Return g dh/dtheta, the torque of gravity against the rotor's rotation, with the upward component
-        h = S sin(theta) + sum M e sin(theta + angle) of the first moment of the unbalance and of the imbalances of the effects,
-        kg m; None without these, or without gravity in the rotor's plane."""
+        """Return g dh/dtheta, the torque of gravity against the rotor's rotation, N m; None without unbalance and imbalances,
+        or without gravity in the rotor's plane.
+
+        h = S sin(theta) + sum M e sin(theta + angle) is the upward component of the first moment of the unbalance and of the
+        imbalances of the effects, kg m.
+        """
         g, imbalances = total_gravity(self.effects), static_imbalances(self.effects)
         if 1 not in g or (self.unbalance is None and not imbalances):
             return None
@@ -369,8 +372,8 @@ class ExciterDynamics(RotorDynamics):
         return self._forces(state, speed, rotation=False)[1]
 
     def _forces(self, state: ExciterState, speed: Array, *, rotation: bool = True) -> tuple[Array, list[Array]]:
-        """Return the torque of the drag, and the generalized forces on the loads without friction and, if `rotation` is False,
-        without those that turn a load about its own centre."""
+        """Return the torque of the drag, and the generalized forces on the loads without friction. If `rotation` is False, the
+        forces that turn a load about its own centre are not included either."""
         loads = self.loads
         resistance = loads.resistance(state.angle, state.rate, speed)
         force = list(resistance)
@@ -387,8 +390,8 @@ class ExciterDynamics(RotorDynamics):
         return resistance[0], force
 
     def _add_friction(self, drag_torque: Array, contact: ContactSolution) -> tuple[Array, list[Array], list[Axes]]:
-        """Return the drag and the forces with the friction that does not depend on the accelerations, and for each coordinate
-        of a load the friction per acceleration, by axis; {} without such friction."""
+        """Return the drag torque and the forces, both with the friction at zero acceleration, and for each coordinate of a load
+        the friction per acceleration, by axis; {} if the friction does not depend on the accelerations."""
         force, coupling = list(contact.force), [dict[int, Array]() for _ in contact.force]
         for each in contact.friction:
             frictions = [lever * each.static_normal_force for lever in (each.lever, *each.others)]

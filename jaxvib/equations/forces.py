@@ -2,9 +2,9 @@
 
 Symbols: q are the coordinates of the carrier, M, C and K its mass, damping and stiffness matrices. P maps q to the displacement
 of the axis of the rotor, and B_j to that of the point that carries load j. theta is the angle of the rotor. Load j has the mass
-m_j, the coordinates u_j (the angle phi_j for a load on a circle of radius R), the position p_j(u_j) relative to its point, and
-the inertia factor kappa_j (7/5 for balls). b_W is the drag. The prime of d(theta) is d/dtheta; all other primes are time
-derivatives.
+m_j, the inertia factor kappa_j (7/5 for balls), the coordinates u_j, and the position p_j(u_j) relative to its point. u_j is
+the angle phi_j for a load on a circle of radius R. b_W is the drag. The prime of d(theta) is d/dtheta; all other primes are
+time derivatives.
 """
 
 from __future__ import annotations
@@ -289,8 +289,11 @@ def _drive_torque(
     acceleration: Array,
     rotor: tuple[Array, Array, Array],
 ) -> Array:
-    """Return the torque of a drive, N m, from the `acceleration` of the carrier, and the angle, the speed relative to the
-    housing and the braking torque of the loads of its `rotor`."""
+    """Return the torque of a drive, N m.
+
+    **Arguments**: `acceleration` of the carrier; `rotor`: angle of the rotor, its speed relative to the housing, and the torque
+    with which the loads brake it.
+    """
     turn, driven, braking = rotor
     motor = dynamics.drive.torque_and_inertia(t, driven, (state.rotor or ())[2:])
     if motor is not None:
@@ -301,8 +304,10 @@ def _drive_torque(
 
 
 def drive_torques(model: Model, field: Dynamics, t: Array, state: State) -> tuple[Array, Array]:
-    """Return the torque of each drive in the direction of its rotation, N m, and its power, W, as arrays (exciters,), without
-    the torque with which the rotor changes the spin of loads that spin or slide. `field`: `dynamics_of(model)`."""
+    """Return the torque of each drive in the direction of its rotation, N m, and its power, W, as arrays (exciters,).
+
+    The torque with which the rotor changes the spin of loads that spin or slide is not included. `field`: `dynamics_of(model)`.
+    """
     change, torques, powers = field(t, state), [], []
     for exciter, dynamics, mount, part in zip(model.scene.exciters, field.exciters, model.mounts, state.exciters, strict=True):
         turn, speed = dynamics.drive.rotor_angle(t, part.rotor), dynamics.drive.rotor_speed(t, part.rotor)
@@ -345,8 +350,8 @@ def _load_power(
 def _spin_power(
     exciter: ExciterDynamics, state: ExciterState, change: ExciterState, at_load: Mapping[int, Array], speed: Array
 ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
-    """Return the sliding velocity c as rates of the coordinates, c_i / |dp/du_i|, the power of the rotor to loads that spin and
-    slide, W, and the power that sliding dissipates, W, without rolling friction."""
+    """Return the sliding velocity c as rates of the coordinates, c_i / |dp/du_i|, and two powers, W: that of the rotor to loads
+    that spin and slide, and that which sliding dissipates, without rolling friction."""
     loads, spin, zero = exciter.loads, state.spin, jnp.zeros(())
     if spin is None:
         return (), (zero, zero)
@@ -374,8 +379,8 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
         N = m (z - n . (a + g e)),      z = R phi'^2 for a load on a circle,      see `Loads.normal_force`
 
     m is the mass of the load, R the radius of its circle and phi its angle. z is the centrifugal acceleration of the motion of
-    the load relative to the point that carries it, a the acceleration of this point, n the direction in which the load presses,
-    g the acceleration of gravity, and e the unit vector against gravity.
+    the load relative to the point that carries it, and a the acceleration of this point. The load presses in the direction n. g
+    is the acceleration of gravity, and e the unit vector against gravity.
     If N is negative, the equations keep the load on its track. Its friction is then proportional to |N| on a circle and 0 in a
     torus.
 

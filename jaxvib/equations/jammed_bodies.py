@@ -25,8 +25,8 @@ Points = Array | np.ndarray
 class JammedBodies(eqx.Module):
     """Scene whose loads are G rigid bodies. It is assembled once for each analysis and passed on.
 
-    Identical loads form one body: they are coincident or, if they have a `ball_radius`, side by side. If loads differ, each
-    load is a separate body with its own angle.
+    Loads that share each parameter (`CircularLoads.alike`) form one body: they are coincident or, if they have a `ball_radius`,
+    side by side. Otherwise each load is a separate body with its own angle.
 
     **Attributes**
 

@@ -119,8 +119,8 @@ class LinearModel(Model):
         """Return this model with its modal form, which is faster for many load speeds; `direction` (count, nd) of the forces of
         several masses, default: that of the model.
 
-        Models of up to 3 coordinates have no modal form, because a direct solution takes no longer, and models with gyroscopic
-        coupling have none, because it does not include this coupling.
+        Two kinds of models have no modal form: those of up to 3 coordinates, because a direct solution takes no longer, and
+        those with gyroscopic coupling, which the modal form does not include.
         """
         if self.mass.shape[0] <= _MAX_DIRECT_SIZE or self.mounts[0].gyroscopic is not None:
             return self
@@ -339,9 +339,12 @@ def turning_loads(
 ) -> CircularLoads:
     """Return the loads of a scene, for an analysis of loads on circles in a rotor of prescribed speed.
 
-    **Raises** `InputError` that names the property or the term: for a body in a plane (the housing of its exciter rotates), for
-    loads that are not `circular`, for a drive that is not `ideal`, and for effects with terms that are not `included`; with
-    `at_one_point` also for loads at several stations.
+    **Raises** `InputError`, which names the property or the term, for
+
+    - a body in a plane, because the housing of its exciter rotates
+    - loads that are not `circular`, and a drive that is not `ideal`
+    - effects with terms that are not `included`
+    - loads at several stations, if `at_one_point` is True
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")

@@ -27,8 +27,8 @@ T = TypeVar("T")
 
 
 class Group(eqx.Module, Generic[Part]):
-    """One `part` of an exciter, or the parts of several exciters of the same structure as one, whose arrays have a leading axis
-    over the exciters; `members`: the numbers of the exciters."""
+    """Parts of one or several exciters, whose numbers are the `members`. Parts of several exciters have equal structure and are
+    stored as one `part`, whose arrays have a leading axis over the exciters."""
 
     part: Part
     members: tuple[int, ...] = eqx.field(static=True)
@@ -104,13 +104,16 @@ class Model(eqx.Module):
         return force if self.scene.machine.has_foundation else jnp.full_like(force, jnp.nan)
 
     def vibration_force(self, displacement: Array, omega: Array) -> Array:
-        """Return the complex amplitudes of the force of the carrier's supports, without effects, on the foundation, N, from
-        those of the coordinates (nd,) or (nd, K) with one frequency or one for each column; NaN if the foundation is
-        unknown."""
+        """Return the complex amplitudes of the force of the carrier's supports, without effects, on the foundation, N; NaN if
+        the foundation is unknown.
+
+        **Arguments**: `displacement` (nd,) or (nd, K): complex amplitudes of the coordinates; `omega`: their frequency, or one
+        for each column, rad/s.
+        """
         return self.known_force(self.carrier.foundation_force(displacement, 1j * omega * displacement))
 
     def natural_force(self, unit: State) -> Array:
-        """Return S n^2, N: the centrifugal force of the unbalance S at the rotor speed n, from `natural_units`."""
+        """Return S n^2, N: the centrifugal force of the unbalance S at the rotor speed n. `unit`: state of `natural_units`."""
         speeds = [each.rate[0] for each in unit.exciters if each.rate] or [unit.velocity / unit.displacement]
         speed = functools.reduce(jnp.maximum, speeds)
         return jnp.mean(jnp.diagonal(self.carrier.mass)) * unit.displacement * speed**2

@@ -84,8 +84,8 @@ def contact_force(
 class ContactSolution(NamedTuple):
     """Inertia factor `kappa`, generalized `force` and `friction` of loads, each of which either rolls or slides.
 
-    `on_rotor`: the friction that brakes the rotor, if it is not `friction`. It does not include the contact forces, neither
-    those of sliding loads nor those of rolling loads.
+    `on_rotor`: the friction that brakes the rotor; None if it is `friction`. It does not include the contact forces of sliding
+    and rolling loads.
     """
 
     kappa: Array
@@ -106,7 +106,7 @@ def resolve_contact(
     centre: Sequence[Array],
     friction: Sequence[Friction],
 ) -> ContactSolution:
-    """Decide which loads slide, from the motion in which all of them roll, and return the forces on each load.
+    """Determine which loads slide, from the motion in which all loads roll, and return the forces on each load.
 
     **Arguments**
 

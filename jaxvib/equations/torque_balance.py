@@ -107,8 +107,8 @@ class TorqueBalance(eqx.Module):
         return eqx.tree_at(lambda balance: balance.model, self, self.model.decomposed(self.direction))
 
     def total_driving_torque(self, omega: Array, factor: Array | None = None) -> Array:
-        """Return `driving_torque`, with the differences from the mean multiplied by `factor`, or all torques if an ideal drive,
-        which balances any torque, turns an unbalance."""
+        """Return `driving_torque`, with the differences from the mean multiplied by `factor`. If an ideal drive, which balances
+        any torque, turns an unbalance, the torques themselves are multiplied."""
         torque = self.driving_torque(omega)
         if factor is None:
             return torque
@@ -335,8 +335,8 @@ def resultant_of(model: LinearModel, phasors: Array) -> Array:
 
 @cached
 def assemble_for_search(scene: Scene, masses: tuple[int, ...] | None = None) -> TorqueBalance:
-    """Assemble the torque balance of a validated scene, or of some of its `masses`, see `balance_of_group`, in the form for
-    searches, see `TorqueBalance.decomposed`."""
+    """Assemble the torque balance for searches, see `TorqueBalance.decomposed`, of a validated scene or of some of its
+    `masses`, see `balance_of_group`."""
     balance = assemble_torque_balance(scene)
     return (balance if masses is None else balance_of_group(balance, masses)).decomposed()
 
