@@ -88,8 +88,8 @@ class Branches(AbstractJam):
     def with_free_loads(self, stride: int = 1) -> tuple[Branches, str]:
         """Return the branches with `stable` for loads that are free to move separately, and the name of the criterion.
 
-        Where this stability is unknown, `stable` does not change. **Arguments**: `stride`: the growth of disturbances is
-        computed at one of so many points that are stable by slope; other points have that of the nearest one.
+        If this stability is unknown, `stable` does not change. **Arguments**: `stride`: the growth of disturbances is computed
+        at every `stride`-th point that is stable by slope; each other point takes the growth of the nearest of these points.
         """
         stable = np.array(self.stable)
         points = np.flatnonzero(stable)

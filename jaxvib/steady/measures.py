@@ -43,22 +43,22 @@ _MIN_SLIP = 1e-4
 """Slip n - Omega, relative to n, below which the torque is computed from the dissipation of the carrier. At this slip the
 difference n - Omega has a relative rounding error of about 1e-12, at smaller slips a larger one."""
 
-_NEGLIGIBLE = 1e-9
+_NEGLIGIBLE_FRACTION = 1e-9
 """Fraction of the largest stroke or force below which a value is a rounding error and is not shown."""
 
-_LARGEST_TRANSMISSIBILITY = 1e4
+_MAX_SHOWN_RATIO = 1e4
 """Largest ratio of forces that is shown. At a larger ratio the loads balance one another, and only a decaying motion is
 left."""
 
 _MAX_ACCELERATION, _MAX_THROW_NUMBER = 8.0, 8.0
-"""Acceleration, g, and throw number above which `VibrationMeasures.notes` doubts a vibration: values usual in practice are 3 to
-6 g, and up to 7 g for fine sieving and dewatering."""
+"""Acceleration, g, and throw number above which `VibrationMeasures.notes` warns. Usual are 3 to 6 g, up to 7 g for fine sieving
+and dewatering, and throw numbers of 3 to 5."""
 
 _WEAK_THROW_NUMBER = 1.5
-"""Throw number below which texts add that material hardly leaves the deck: the lowest one usual for feeders."""
+"""Lowest throw number that is usual for feeders. Below it, texts add that material hardly leaves the deck."""
 
-_MAX_SHOWN_SHARE = 10.0
-"""Transmissibility above which texts state a multiple in place of percent."""
+_MAX_RATIO_IN_PERCENT = 10.0
+"""Transmissibility above which texts state it as a multiple, not in percent."""
 
 
 def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
@@ -111,20 +111,22 @@ class VibrationMeasures(Readable):
       two forces is unknown
     - `foundation_load` (directions,), N zero to peak: force on the foundation in each direction, across and up for a body in a
       plane or a rotor
-    - `static_deflection` (nt,), m: downward displacement of each coordinate (of x: to the left) under the weight of machine
-      and loads, 0 for a platform that no support carries; typical: 5 to 30 mm for screens
-    - `static_load` (ns,), N: weight that each support carries, negative if the support pulls the foundation up. It and
-      `static_deflection` are NaN if the supports cannot carry the weight, if the directions of coordinates are unknown, and for
-      a rotor without the effect `Gravity`, whose axis may be vertical
-    - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on a support.
-      They are NaN, as is `foundation_load` in two directions, for a scene with supports that are effects (`CubicSupport`,
-      `Stop`, `FrictionSupport`), and for matrices without a foundation
+    - `static_deflection` (nt,), m: downward displacement of each coordinate under the weight of machine and loads (for x:
+      displacement to the left), 0 for a platform that no support carries; typical: 5 to 30 mm for screens
+    - `static_load` (ns,), N: weight that each support carries, negative if the support pulls the foundation up
+    - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on a support
     - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive, see `Vibration`
-    - `point` (2,) of a body in a plane, its `point_stroke`, m peak to peak along the long axis of its path, its
-      `point_acceleration`, g, `throw_angle`, rad, and `throw_number`, see `Ellipse`, and `conveying_speed`, m/s, the estimate
-      of `jaxvib.conveying_speed`; with a leading axis if several points were requested; None for other machines
+    - `point` (2,), m, of a body in a plane, and the motion of this point: `point_stroke`, m peak to peak along the long axis of
+      its path; `point_acceleration`, g, `throw_angle`, rad, and `throw_number`, see `Ellipse`; `conveying_speed`, m/s, the
+      estimate of `jaxvib.conveying_speed`. If several points were requested, these have a leading axis. For other machines they
+      are None
     - `throughput`, kg/s, at the `point`; None if no `layer` was given
     - `coordinates` (nt,): names of the coordinates, and `directions` of the force on the foundation
+
+    `static_deflection` and `static_load` are NaN if the supports cannot carry the weight, if the directions of the coordinates
+    are unknown, and for a rotor without the effect `Gravity`, whose axis may be vertical. `dynamic_load`, `side_load`, and
+    `foundation_load` in two directions are NaN for a scene with supports that are effects (`CubicSupport`, `Stop`,
+    `FrictionSupport`), and for matrices without a foundation.
     """
 
     speed: Array = eqx.field(metadata=in_unit("rad/s"))
@@ -161,8 +163,8 @@ class VibrationMeasures(Readable):
         return self.point is None and len(self.directions) > 1
 
     def notes(self) -> list[str]:
-        """Return a sentence for an acceleration above 8 g, and for a throw number above 8, which usual screens do not reach;
-        none for a rotor."""
+        """Return warnings of an acceleration above 8 g and of a throw number above 8, which screens do not reach; none for a
+        rotor."""
         if self._is_rotor:
             return []
         accelerations, throws = (self.acceleration, self.point_acceleration), (self.throw_number,)
@@ -193,17 +195,21 @@ class VibrationMeasures(Readable):
             f"{name}{of}: stroke {quantity_text(self.stroke[k], 'm', 4)} peak to peak, {float(self.acceleration[k]):.3g} g, "
             f"{1e3 * float(self.velocity[k]):.4g} mm/s RMS{_zone_text(float(self.velocity[k])) if self._is_rotor else ''}"
             for k, name in enumerate(self.coordinates)
-            if not float(self.stroke[k]) < _NEGLIGIBLE * float(np.max(self.stroke))
+            if not float(self.stroke[k]) < _NEGLIGIBLE_FRACTION * float(np.max(self.stroke))
         ]
         sag, most = np.asarray(self.static_deflection), np.nanmax(np.abs(self.static_deflection), initial=0.0)
-        sagging = [(name, each) for name, each in zip(self.coordinates, sag, strict=True) if abs(each) > _NEGLIGIBLE * most]
+        sagging = [
+            (name, each) for name, each in zip(self.coordinates, sag, strict=True) if abs(each) > _NEGLIGIBLE_FRACTION * most
+        ]
         for way, across in (("down", False), ("to the left", True)):
             named = [f"{name} {quantity_text(each, 'm', 4)}" for name, each in sagging if (name[0] == "x") == across]
             lines += [f"static deflection{of}, {way}: {', '.join(named)}"] if named else []
         for k, each in enumerate(zip(self.static_load, self.dynamic_load, self.side_load, strict=True)):
             named = zip(each, ("static", "dynamic", "to the sides"), strict=True)
             largest = np.max(np.abs(each), initial=0.0, where=~np.isnan(each))
-            parts = [f"{quantity_text(load, 'N', 4)} {word}" for load, word in named if abs(load) > _NEGLIGIBLE * largest]
+            parts = [
+                f"{quantity_text(load, 'N', 4)} {word}" for load, word in named if abs(load) > _NEGLIGIBLE_FRACTION * largest
+            ]
             lines += [f"support {k + 1}: {', '.join(parts)}"] if parts else []
         if len(self.directions) > 1 and not np.any(np.isnan(self.foundation_load)):
             loads = zip(self.foundation_load, self.directions, strict=True)
@@ -221,7 +227,7 @@ class VibrationMeasures(Readable):
         ratio, force = float(self.transmissibility), float(self.exciter_force)
         if force == 0.0:
             return ["the forces of the exciters cancel: there is no transmissibility"]
-        if not ratio < _LARGEST_TRANSMISSIBILITY:
+        if not ratio < _MAX_SHOWN_RATIO:
             return []
         if len(self.torque) > 1:
             name = f"exciters' {quantity_text(force, 'N', 4)}"
@@ -229,7 +235,7 @@ class VibrationMeasures(Readable):
             name = f"exciter's rotating {quantity_text(force / np.sqrt(2.0), 'N', 4)}"
         else:
             name = f"exciter's {quantity_text(force, 'N', 4)}"
-        if ratio > _MAX_SHOWN_SHARE:
+        if ratio > _MAX_RATIO_IN_PERCENT:
             return [f"the foundation receives {ratio:.3g} times the {name}"]
         isolation = f" (isolation {100.0 * (1.0 - ratio):.3g} %)" if ratio < 1.0 else ""
         return [f"of the {name}, {100.0 * ratio:.3g} % reach the foundation{isolation}"]

@@ -32,8 +32,10 @@ from jaxvib.units.reading import STANDARD_GRAVITY
 
 
 def _rounding(semi_axis: Array) -> float:
-    """Return the relative size below which a semi-axis, or a difference of both, is a rounding error: a path is then a straight
-    line, or a circle, whose long axis has no direction."""
+    """Return the relative size below which a semi-axis, or the difference of both semi-axes, is a rounding error.
+
+    The path is then a straight line, or a circle, whose long axis has no direction.
+    """
     return max(1e-12, 8.0 * float(jnp.finfo(semi_axis.dtype).eps))
 
 

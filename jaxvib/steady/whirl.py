@@ -208,12 +208,12 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
         flow = jnp.linalg.solve(mass, jnp.concatenate([-carrier.stiffness, -resisting], axis=1))
         return jnp.concatenate([jnp.eye(nd, 2 * nd, nd, dtype=mass.dtype), flow])
 
-    def one_of_each(values: Array, stops: Array) -> tuple[Array, Array]:
-        # Of each conjugate pair, the value with the positive frequency is chosen. Real values are of two kinds: in the one kind
-        # a displacement creeps back (`stops` is small), in the other kind a velocity stops (`stops` is large). Without
-        # gyroscopic coupling both kinds have the same number of values, see `_stopping`.
+    def one_of_each_pair(values: Array, kind: Array) -> tuple[Array, Array]:
+        # Of each conjugate pair, the value with the positive frequency is chosen. Real values are of two kinds: a displacement
+        # that creeps back (`kind` is small), and a velocity that decays (`kind` is large). Without gyroscopic coupling both
+        # kinds have the same number of values, see `_kinds_and_errors`.
         oscillates = jnp.abs(values.imag) > 1e-12 * jnp.max(jnp.abs(values))
-        rank = jnp.argsort(jnp.argsort(jnp.where(oscillates, jnp.inf, stops)))
+        rank = jnp.argsort(jnp.argsort(jnp.where(oscillates, jnp.inf, kind)))
         creeps = rank < jnp.sum(~oscillates) // 2
         speed = jnp.where(creeps, 0.0, jnp.where(oscillates & (values.imag > 0.0), values.imag, jnp.inf))
         return jnp.lexsort((-values.real, speed))[:nd], oscillates
@@ -225,11 +225,11 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
         coupled = jax.lax.stop_gradient(resisting + coupling)
         separated, vectors = jnp.linalg.eig(jax.lax.stop_gradient(first_order(coupled)))
         shapes = vectors[:nd]
-        stops, error = _stopping(jax.lax.stop_gradient((mass, coupled, carrier.stiffness)), separated, shapes)
+        kind, error = _kinds_and_errors(jax.lax.stop_gradient((mass, coupled, carrier.stiffness)), separated, shapes)
         nearest = jnp.argmin(jnp.abs(values[:, None] - separated[None, :]), axis=1)
-        chosen, oscillates = one_of_each(values, stops[nearest])
+        chosen, oscillates = one_of_each_pair(values, kind[nearest])
         turns = oscillates[chosen]
-        chosen_shapes = shapes[:, one_of_each(separated, stops)[0]]
+        chosen_shapes = shapes[:, one_of_each_pair(separated, kind)[0]]
         straight = turns & _is_straight(model, chosen_shapes)
         return (
             jnp.where(turns, values.imag[chosen], 0.0),
@@ -250,15 +250,15 @@ def _coupling_size(dtype: np.dtype) -> float:
     return max(_COUPLING, _MIN_COUPLING_ROUNDINGS * float(jnp.finfo(dtype).eps))
 
 
-def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array) -> tuple[Array, Array]:
+def _kinds_and_errors(matrices: tuple[Array, Array, Array], values: Array, shapes: Array) -> tuple[Array, Array]:
     """Return the kind of each natural motion, and the relative error of its eigenvalue, from the `matrices` M, C (gyroscopic
     terms included) and K (nd, nd), the `values` s (k,) and the `shapes` x (nd, k).
 
         (s^2 M + s C + K) x = 0,      m s^2 + c s + k = 0 with m = x^H M x, c = x^H C x, k = x^H K x
 
-    The kind is - Re(2 s + c/m). Of the two real roots of an overdamped motion, it is negative at the slower one, at which
-    damping balances the spring, and positive at the faster one, at which damping stops the mass (the sign characteristic in
-    the theory of Hermitian matrix polynomials), even if a slow root of one motion is larger than a fast root of another motion.
+    The kind is - Re(2 s + c/m), in the theory of Hermitian matrix polynomials the sign characteristic. An overdamped motion has
+    two real roots. The kind is negative at the slower root, at which damping balances the spring, and positive at the faster
+    root, at which damping stops the mass. This holds even if a slow root of one motion is larger than a fast root of another.
     The error is the step of Newton's method for the scalar equation, plus the rounding of its terms.
     """
     sizes = jnp.abs(shapes)

@@ -74,7 +74,7 @@ class Criterion(Result):
     def summary(self) -> str:
         """Return the characteristic speeds and intervals as a table in text."""
 
-        def written(intervals: list[list[float | None]]) -> str:
+        def intervals_text(intervals: list[list[float | None]]) -> str:
             ranges = (f"{scale * (a or 0.0):.6g} .. {'infinity' if b is None else f'{scale * b:.6g}'}" for a, b in intervals)
             return f"{', '.join(ranges)} {unit}" if intervals else "no rotor speed"
 
@@ -82,7 +82,7 @@ class Criterion(Result):
             return self.message
         table, (unit, scale) = criterion_table(self), speed_unit()
         lines = [f"{table['status']}", self.speeds.summary()]
-        lines += [f"{name + ' at':14s}{written(table[name])}" for name in ("balancing", "gathering")]
+        lines += [f"{name + ' at':14s}{intervals_text(table[name])}" for name in ("balancing", "gathering")]
         return "\n".join(lines)
 
     @validated
@@ -185,19 +185,19 @@ def _criterion_at_speeds(speeds: CharacteristicSpeeds) -> Criterion:
     return Criterion(
         status=speeds.status,
         speeds=speeds,
-        balancing=_balancing(speeds.damped_resonances, speeds.damped_additional),
-        gathering=_gathering(speeds.damped_resonances, speeds.damped_additional),
-        undamped_balancing=_balancing(speeds.resonances, speeds.additional),
-        undamped_gathering=_gathering(speeds.resonances, speeds.additional),
+        balancing=_balancing_intervals(speeds.damped_resonances, speeds.damped_additional),
+        gathering=_gathering_intervals(speeds.damped_resonances, speeds.damped_additional),
+        undamped_balancing=_balancing_intervals(speeds.resonances, speeds.additional),
+        undamped_gathering=_gathering_intervals(speeds.resonances, speeds.additional),
     )
 
 
-def _balancing(resonances: Array, additional: Array) -> Array:
+def _balancing_intervals(resonances: Array, additional: Array) -> Array:
     ends = jnp.append(jnp.where(jnp.isnan(additional), jnp.inf, additional), jnp.inf)
     return jnp.stack([resonances, jnp.where(jnp.isnan(resonances), jnp.nan, ends)], axis=1)
 
 
-def _gathering(resonances: Array, additional: Array) -> Array:
+def _gathering_intervals(resonances: Array, additional: Array) -> Array:
     starts = jnp.concatenate([0.0 * resonances[:1], additional])  # NaN if the first resonance is unknown
     ends = jnp.where(jnp.isnan(resonances), jnp.inf, resonances)
     return jnp.stack([starts, jnp.where(jnp.isnan(starts), jnp.nan, ends)], axis=1)

@@ -105,8 +105,8 @@ def fine_and_coarse(scene: Scene, angles: Any, steps: int | None) -> tuple[Array
 def validate_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | None:
     """Return the validated number of `steps`; None if it is chosen for each speed.
 
-    **Raises** `InputError` for other steps, for speeds that are not positive, and for a rotor that is too slow: a vibration of
-    the carrier then lasts longer than a turn, and the allowed number of steps does not resolve it.
+    **Raises** `InputError` for an invalid number of steps, for speeds that are not positive, and for a rotor that is too slow:
+    a vibration of the carrier then lasts longer than a turn, and the allowed number of steps does not resolve it.
     """
     values, limit = np.asarray(speeds), 0.1 * float(np.finfo(float_dtype()).max) ** 0.5
     wrong = values[~((values > 0.0) & (values < limit))]
@@ -115,8 +115,10 @@ def validate_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | 
     if steps is not None:
         return count(steps, "steps", low=2, each=64.0)
     slowest = float(np.min(np.asarray(speeds), initial=np.inf))
-    decay, wanted = (float(x) for x in _slowest_decay(eqx.tree_at(lambda s: s.drive.speed, at_constant_speed(scene), slowest)))
-    if wanted >= _MAX_STEPS and decay * 2.0 * np.pi / slowest < _MIN_DECAY_EXPONENT:
+    decay, needed_steps = (
+        float(x) for x in _slowest_decay(eqx.tree_at(lambda s: s.drive.speed, at_constant_speed(scene), slowest))
+    )
+    if needed_steps >= _MAX_STEPS and decay * 2.0 * np.pi / slowest < _MIN_DECAY_EXPONENT:
         problem = (
             f"is {slowest:g} rad/s, at which a turn takes more than {_MAX_STEPS} steps, and the carrier still vibrates at its "
             f"end (it decays at {max(decay, 0.0):.2g} 1/s); use a higher speed, or give machine.damping"

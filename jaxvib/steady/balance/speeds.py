@@ -258,7 +258,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     last = jnp.max(jnp.where(jnp.isnan(poles), 0.0, poles))
     last = jnp.where(last > 0.0, last, 1.0)  # a machine without springs
     tiny_damping = jnp.finfo(last.dtype).eps ** 0.75 * last
-    # This term changes neither the real part of 1/A nor the sign changes. It makes the function smooth at the poles.
+    # The term `smooth` changes neither the real part of 1/A nor the sign changes. It makes the functional smooth at the poles.
     participation = jnp.sum(jnp.abs(b.conj() @ forms) ** 2)
     smoothing = 1j * last**2 / participation
     smooth = smoothing * jnp.outer(b, b.conj())
@@ -296,7 +296,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     grid = jnp.concatenate([0.999 * poles[:1], inside.ravel(), 1.001 * poles[-1:]])
 
     # Below the first resonance the sign is + for any damping; for a machine that can drift, the sign changes at speed 0.
-    # A loop over the grid points: a batch of machines then needs the memory of only one grid point for each machine.
+    # `map` loops over the grid points: a batch of machines then needs the memory of only one grid point for each machine.
     positive = jnp.append(jnp.asarray([True]), jax.lax.map(lambda w: fast_functional(w) > 0.0, grid[1:]))
     passed = jnp.cumsum(positive[1:] != positive[:-1])
     order = jnp.arange(2 * resonances.shape[0] - 1)

@@ -67,8 +67,8 @@ class BalancedStates(Result):
     - `status`: a `BalanceStatus`
     - `angles` (k, N), rad: one arrangement in each row, with load 1 at angle 0 unless the rotor has an imbalance; no rows if
       the loads cannot cancel
-    - `dimension` of the set of arrangements, including the common rotation: N - 2, but 1 for two loads on a rotor without
-      imbalance; for loads in two planes the sum for both planes
+    - `dimension` of the set of arrangements, including the common rotation: N - 2, but 0 for a single load, and 1 for two
+      loads on a rotor without imbalance; for loads in two planes the sum for both planes
     - `neutral` (k, N, d): orthonormal changes of the angles that keep each arrangement balanced to first order
     - `names` (d,) of these changes: "turn of all loads" first (not if the rotor has an imbalance), then "shape 1", ...; for
       loads in two planes "turn in plane 1", "shape 1 in plane 1", ...
@@ -92,7 +92,7 @@ class BalancedStates(Result):
         The full equations are linearized about the balanced motion and integrated over one turn of the rotor.
 
         **Arguments**: `arrangement`: its number, counted from 0; `steps` of Radau's method over one turn (default: as many as
-        the natural frequencies need); the time is proportional to it.
+        the natural frequencies need); the time is proportional to this number.
         """
         return balanced_stability(self.scene, self._angles_of(arrangement), steps=steps)
 
@@ -277,6 +277,7 @@ def _touching_angle(scene: Scene) -> float:
 
 
 def _sides(loads: CircularLoads) -> np.ndarray:
+    """Return the unbalance m R of each load, (N,) kg m: the sides of the polygon of `arrangements`."""
     return np.broadcast_to(np.asarray(loads.mass) * np.asarray(loads.radius), (loads.count,))
 
 
@@ -347,7 +348,7 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
 
     Source: Floquet's theorem; Radau's method of Hairer, Wanner, Solving Ordinary Differential Equations II, section IV.5.
     """
-    angles, neutral = _arrangement(scene, angles)
+    angles, neutral = _validate_arrangement(scene, angles)
     matrices = fine_and_coarse(scene, angles, validate_steps(scene, scene.drive.speed, steps))
     fine, coarse = (np.linalg.eigvals(np.asarray(each)) for each in matrices)
     speed = float(scene.drive.speed)
@@ -372,7 +373,7 @@ def balanced_growth(scene: Scene, speeds: Numbers, angles: ArrayLike | None = No
     >>> balanced_growth(scene, [20.0, 40.0]) < 0.0
     array([False,  True])
     """
-    angles, neutral = _arrangement(scene, angles)
+    angles, neutral = _validate_arrangement(scene, angles)
     if isinstance(speeds, (np.ndarray, jax.Array)):
         if np.size(speeds) == 0:
             return np.zeros(np.shape(speeds))
@@ -390,8 +391,8 @@ _DECAY_ERROR = 5e-11
 """Smallest decay over a turn that counts: errors of the integration let an undamped vibration decay by up to 2e-11."""
 
 
-def decay_over_turn(speeds: np.ndarray, growth: np.ndarray) -> np.ndarray:
-    """Return True for growth rates, 1/s, of deviations that decay during a turn by more than errors of the computation."""
+def decays_over_turn(speeds: np.ndarray, growth: np.ndarray) -> np.ndarray:
+    """Return True for growth rates, 1/s, at which deviations decay in a turn by more than the error of the computation."""
     return growth * 2.0 * np.pi / speeds < -max(_DECAY_ERROR, 32.0 * float(np.finfo(float_dtype()).eps))
 
 
@@ -411,7 +412,7 @@ def balanced_intervals(
     if not 0.0 < low < high:
         raise InputError("low", f"is {low:g} and high {high:g}; 0 < low < high is needed, both finite")
     grid = np.linspace(low, high, count(points, "points", low=2, each=1e4))
-    stable = decay_over_turn(grid, balanced_growth(scene, grid, angles, steps=steps))
+    stable = decays_over_turn(grid, balanced_growth(scene, grid, angles, steps=steps))
     changes = stability_changes(scene, grid, stable, angles, steps=steps).tolist()
     ends = [*([low] if stable[0] else []), *changes, *([high] if stable[-1] else [])]
     return SpeedIntervals([float(a), float(b)] for a, b in zip(ends[0::2], ends[1::2], strict=True))
@@ -432,7 +433,7 @@ def stability_changes(
     left, right = speeds[change], speeds[change + 1]
     while left.size and np.max((right - left) / right) > rtol:
         middle = (left + right) / 2.0
-        same = decay_over_turn(middle, balanced_growth(scene, middle, angles, steps=steps)) == stable[change]
+        same = decays_over_turn(middle, balanced_growth(scene, middle, angles, steps=steps)) == stable[change]
         left, right = np.where(same, middle, left), np.where(same, right, middle)
     return (left + right) / 2.0
 
@@ -442,8 +443,8 @@ def _rounding() -> float:
     return max(1e-9, 32.0 * float(np.finfo(float_dtype()).eps))
 
 
-def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, int]:
-    """Return validated angles at which the loads cancel each other, and the number of their neutral directions."""
+def _validate_arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, int]:
+    """Return angles at which the loads cancel each other, validated, or the default; and the number of neutral directions."""
     sides = _sides(turning_loads(scene))
     if not np.min(np.asarray(natural_frequencies(scene))) > 0.0:
         problem = (

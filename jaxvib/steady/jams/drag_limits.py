@@ -21,8 +21,8 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.folds import DraggedModel, branch_pieces
-from jaxvib.steady.jams.phase_starts import at_speed, phases_near, solved_phases
+from jaxvib.steady.jams.folds import DragFactorModel, branch_pieces
+from jaxvib.steady.jams.phase_starts import phases_near, search_data, search_phases
 from jaxvib.steady.jams.phases import loads_with_drag
 from jaxvib.steady.outcome import REFUSED, outcome
 
@@ -84,17 +84,17 @@ def drag_limits(scene: Scene, *, phases: bool = False) -> DragLimits:
         factor(w) sum b_W R^2 (n - w) = braking torque of the vibration at w
 
     n is the rotor speed, w the load speed, and b_W and R are the drag and the radius of a load. The greatest drag of a
-    resonance is the maximum of `factor` over the load speeds w near it. At this maximum two jams merge
-    in a fold; with a larger drag the loads pass this resonance. In the limit of light loads an imbalance of the rotor does not
-    change the limits, see `jam_modes`.
+    resonance is the maximum of `factor` over the load speeds w near it. At this maximum two jams merge in a fold; with a larger
+    drag the loads pass this resonance. In the limit of light loads an imbalance of the rotor does not change the limits, see
+    `jam_modes`.
 
     - For equal loads at one point of the machine no other arrangement can jam at a larger drag: the torques of all loads have
       the sum (w^4/2) |sum_j S_j exp(i a_j)|^2 Im h, whose modulus is largest for equal angles a_j. S_j = m_j R_j is the
       unbalance of a load, and h is the receptance of the point that carries the loads, for a rotating force
-    - Loads at several points of a rotor, or unequal loads, jam at unequal phases. With `phases`, `factor` is the largest one
-      of all phases that a search finds. Loads then count as points, see `phase_jams`. Balls with a `ball_radius` that touch
-      each other have a smaller common unbalance, and jam only up to a smaller drag. For equal loads at one point, the limit
-      without `phases` includes this
+    - Loads at several points of a rotor, or unequal loads, jam at unequal phases. With `phases`, `factor` is the largest
+      factor of all phases that a search finds. Loads then count as points, see `phase_jams`. Balls with a `ball_radius` that
+      touch each other have a smaller common unbalance, and jam only up to a smaller drag. For equal loads at one point, the
+      limit without `phases` includes this
 
     **Arguments**
 
@@ -103,8 +103,8 @@ def drag_limits(scene: Scene, *, phases: bool = False) -> DragLimits:
 
     **Returns** `DragLimits`. Its derivatives are exact without `phases`; with `phases` there are none.
 
-    **Raises** `InputError` for the reasons of `jam_modes` or `phase_jams`, and for dry friction, which is not multiplied with
-    the drag.
+    **Raises** `InputError` for the reasons of `jam_modes` or `phase_jams`, and for dry friction, which the factor
+    would not multiply.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -125,8 +125,8 @@ def drag_limits(scene: Scene, *, phases: bool = False) -> DragLimits:
 @cached
 def _limits_of_coincident_loads(scene: Scene) -> DragLimits:
     model = jammed_model(scene)
-    parts = {name: getattr(model, name) for name in DraggedModel.__dataclass_fields__}
-    pieces = branch_pieces(DraggedModel(**parts).decomposed())
+    parts = {name: getattr(model, name) for name in DragFactorModel.__dataclass_fields__}
+    pieces = branch_pieces(DragFactorModel(**parts).decomposed())
     # The folds 0, 2, 4, ... are maxima. The piece before a maximum has the mode number 2 r - 1 of its resonance r = 1, 2, ...
     peaks, owner = pieces.folds.exists[0::2], (pieces.mode[0:-1:2] - 1) // 2
     is_own = peaks[None, :] & (owner[None, :] == np.arange(owner.size)[:, None])
@@ -144,7 +144,7 @@ def _limits_of_phases(scene: Scene) -> DragLimits:
     """Return the limits for any phases: maxima over the load speed of the largest factor of all phases."""
     balance, resonances = assemble_for_search(scene), np.asarray(estimated_frequencies(scene))
     random = np.random.default_rng(0).uniform(-np.pi, np.pi, (_SETS_OF_PHASES, balance.unbalance.size))
-    speeds, _, row, factor, angles = solved_phases(balance, random)
+    speeds, _, row, factor, angles = search_phases(balance, random)
     largest, best = np.zeros(speeds.size), np.full(speeds.size, -1)
     for k in np.argsort(factor):
         largest[row[k]], best[row[k]] = factor[k], k
@@ -166,7 +166,7 @@ def _largest_factor(balance: TorqueBalance, around: Array, phase: Array) -> tupl
     and the factor. A speed at which the pattern does not exist has the factor 0."""
 
     def factor(w: Array) -> Array:
-        value, _, residual = phases_near(balance, at_speed(balance, w), phase)
+        value, _, residual = phases_near(balance, search_data(balance, w), phase)
         good = (residual < jnp.sqrt(jnp.finfo(residual.dtype).eps)) & (value > 0.0)
         return jnp.where(good, value, 0.0)
 
@@ -174,10 +174,10 @@ def _largest_factor(balance: TorqueBalance, around: Array, phase: Array) -> tupl
 
     def narrowed(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds
-        one, two = high - golden * (high - low), low + golden * (high - low)
-        values = jax.vmap(factor)(jnp.stack([one, two]))
+        left, right = high - golden * (high - low), low + golden * (high - low)
+        values = jax.vmap(factor)(jnp.stack([left, right]))
         is_left = values[0] > values[1]
-        return jnp.where(is_left, low, one), jnp.where(is_left, two, high)
+        return jnp.where(is_left, low, left), jnp.where(is_left, right, high)
 
     low, high = jax.lax.fori_loop(0, _GOLDEN_STEPS, narrowed, (around[0], around[2]))
     candidates = jnp.stack([0.5 * (low + high), around[1]])

@@ -28,9 +28,9 @@ Excited = TypeVar("Excited", bound=ExcitedModel)
 _GRID_POINTS = 64
 """Number of grid points on each side of each pole in the search for folds."""
 
-_SLOWEST = 1e-3
-"""Lower limit of the largest pole, rad/s, by which the grid of load speeds is scaled: a free body without damping has the pole
-0 only."""
+_MIN_LARGEST_POLE = 1e-3
+"""Lower limit, rad/s, of the largest pole, which scales the grid of load speeds. A free body without damping has only the
+pole 0."""
 
 _BLOCK_SIZE = 1024
 """Number of load speeds whose sums over the poles fit into the CPU's first cache."""
@@ -52,7 +52,7 @@ class Folds(Readable):
     exists: Array = eqx.field(metadata=in_unit("", "fold"))
 
 
-class DraggedModel(JammedModel):
+class DragFactorModel(JammedModel):
     """Model of a scene with jammed loads at the rotor's working speed.
 
     Its branch is not a rotor speed but a factor of the drag as a function of the load speed: the loads jam at this load speed
@@ -81,8 +81,8 @@ def rotor_speed_at(model: ExcitedModel, omega: Array, speed: Array | None = None
     unless the weight exceeds N. An imbalance of the rotor acts at the frequency n and not at w, and has no effect here.
 
     For a model with unbalances instead of loads (`UnbalancedModel`) the value returned is not a speed but the torque of the
-    vibration divided by that of the motors; for a `DraggedModel` it is the factor of the drag. Two motions merge at the folds
-    of these functions too.
+    vibration divided by that of the motors; for a `DragFactorModel` it is the factor of the drag. Two motions merge at the
+    folds of these functions too.
 
     >>> import jaxvib as jv
     >>> from jaxvib.equations.linear import jammed_model
@@ -129,7 +129,7 @@ def _speed_from_acceleration(model: ExcitedModel, omega: Array, acceleration: Ar
     if isinstance(model, UnbalancedModel):
         return torque / model.motor_torque(omega)
     assert isinstance(model, JammedModel)
-    if isinstance(model, DraggedModel):
+    if isinstance(model, DragFactorModel):
         return torque / (model.drag * (model.scene.drive.speed - omega))
     free = omega + torque / model.drag
     effects = model.scene.all_effects
@@ -191,8 +191,10 @@ def branch_root(
     high: Array,
     ends: tuple[Array, Array],
 ) -> Array:
-    """Return the load speed between `low` and `high` at which a function of the branch is 0, with exact derivatives: `exact`
-    from the matrices, `scanned` in modal form, with the values `ends` at both ends."""
+    """Return the load speed between `low` and `high` at which a function of the branch is 0, with exact derivatives.
+
+    `exact` computes the function from the matrices, `scanned` in modal form; `ends` are its values at `low` and `high`.
+    """
     f = partial(exact, model)
     if model.modal is None:
         return bracketed_root(f, low, high, ends)
@@ -230,7 +232,7 @@ def branch_pieces(model: ExcitedModel) -> Pieces:
     fold_count = 2 * (resonances.shape[0] + model.extra_peaks)
     grid, slopes = _with_close_folds(partial(scanned_slopes, frozen), grid, fold_count)
     falling = slopes < 0.0
-    change = _first_places(falling[1:] != falling[:-1], 2 * fold_count, grid.shape[0] - 1)
+    change = _first_true_indices(falling[1:] != falling[:-1], 2 * fold_count, grid.shape[0] - 1)
     exists = change < grid.shape[0] - 1
     change = jnp.minimum(change, grid.shape[0] - 2)
     ends = (grid[change], grid[change + 1], (slopes[change], slopes[change + 1]))
@@ -286,8 +288,9 @@ def sampled_modes(omega: np.ndarray, speeds: np.ndarray, resonances: np.ndarray)
 
 
 def without_ripples(speeds: Array, count: Array, count_left: int) -> Array:
-    """Return the indices of the `count_left` most relevant of 2 `count_left` folds; `speeds` are their rotor speeds, and the
-    first `count` of them exist.
+    """Return the indices of the `count_left` most relevant folds.
+
+    `speeds` (2 `count_left`,) are rotor speeds of folds, of which the first `count` exist.
 
     A branch has one peak for each resonance. If it has additional ripples, the pairs of neighbouring folds whose rotor speeds
     have the ratio closest to 1 are dropped.
@@ -317,7 +320,7 @@ def grid_near_poles(model: LinearModel, per_side: int, highest: Array | None = N
     resonances, _ = model.modes()
     fixed = jax.lax.stop_gradient(resonances)
     poles = _poles(*jax.lax.stop_gradient(model.peak_matrices())) if model.modal is None else model.modal.poles
-    top = jnp.maximum(jnp.max(fixed), jnp.max(jnp.abs(poles), initial=_SLOWEST))
+    top = jnp.maximum(jnp.max(fixed), jnp.max(jnp.abs(poles), initial=_MIN_LARGEST_POLE))
     beyond = 5.0 * top if highest is None else jnp.maximum(5.0 * top, highest)
     tiny = jnp.finfo(top.dtype).eps * 16.0
     width = jnp.maximum(jnp.abs(poles.real), tiny * top)[:, None]
@@ -354,9 +357,9 @@ def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
     return jnp.concatenate([poles, poles.conj()]) if jnp.iscomplexobj(mass) else poles
 
 
-def _first_places(there: Array, size: int, otherwise: int) -> Array:
-    """Return the first `size` indices at which `there` (n,) is True, ascending, padded with `otherwise`."""
-    return jnp.sort(jnp.where(there, jnp.arange(there.shape[0]), otherwise))[:size]
+def _first_true_indices(mask: Array, size: int, fill: int) -> Array:
+    """Return the first `size` indices at which `mask` (n,) is True, ascending, padded with `fill`."""
+    return jnp.sort(jnp.where(mask, jnp.arange(mask.shape[0]), fill))[:size]
 
 
 def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, added_count: int) -> tuple[Array, Array]:
@@ -368,7 +371,7 @@ def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, added_count
     sign, size = jnp.sign(value), jnp.abs(value)
     same = (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:])
     dips = same & (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:])
-    at = _first_places(dips, added_count, dips.shape[0] - 1)
+    at = _first_true_indices(dips, added_count, dips.shape[0] - 1)
     step = (jnp.sqrt(jnp.asarray(5.0, grid.dtype)) - 1.0) / 2.0
 
     side, lowest = jnp.sign(value[at + 1]), jnp.abs(value[at + 1])

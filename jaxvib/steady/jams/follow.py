@@ -22,11 +22,11 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
 
     Newton's method solves (n(w) - w)^(-1/2) = (n - w)^(-1/2), see `rotor_speed_at`. Near a resonance w_r the left side is
     almost proportional to |w - w_r|; a few steps are therefore sufficient even from a distant start. `jam_modes` computes the
-    whole branch, which takes about fifty times as long, and determines the number of the mode. This function keeps the number,
-    and does not detect that modes exchange their numbers.
+    whole branch, which takes about fifty times as long, and determines the number of the mode. This function keeps the number;
+    it does not detect that two modes have exchanged their numbers.
 
-    **Returns** `Jam`, with NaN if the iteration has not converged or ended on a piece of the branch with the wrong sign of the
-    slope. First derivatives are exact.
+    **Returns** `Jam`, with NaN if the iteration has not converged, or has ended on a piece of the branch whose slope has the
+    wrong sign. First derivatives are exact.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

@@ -73,7 +73,8 @@ class AbstractJam(Result):
     - `mode`: number of the mode
     - `status`: a `JamStatus`
     - `omega`: load speed, rad/s; `rotor_speed`, rad/s
-    - `stable`: True if the slope dn/dOmega > 0, for light loads that stay together (`phase_jams` shows whether they do)
+    - `stable`: True if the slope dn/dOmega > 0 and the vibration can drive each load, for light loads that stay together
+      (`phase_jams` shows whether they do)
     - `slope`: dn/dOmega
     - `displacement` (nd,): complex amplitudes of q = Re(displacement exp(i Omega t)), m (rad for tilts)
     - `amplitude` (nd,), m (rad for tilts), zero to peak; typical: 0.5 to 10 mm
@@ -202,8 +203,8 @@ class JamModes(AbstractJam):
     def summary(self, scene: Scene | None = None) -> str:
         """Return the table of `jaxvib modes` in text; amplitudes and foundation force are zero to peak.
 
-        **Arguments**: `scene` of the modes. With it the column "stable" also states whether the loads stay together, as in the
-        table of the command (not computed for loads with a `ball_radius` or dry friction).
+        **Arguments**: `scene` of the modes. If it is given, the column "stable" also states whether the loads stay together, as
+        in the table of the command (not computed for loads with a `ball_radius` or dry friction).
         """
         rotor, resonances = (speed_text(speed) for speed in (np.asarray(self.rotor_speed)[0], self.resonances))
         growth = {} if scene is None else growth_of_modes(self, scene)
@@ -248,7 +249,7 @@ def modes_table(jams: JamModes, growth: Mapping[int, float]) -> list[list[str]]:
     """
     unit, scale = speed_unit()
     existing = [jams.select(k) for k in jams.mode_numbers()]
-    shown = [shown_unit(each, _largest(jams, k)) for k, each in enumerate(jams.units)]
+    shown = [shown_unit(each, _largest_amplitude(jams, k)) for k, each in enumerate(jams.units)]
     headers = [f"{name}, {length}" for name, (length, _) in zip(jams.coordinates, shown, strict=True)]
     rows = [
         [
@@ -263,7 +264,7 @@ def modes_table(jams: JamModes, growth: Mapping[int, float]) -> list[list[str]]:
     return [["mode", unit, "stable", *headers, "force, N"], *rows]
 
 
-def _largest(jams: JamModes, coordinate: int) -> float:
+def _largest_amplitude(jams: JamModes, coordinate: int) -> float:
     """Return the largest amplitude of the coordinates that have the unit of this one, m or rad."""
     same = np.asarray([unit == jams.units[coordinate] for unit in jams.units])
     values = np.asarray(jams.amplitude)[:, same]
@@ -352,9 +353,9 @@ def jam_modes(scene: Scene) -> JamModes:
 
 def _from_jams(jams: JamModes, scene: Scene) -> JamModes:
     """Return jams with all fields computed from their load speeds, without resonances and folds."""
-    n, model, there = scene.drive.speed, jammed_model(scene).decomposed(), jams.status != JamStatus.absent
-    omega = jax.vmap(lambda root: known_root(lambda w: rotor_speed_at(model, w) - n, root))(jnp.where(there, jams.omega, n))
-    fields = _fields(model, jnp.where(there, omega, n), there, jams.status == JamStatus.at_fold)
+    n, model, exists = scene.drive.speed, jammed_model(scene).decomposed(), jams.status != JamStatus.absent
+    omega = jax.vmap(lambda root: known_root(lambda w: rotor_speed_at(model, w) - n, root))(jnp.where(exists, jams.omega, n))
+    fields = _fields(model, jnp.where(exists, omega, n), exists, jams.status == JamStatus.at_fold)
     return dataclasses.replace(jax.tree.map(lambda _: None, jams), **fields)
 
 
@@ -363,40 +364,40 @@ def jams_of(scene: Scene) -> JamModes:
     """Return `jam_modes` for a validated scene."""
     n, model = scene.drive.speed, jammed_model(scene).decomposed()
     pieces = branch_pieces(model)
-    omega, exists = _solved_on_pieces(model, pieces)
+    omega, has_root = _solve_on_pieces(model, pieces)
 
     numbers = jnp.arange(1, 2 * pieces.resonances.shape[0] + 2)
-    hits = (pieces.mode[None, :] == numbers[:, None]) & exists[None, :]
-    there = jnp.any(hits, axis=1)
-    chosen = jnp.argmax(hits, axis=1)
-    omega = jnp.where(there, omega[chosen], n)
+    hits = (pieces.mode[None, :] == numbers[:, None]) & has_root[None, :]
+    exists = jnp.any(hits, axis=1)
+    piece = jnp.argmax(hits, axis=1)
+    omega = jnp.where(exists, omega[piece], n)
 
     # If the rotor speeds of the scene and of a fold differ by less than this limit, their difference is lost in rounding
     # errors, and derivatives are not significant.
     speeds = jax.lax.stop_gradient(jnp.where(pieces.folds.exists, pieces.folds.rotor_speed, jnp.inf))
-    close = jnp.concatenate([jnp.zeros((1,), bool), jnp.abs(speeds - n) < 4096.0 * jnp.finfo(n.dtype).eps * n])
-    close = (close | jnp.roll(close, -1))[chosen]
+    is_near = jnp.concatenate([jnp.zeros((1,), bool), jnp.abs(speeds - n) < 4096.0 * jnp.finfo(n.dtype).eps * n])
+    at_fold = (is_near | jnp.roll(is_near, -1))[piece]
 
-    fields = _fields(model, omega, there, close)
+    fields = _fields(model, omega, exists, at_fold)
     return JamModes(**fields, resonances=pieces.resonances, folds=pieces.folds)
 
 
-def _fields(model: JammedModel, omega: Array, there: Array, at_fold: Array) -> dict[str, Any]:
+def _fields(model: JammedModel, omega: Array, exists: Array, at_fold: Array) -> dict[str, Any]:
     """Return the fields of `JamModes` from load speeds, rad/s, existence flags and fold flags."""
     n = model.scene.drive.speed
 
-    def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:
-        solved = jam_at(model, number, w, n, flat)
+    def jam(number: Array, w: Array, has_mode: Array, has_fold: Array) -> Jam:
+        solved = jam_at(model, number, w, n, has_fold)
         values = jax.tree.map(
-            lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value, solved
+            lambda value: jnp.where(has_mode, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value, solved
         )
         return eqx.tree_at(
             lambda j: (j.status, j.stable, j.rotor_speed),
             values,
-            (JamStatus.where(is_there, solved.status, JamStatus.absent), is_there & solved.stable, n),
+            (JamStatus.where(has_mode, solved.status, JamStatus.absent), has_mode & solved.stable, n),
         )
 
-    jams = jax.vmap(jam)(jnp.arange(1, omega.shape[0] + 1), omega, there, at_fold)
+    jams = jax.vmap(jam)(jnp.arange(1, omega.shape[0] + 1), omega, exists, at_fold)
     return {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
 
 
@@ -406,8 +407,8 @@ def jam_at(
     """Return the jam of the mode `number`.
 
     **Arguments**, all scalars: `omega`, rad/s, the load speed of the jam; `rotor_speed`, rad/s, at which the jam has this load
-    speed (default: that of the branch); `at_fold`: True if the jam is at a fold (default: if the slope
-    of the branch is almost zero). The status is never `absent`, because the caller has checked that the mode exists.
+    speed (default: that of the branch); `at_fold`: True if the jam is at a fold (default: True if the slope of the branch is
+    almost 0). The status is never `absent`, because the caller has checked that the mode exists.
     """
     speed, slope, displacement = branch_tangent(model, omega)
     rotor_speed = speed if rotor_speed is None else rotor_speed
@@ -462,9 +463,9 @@ def branch_points(model: JammedModel, omega: Array) -> tuple[Jam, Folds]:
     return jams, pieces.folds
 
 
-def _solved_on_pieces(model: JammedModel, pieces: Pieces) -> tuple[Array, Array]:
-    """Return load speeds on the monotone pieces at which the branch has the scene's rotor speed, and a mask, True for those
-    that exist."""
+def _solve_on_pieces(model: JammedModel, pieces: Pieces) -> tuple[Array, Array]:
+    """Return the load speed on each monotone piece at which the branch has the scene's rotor speed, and True for each piece
+    that has one."""
     target = model.scene.drive.speed
     gaps = pieces.speed_low - target, pieces.speed_high - target
     exists = (pieces.high > pieces.low) & (gaps[0] * gaps[1] <= 0.0)

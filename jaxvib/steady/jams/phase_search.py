@@ -1,4 +1,4 @@
-"""Every jam of a scene at unequal phases, and phase patterns followed over the drag."""
+"""Search for all jams of a scene with any phases, and phase patterns followed over the drag."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phase_starts import (
     LOAD_SPEEDS,
-    at_speed,
     distinct_rows,
     equal_loads,
     load_speeds,
     phases_near,
-    solved_clusters,
+    search_clusters,
+    search_data,
 )
 from jaxvib.steady.jams.phases import AbstractPhaseJam, PhaseJam, PhaseStatus, jam_from, loads_with_drag, phase_jam
 from jaxvib.steady.outcome import entry, require_index
@@ -136,7 +136,7 @@ def phase_jams(
       resonances
     - Jams that differ by a common rotation of all loads, or by an exchange of equal loads, count as one
     - Loads that turn with the rotor and balance it are left out. Two equal loads at one point of the machine also have a jam at
-      the speed at which the response of the machine lags by 90 degrees; it is left out here, and `synchronous_regimes` lists it
+      the speed at which the response of the machine lags by 90 degrees. It is left out too; `synchronous_regimes` lists it
     - Loads count as points: their `ball_radius` is not used, so that loads at one angle have the unbalance N m R. `jam_modes`
       places them side by side
     - An imbalance of the rotor (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force rotates at the rotor
@@ -175,19 +175,19 @@ def phase_jams(
     loads = loads_with_drag(scene)
     number = count(starts, "starts", each=64.0 * loads.count * LOAD_SPEEDS)
     balance = assemble_for_search(scene)
-    return _jams_from_starts(scene, balance, *solved_clusters(balance, number, random_numbers(seed)))
+    return _jams_from_starts(scene, balance, *search_clusters(balance, number, random_numbers(seed)))
 
 
 def _jams_from_starts(scene: Scene, balance: TorqueBalance, omega: np.ndarray, phase: np.ndarray) -> PhaseJams:
     """Solve for jams from load speeds (n,) and phases (n, count) of solved balances."""
     groups = equal_loads(balance)
     starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(balance.speed)))
-    places, reached = _distinct(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
+    places, reached = _distinct_jams(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
     # Several starts can lead to the same jam; at the low accuracy of the search their results may still differ.
     first = starts_at[np.asarray(places, dtype=int)]
     jams = in_chunks(_JAMS_PER_PROGRAM, lambda w, a: _jams_from(scene, w, a), omega[first], phase[first])
     found = np.flatnonzero(status_names(jams.status) == "found")
-    places, reached = _distinct(jams.omega[found], jams.phase[found], reached[found], groups)
+    places, reached = _distinct_jams(jams.omega[found], jams.phase[found], reached[found], groups)
     keep = found[np.asarray(places, dtype=int)]
     order = sorted(range(keep.size), key=lambda i: (-round(float(jams.omega[keep[i]]), 6), not jams.stable[keep[i]]))
     fields = {name: getattr(jams, name) for name in PhaseJam.__dataclass_fields__}
@@ -195,7 +195,7 @@ def _jams_from_starts(scene: Scene, balance: TorqueBalance, omega: np.ndarray, p
     return PhaseJams(**sorted_fields, starts=on_device(reached[order]), scene=scene)
 
 
-def _distinct(
+def _distinct_jams(
     omega: np.ndarray, phase: np.ndarray, starts: np.ndarray, groups: list[np.ndarray]
 ) -> tuple[list[int], np.ndarray]:
     """Return indices of distinct jams among n, by falling speed, and the sum of the `starts` (n,) that led to each."""
@@ -217,7 +217,7 @@ def _distinct(
         k = once[m]
         while near < len(places) and not abs(omega[places[near]] - omega[k]) < _SAME_SPEED_DIFFERENCE * omega[places[near]]:
             near += 1
-        place = next((i for i in range(near, len(places)) if _same(phase[places[i]], phase[k], groups)), None)
+        place = next((i for i in range(near, len(places)) if _is_same_pattern(phase[places[i]], phase[k], groups)), None)
         if place is None:
             places.append(int(k))
             reached.append(int(starts[m]))
@@ -274,7 +274,7 @@ def _follow_pattern(scene: Scene, phase: Array, omega: Array, restart: Array) ->
     def step(last: Array, at: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
         w, begins = at
         start = jnp.where(begins, phase, last)
-        factor, angles, residual = phases_near(balance, at_speed(balance, w), start)
+        factor, angles, residual = phases_near(balance, search_data(balance, w), start)
         good = (residual < jnp.sqrt(jnp.finfo(residual.dtype).eps)) & (factor > 0.0)
         braked = eqx.tree_at(lambda field: field.drag, balance.averaged, factor * balance.drag)
         growth = averaged_growth(braked, w, angles, w**2 * response_of(balance, w) @ (balance.unbalance * jnp.exp(1j * angles)))
@@ -284,7 +284,7 @@ def _follow_pattern(scene: Scene, phase: Array, omega: Array, restart: Array) ->
     return jax.lax.scan(step, phase, (omega, restart))[1]
 
 
-def _same(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bool:
+def _is_same_pattern(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bool:
     """Return True if two sets of phases differ only by a common rotation and by an exchange of equal loads."""
 
     def points(phase: np.ndarray, group: np.ndarray) -> np.ndarray:
@@ -295,12 +295,12 @@ def _same(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bo
     lead = points(first, groups[0])[0]
     for start in points(second, groups[0]):
         turned = [points(second, g) * lead / start for g in groups]
-        if all(_match(points(first, g), other) for g, other in zip(groups, turned, strict=True)):
+        if all(_is_same_set(points(first, g), other) for g, other in zip(groups, turned, strict=True)):
             return True
     return False
 
 
-def _match(first: np.ndarray, second: np.ndarray) -> bool:
+def _is_same_set(first: np.ndarray, second: np.ndarray) -> bool:
     """Return True if two sets of points are the same in some order."""
     left = list(second)
     for point in first:
@@ -311,15 +311,21 @@ def _match(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 _PHASE_JUMP = 0.3
-"""If a phase changes by more than this, rad, between neighbouring load speeds, a figure shows another pattern."""
+"""Change of a phase between neighbouring load speeds, rad, above which a figure shows another pattern."""
 
 
 class PhaseBranch(Result):
     """Phase pattern over the load speed, at a fixed rotor speed.
 
-    **Attributes** (n speeds): `omega` (n,) rad/s; `drag_factor` (n,): the factor by which the scene's drag must be multiplied
-    so that the loads jam at this speed, NaN if the pattern has no jam; `phase` (n, count) rad; `growth` (n,) 1/s and `stable`
-    (n,) as in `PhaseJam`; `rotor_speed` rad/s; `drag` (count,) N s/m, which the factor multiplies.
+    **Attributes** (n speeds)
+
+    - `omega` (n,), rad/s
+    - `drag_factor` (n,): the loads jam at this speed if the drag of the scene is multiplied by this factor; NaN if the pattern
+      has no jam
+    - `phase` (n, count), rad
+    - `growth` (n,), 1/s, and `stable` (n,), as in `PhaseJam`
+    - `rotor_speed`, rad/s
+    - `drag` (count,), N s/m: drag of the loads in the scene
     """
 
     omega: Array = eqx.field(metadata=in_unit("rad/s", "omega"))

@@ -42,7 +42,7 @@ _STARTS_OF_CLUSTERS, _MAX_DIVISIONS = 16, 64
 there are more divisions, they are not searched separately, and every load has an independent phase."""
 
 
-def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def search_clusters(balance: TorqueBalance, number: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return speeds (n,) and phases (n, count) of solutions of the torque balance, from about `number` random sets of phases
     in total, or more if the loads have many divisions (see below).
 
@@ -76,7 +76,7 @@ def _solve_balances(balance: TorqueBalance, omega: Array, phase: Array) -> tuple
 
 
 def equal_loads(balance: TorqueBalance) -> list[np.ndarray]:
-    """Return groups of loads with equal parameters, as indices."""
+    """Return the indices of the loads of each group of loads with equal parameters."""
     direction = np.asarray(balance.direction)
     rows = np.concatenate(
         [np.real(direction), np.imag(direction), np.stack([balance.unbalance, balance.drag, balance.averaged.inertia], 1)],
@@ -138,7 +138,7 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
     the interval is narrowed down. Points whose multiple is near 1 are starts too. The mirror images of all starts are added:
     of two patterns that are nearly mirror images of each other, Newton's method often misses the one with steeper slopes.
     """
-    speeds, at_speeds, row, factor, angles = solved_phases(balance, phases)
+    speeds, at_speeds, row, factor, angles = search_phases(balance, phases)
     if not row.size:
         return speeds[:1], phases[:1]
     size = np.log(factor)
@@ -169,9 +169,14 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
     return np.tile(np.concatenate([speeds[row[near]], low]), 2), np.concatenate([every, -every])
 
 
-def solved_phases(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, AtSpeed, np.ndarray, np.ndarray, np.ndarray]:
-    """Return load speeds, their data, and, solved from `phases` (sets, count) and regular sets, for each jam the index of its
-    speed, the multiple of the drag, and the phases."""
+def search_phases(
+    balance: TorqueBalance, phases: np.ndarray
+) -> tuple[np.ndarray, SearchData, np.ndarray, np.ndarray, np.ndarray]:
+    """Search at many load speeds, from `phases` (sets, count) and regular sets, for the phases at which all loads need the same
+    multiple of their drag.
+
+    **Returns** the load speeds, their data, and for each solution the index of its speed, the multiple, and the phases.
+    """
     speeds, phases = load_speeds(balance), np.concatenate([phases, _regular_phases(balance)])
     at_speeds = _data_at_speeds(balance, speeds)
     row = np.repeat(np.arange(speeds.size), len(phases))
@@ -191,7 +196,7 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.sort(first), which
 
 
-class AtSpeed(eqx.Module):
+class SearchData(eqx.Module):
     """Data of the search for phases at a load speed `omega`, rad/s: `influence` (count, count), see `influence_of`, and the
     upper bound `most` of the multiple of the drag that a load can need. Several speeds have a leading axis."""
 
@@ -200,31 +205,31 @@ class AtSpeed(eqx.Module):
     most: Array
 
 
-def at_speed(balance: TorqueBalance, omega: Array) -> AtSpeed:
+def search_data(balance: TorqueBalance, omega: Array) -> SearchData:
     """Return the data of the search at one load speed."""
     influence = influence_of(balance, omega)
     torque = jnp.sum(magnitude(influence) * balance.unbalance[:, None] * balance.unbalance[None, :]) * omega**4
-    return AtSpeed(omega, influence, torque / (jnp.min(balance.drag) * jnp.abs(balance.speed - omega)))
+    return SearchData(omega, influence, torque / (jnp.min(balance.drag) * jnp.abs(balance.speed - omega)))
 
 
 @cached
-def _data_at_each(balance: TorqueBalance, omega: Array) -> AtSpeed:
-    return jax.vmap(at_speed, in_axes=(None, 0))(balance, omega)
+def _data_at_each(balance: TorqueBalance, omega: Array) -> SearchData:
+    return jax.vmap(search_data, in_axes=(None, 0))(balance, omega)
 
 
-def _data_at_speeds(balance: TorqueBalance, omega: np.ndarray) -> AtSpeed:
+def _data_at_speeds(balance: TorqueBalance, omega: np.ndarray) -> SearchData:
     """Return data of the search at load speeds (n,), padded to whole chunks: one program is valid for any number of them."""
     filled = omega[np.minimum(np.arange(-(-omega.size // _SPEEDS_PER_PROGRAM) * _SPEEDS_PER_PROGRAM), omega.size - 1)]
     return on_device(in_chunks(_SPEEDS_PER_PROGRAM, lambda w: _data_at_each(balance, w), filled))
 
 
-def _follow_phases(balance: TorqueBalance, at: AtSpeed, row: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, ...]:
+def _follow_phases(balance: TorqueBalance, at: SearchData, row: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the results of `_solve_phases` with the logarithm of the drag's multiple."""
     factor, angles, good = _solve_phases(balance, at, row, phase)
     return np.log(np.where(good, factor, 1.0)), angles, good
 
 
-def _solve_phases(balance: TorqueBalance, at: AtSpeed, row: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, ...]:
+def _solve_phases(balance: TorqueBalance, at: SearchData, row: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, ...]:
     """Solve for phases from starts (n, count), each at the load speed with the index `row` (n,), in rounds of Newton steps;
     each round continues with the starts that have not converged.
 
@@ -245,7 +250,7 @@ def _solve_phases(balance: TorqueBalance, at: AtSpeed, row: np.ndarray, phase: n
 
 
 @cached
-def _newton_round(row: Array, phase: Array, balance: TorqueBalance, at: AtSpeed) -> tuple[Array, Array, Array]:
+def _newton_round(row: Array, phase: Array, balance: TorqueBalance, at: SearchData) -> tuple[Array, Array, Array]:
     each = jax.tree.map(lambda values: values[row], at)
     return jax.vmap(lambda one, start: phases_near(balance, one, start, _STEPS_PER_ROUND))(each, phase)
 
@@ -272,7 +277,7 @@ def _regular_phases(balance: TorqueBalance) -> np.ndarray:
 
 
 def phases_near(
-    balance: TorqueBalance, at: AtSpeed, start: Array, steps: int = _STEPS_PER_ROUND * _MAX_ROUNDS
+    balance: TorqueBalance, at: SearchData, start: Array, steps: int = _STEPS_PER_ROUND * _MAX_ROUNDS
 ) -> tuple[Array, Array, Array]:
     """Solve for the phases (count,) of a jam at a given load speed by `steps` Newton steps from `start` (count,).
 
@@ -282,14 +287,14 @@ def phases_near(
     **Returns** the multiple, positive in a jam; the phases; and the remaining relative difference between the multiples.
     """
 
-    def differences(x: Array, given: tuple[Array, Array, AtSpeed]) -> tuple[Array, Array]:
-        unbalance, most, at = given
+    def differences(x: Array, parameters: tuple[Array, Array, SearchData]) -> tuple[Array, Array]:
+        unbalance, most, at = parameters
         angles = jnp.concatenate([jnp.zeros(1, x.dtype), x])
         torque = torques_at(unbalance, at.influence, at.omega, jax.lax.complex(jnp.cos(angles), jnp.sin(angles)))
         each = -torque / most
         return each[1:] - each[:-1], each
 
-    given = balance.unbalance, balance.drag * (balance.speed - at.omega) * at.most, at
+    parameters = balance.unbalance, balance.drag * (balance.speed - at.omega) * at.most, at
     x = start[1:] - start[0]
-    x, each = damped_newton(differences, x, given, steps) if x.size else (x, differences(x, given)[1])
+    x, each = damped_newton(differences, x, parameters, steps) if x.size else (x, differences(x, parameters)[1])
     return each[0] * at.most, jnp.concatenate([jnp.zeros(1, x.dtype), x]), jnp.max(jnp.abs(each - each[0]))

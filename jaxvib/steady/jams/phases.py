@@ -128,9 +128,10 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 
         b_j R_j^2 (n - w) + T_j(w, a) = 0,     j = 1 .. count
 
-    is solved for w and all phases a but the first. b_j is the drag of load j, R_j its radius, n the rotor speed, and T_j the
+    is solved for w and all phases a except the first. b_j is the drag of load j, R_j its radius, n the rotor speed, and T_j the
     mean torque of the vibration on the load (`torques_at`). Stability is determined by the growth rate of small disturbances of
-    the averaged equations (`averaged_growth`), in which the angle of each load is free; for isotropic supports they are exact.
+    the averaged equations (`averaged_growth`), in which the angle of each load is free. For isotropic supports the averaged
+    equations are exact.
 
     **Raises** `InputError` as `phase_jams`, and for a number of phases that differs from the number of loads.
 
@@ -190,12 +191,12 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     size = jnp.where(balance.unbalance > 0.0, balance.unbalance, 1.0) / jnp.min(jnp.diagonal(balance.model.mass))
     bounded = jnp.all(magnitude(z) * 100.0 * jnp.finfo(w.dtype).eps < jnp.max(size))
     status = PhaseStatus.where(bounded | ~good, status, PhaseStatus.unbounded)
-    there = good & bounded
+    exists = good & bounded
     # Eigenvalues take as long as everything else; if there is no jam, the speed is NaN and they are skipped.
-    growth = averaged_growth(frozen.averaged, *jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles, z)))
+    growth = averaged_growth(frozen.averaged, *jax.lax.stop_gradient((jnp.where(exists, w, jnp.nan), angles, z)))
 
     def or_nan(value: Array) -> Array:
-        return jnp.where(there, value, jnp.nan)
+        return jnp.where(exists, value, jnp.nan)
 
     return PhaseJam(
         status=status,
@@ -204,7 +205,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
         phase=or_nan(angles),
         pattern=phase_pattern(angles),
         growth=or_nan(growth),
-        stable=there & decays(growth, w),
+        stable=exists & decays(growth, w),
         displacement=or_nan(z),
         amplitude=or_nan(magnitude(z)),
         foundation_force=or_nan(peak_force(force)),
@@ -270,12 +271,12 @@ def phase_pattern(phase: Array) -> PhasePattern:
     turns = [jnp.exp(1j * k * phase) for k in (1, 2)]
     means = [jnp.mean(turn) for turn in turns]
     pairs = zip(turns, means, strict=True)
-    close, parallel = (jnp.min((turn * mean.conj()).real) > _COSINE * jnp.abs(mean) for turn, mean in pairs)
+    close, parallel = (jnp.min((turn * mean.conj()).real) > _MIN_COSINE * jnp.abs(mean) for turn, mean in pairs)
     first = jnp.abs(means[0])
     pattern = PhasePattern.where(first < 0.1, PhasePattern.spread, PhasePattern.other)
     pattern = PhasePattern.where((first < 0.25) & parallel, PhasePattern.opposite, pattern)
     return PhasePattern.where((first > 0.5) & close, PhasePattern.together, pattern)
 
 
-_COSINE = math.cos(math.radians(30.0))
+_MIN_COSINE = math.cos(math.radians(30.0))
 """Cosine of the largest angle between a load and the mean direction of loads that are together."""

@@ -36,6 +36,7 @@ _ORBITS_PER_BATCH = 32
 """Number of orbits in a batch: enough to fill vector registers, few enough for the CPU's cache memory."""
 
 _COLLOCATION_POINTS = (16, 32, 64)
+"""Collocation points on half a period, tried one after the other until the accuracy is reached."""
 
 _STABILITY_CRITERION = "by the multipliers of the full equations"
 
@@ -131,7 +132,8 @@ def exact_branches(
     - of prod (1 + s_i), of either set: loss of symmetry if the motion has the half-turn symmetry, otherwise period doubling
     - of prod (1 - s_i) of the second set: loss of symmetry
 
-    The arguments are those of `branches`. A point that could not be solved has NaN and a status.
+    The arguments are those of `branches`. At a load speed without a solution the values are NaN, and the
+    status states the reason.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -189,14 +191,14 @@ class _Solver:
             todo = np.flatnonzero(~(found["error"] <= self.accuracy))
             if todo.size == 0:
                 break
-            found = jax.tree.map(functools.partial(_replaced_rows, todo), found, self._batches(omega[todo], point_count))
+            found = jax.tree.map(functools.partial(_replace_rows, todo), found, self._batches(omega[todo], point_count))
         return found
 
     def _batches(self, omega: np.ndarray, points: int) -> _Values:
         return in_chunks(_ORBITS_PER_BATCH, lambda w: _values(self.scene, w, points, self.accuracy, self.implicit), omega)
 
 
-def _replaced_rows(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+def _replace_rows(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
     old = old.copy()
     old[where] = new
     return old

@@ -131,8 +131,8 @@ def jam_orbit(
         return outcome(_solve_program(plan.problem, plan.points[0], _MAX_TRACED_STEPS), scene)
     orbit = _solve_accurately(plan)
     if plan.mode is not None and not abs(float(orbit.omega) / float(plan.problem.start) - 1.0) < _MAX_SPEED_DIFFERENCE:
-        # The mode does not exist in leading order, or is far from it: search the whole exact branch.
-        orbit = _solve_accurately(_from_search(plan, plan.mode))
+        # The mode does not exist in leading order, or its exact load speed is far from that of leading order.
+        orbit = _solve_accurately(_plan_from_search(plan, plan.mode))
     return outcome(orbit, throw=throw, failures=("absent", "not_converged"))
 
 
@@ -172,7 +172,10 @@ class OrbitPlan(NamedTuple):
 def plan_orbit(
     scene: Scene, *, mode: int | None, omega: Number | None, near: Number | None, accuracy: float | None, points: int | None
 ) -> OrbitPlan:
-    """Validate the other arguments of `jam_orbit`, and choose start, points and method. **Raises** `InputError`."""
+    """Validate the arguments of `jam_orbit` except `scene` and `throw`, and choose start, points and method.
+
+    **Raises** `InputError`.
+    """
     named = [name for name, value in (("mode", mode), ("omega", omega), ("near", near)) if value is not None]
     if len(named) != 1:
         given = " and ".join(named) if named else "none"
@@ -253,7 +256,7 @@ def _solve_accurately(plan: OrbitPlan) -> Orbit:
     return best
 
 
-def _from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
+def _plan_from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
     """Return the plan that starts at the load speed of the mode that a search of the whole exact branch finds."""
     speed, start = exact_mode_speeds(plan.problem.scene).get(mode), plan.problem.start
     start = start if speed is None else jnp.asarray(speed, dtype=start.dtype)

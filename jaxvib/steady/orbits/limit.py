@@ -176,7 +176,7 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
     has_effect = bool(first.is_met) and abs(float(first.value) - value) <= _SAME_VALUE * max(abs(value), 1e-6)
     first = first if has_effect else near
     rising = 1.0 if float(first.slope) > 0.0 else -1.0
-    ends = [_fold(at, first, towards, number.spec.bounds) if has_effect else (None, []) for towards in (-rising, rising)]
+    ends = [_find_fold(at, first, towards, number.spec.bounds) if has_effect else (None, []) for towards in (-rising, rising)]
     branch, failure = [*reversed(ends[0][1]), first, *ends[1][1]], "not_found" if has_effect else "no_effect"
     return SynchronizationLimit(
         status=member(LimitStatus, np.array([failure if end is None else "found" for end, _ in ends])),
@@ -201,8 +201,8 @@ def _require_one_period(scene: Scene, number: NamedNumber) -> None:
 
 
 class _Point(NamedTuple):
-    """Point of a branch: `value` of the parameter, `speed`, rad/s, and `phases` (N,), rad; `slope`: derivative of the value by
-    the coordinate `along` the branch (phase of one exciter, rad, or relative change of the speed divided by
+    """Point of a branch: `value` of the parameter, `speed`, rad/s, and `phases` (N,), rad; `slope`: derivative of the value
+    with respect to the coordinate `along` the branch (phase of one exciter, rad, or relative change of the speed divided by
     `_SPEED_PER_RADIAN`); `is_met`: True if the equations are satisfied."""
 
     value: np.ndarray
@@ -213,7 +213,7 @@ class _Point(NamedTuple):
     along: np.ndarray
 
 
-def _fold(
+def _find_fold(
     at: Callable[[_Point, float], _Point], first: _Point, towards: float, bounds: Bounds
 ) -> tuple[_Point | None, list[_Point]]:
     """Return the fold in one direction along the branch within the `bounds` of the parameter, or None, and the points of the
@@ -259,8 +259,11 @@ def _branch_point(
     exciter: int | None,
     points: int,
 ) -> tuple[Array, ...]:
-    """Solve for the fields of `_Point` without `along` for the motion in which an `exciter` has its given phase, or, if None,
-    that has the given speed; `slope` is the derivative with respect to this phase or speed."""
+    """Solve for the fields of `_Point` except `along`.
+
+    The motion has the given phase of an `exciter`, or the given speed if `exciter` is None; `slope` is the derivative with
+    respect to this phase or speed.
+    """
     value, speed, phases = jnp.asarray(value), jnp.asarray(speed), jnp.asarray(phases)
     number, grid, counts = find_number(scene, over, "over"), grid_of(points, False), body_counts(scene)
     forced = bool(forcing_exciters(scene))

@@ -46,7 +46,7 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     if np.sum(known) < 2:
         problem = "no exact jam was found at any load speed; check the largest and the smallest numbers of the scene"
         raise ComputationError("not_converged", problem)
-    omega, speed = _interpolated(omega[known], speed[known], slope[known])
+    omega, speed = _interpolate(omega[known], speed[known], slope[known])
     folds, ends, modes = sampled_modes(omega, speed, resonances)
     crossed = (speed[1:] - target) * (speed[:-1] - target) <= 0.0
     near = folds[np.abs(speed[folds] - target) < _NEAR_FOLD_DISTANCE * target]
@@ -60,8 +60,8 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
             close.append(k)
     found: dict[int, float] = {}
     for k in np.flatnonzero(crossed):
-        part = (target - speed[k]) / (speed[k + 1] - speed[k])
-        found.setdefault(int(modes[np.searchsorted(ends, k)]), float(omega[k] + part * (omega[k + 1] - omega[k])))
+        share = (target - speed[k]) / (speed[k + 1] - speed[k])
+        found.setdefault(int(modes[np.searchsorted(ends, k)]), float(omega[k] + share * (omega[k + 1] - omega[k])))
     # If a fold lies between two points, the two modes that meet at the fold are near these points.
     for k in close:
         for side in (k - 1, k + 1):
@@ -70,8 +70,11 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
 
 
 def _ends_before(scene: Scene, low: float, high: float, target: float, refinements: int = 2) -> bool:
-    """Return True if the exact branch has a fold between two load speeds, before it reaches the rotor speed `target`: that of
-    the interpolated cubic in the last of `refinements` smaller and smaller intervals around the fold, up to rounding."""
+    """Return True if the exact branch has a fold between two load speeds, at which it turns back before it reaches the rotor
+    speed `target`, up to rounding.
+
+    The fold is that of the interpolated cubic in the last of `refinements` intervals, each smaller than the one before.
+    """
     omega = np.linspace(low, high, _BRANCH_POINTS)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
     (folds,) = np.nonzero(slope[1:] * slope[:-1] <= 0.0)
@@ -82,11 +85,11 @@ def _ends_before(scene: Scene, low: float, high: float, target: float, refinemen
         low, high = (float(w) for w in omega[ends])
         return _ends_before(scene, low, high, target, refinements - 1)
     rounding = 4096.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
-    fold = _interpolated(omega[ends], speed[ends], slope[ends])[1]
+    fold = _interpolate(omega[ends], speed[ends], slope[ends])[1]
     return bool(np.max(fold) < target * (1.0 - rounding) if slope[folds[0]] > 0.0 else np.min(fold) > target * (1.0 + rounding))
 
 
-def _interpolated(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _interpolate(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return points of the cubics through (x, y) with the given slopes, `_PARTS_PER_INTERVAL` in each interval."""
     t, h = np.arange(_PARTS_PER_INTERVAL) / _PARTS_PER_INTERVAL, np.diff(x)[:, None]
     a, b, c, d = y[:-1, None], h * slope[:-1, None], y[1:, None], h * slope[1:, None]

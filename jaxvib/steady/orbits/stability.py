@@ -81,7 +81,7 @@ def multiplier_error(trivial: Array, decay_error: Array) -> Array:
     return jnp.maximum(jnp.abs(trivial - 1.0), jnp.maximum(decay_error, rounding))
 
 
-def _oscillation(model: JammedBodies, speed: Array) -> Array:
+def _fastest_oscillation(model: JammedBodies, speed: Array) -> Array:
     """Return the rate of the carrier's fastest oscillation at the rotor's `speed`, rad/s."""
     linear, gyroscopic = model.linear, model.linear.mount.gyroscopic
     square, half = relative_to(linear.mass, linear.carrier.stiffness)
@@ -120,7 +120,7 @@ def is_stiff(model: JammedBodies, omega: Array, speed: Array) -> Array:
     """Return True if multipliers at load speeds `omega` and the rotor's `speed` (rad/s) need the implicit method, because of
     the decay rates of loads and carrier."""
     decay = jnp.maximum(_damping_rate(model), _drag_rate(model, omega, speed))
-    return decay > _STIFF_DECAY_RATIO * (_oscillation(model, speed) + 2.0 * omega)
+    return decay > _STIFF_DECAY_RATIO * (_fastest_oscillation(model, speed) + 2.0 * omega)
 
 
 def steps_for(model: JammedBodies, omega: Array, speed: Array, *, implicit: bool) -> Array:
@@ -128,7 +128,7 @@ def steps_for(model: JammedBodies, omega: Array, speed: Array, *, implicit: bool
 
     An `implicit` method is stable at any rate of decay; its steps follow the oscillation only.
     """
-    turn, fastest = np.pi if model.half_turn else 2.0 * np.pi, _oscillation(model, speed)
+    turn, fastest = np.pi if model.half_turn else 2.0 * np.pi, _fastest_oscillation(model, speed)
     if implicit:
         return radau.steps_for(turn * (fastest / omega + 2.0))
     return jnp.ceil(turn * (jnp.maximum(fastest, _damping_rate(model)) / omega + 2.0) / _PHASE_PER_STEP).astype(int)
@@ -229,7 +229,7 @@ class _Disturbances(NamedTuple):
         coupling = coupling if by_acceleration is None else coupling - by_acceleration / self.total
         return _Coefficients(s * moving, coupling, -s * point * rate[None], s * moving2, stiff / unit, by_rate)
 
-    def damped(self, q1: Array) -> Array:
+    def damping_acceleration(self, q1: Array) -> Array:
         """Return the acceleration of the carrier by damping and gyroscopic forces at the velocity q1."""
         acceleration = _times(self.damping, q1) / self.w
         return acceleration if self.gyroscopic is None else acceleration + self.n * _times(self.gyroscopic, q1) / self.w
@@ -241,7 +241,7 @@ class _Disturbances(NamedTuple):
         t, t1, t2 = (v[:, :, None, :] for v in (c.moving, c.moving1, c.moving2))
         q = shifted - _times(self.shift, jnp.sum(t * d[None], axis=1))
         q1 = shifted1 - _times(self.shift, jnp.sum(t * d1[None] + t1 * d[None], axis=1))
-        shifted2 = -self.damped(q1) - _times(self.stiffness, q) / self.w**2
+        shifted2 = -self.damping_acceleration(q1) - _times(self.stiffness, q) / self.w**2
         driven = _times(self.port, shifted2) - _times(self.accelerance, jnp.sum(2.0 * t1 * d1[None] + t2 * d[None], axis=1))
         torque = c.by_rate[:, None] * d1 + c.by_angle[:, None] * d
         # Acceleration of the mount including the motion of the bodies: one equation for each direction.
@@ -267,7 +267,7 @@ class _Disturbances(NamedTuple):
         return jnp.concatenate([
             at1 + _times(self.shift, jnp.sum(turning, axis=1)),
             1.0 + deviation1,
-            -self.damped(at1) - _times(self.stiffness, at) / self.w**2,
+            -self.damping_acceleration(at1) - _times(self.stiffness, at) / self.w**2,
             deviation2,
         ])[:, 0]  # fmt: skip
 

@@ -394,15 +394,15 @@ def _solve_program(
     eps = float(jnp.finfo(speed.dtype).eps)
     largest = jnp.max(jnp.abs(multipliers))
     is_met = residual < 4096.0 * eps
-    equal = jnp.asarray(True)
+    has_one_speed = jnp.asarray(True)
     for k in forcing:
-        equal = equal & (jnp.abs(scene.exciters[k].drive.speed / speed - 1.0) < 64.0 * eps)
+        has_one_speed = has_one_speed & (jnp.abs(scene.exciters[k].drive.speed / speed - 1.0) < 64.0 * eps)
     status = SynchronousStatus.where(error <= accuracy, SynchronousStatus.found, SynchronousStatus.under_resolved)
     nearest = jnp.min(jnp.abs(multipliers - 1.0))
     status = SynchronousStatus.where(nearest < eps**0.4, SynchronousStatus.at_fold, status)
     status = SynchronousStatus.where(is_met, status, SynchronousStatus.not_converged)
-    status = SynchronousStatus.where(equal, status, SynchronousStatus.different_speeds)
-    is_solution = is_met & equal
+    status = SynchronousStatus.where(has_one_speed, status, SynchronousStatus.different_speeds)
+    is_solution = is_met & has_one_speed
     numbers = {
         **_quantities(whole, grid, motion), "multiplier": largest, "multiplier_error": multiplier_error,
         "multipliers": multipliers, "trivial": trivial, "error": error,

@@ -288,9 +288,9 @@ def _solve_jvp(primals, tangents, *, grid_key: tuple[int, bool], forced: bool):
 
 def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, forced: bool) -> tuple[Array, Array]:
     """Return the residual of the equations at the points, relative to their terms, and the estimated error of the motion: the
-    largest of those of the speed, relative, of angles, rad, and of displacements, relative to the largest displacement.
+    largest of the errors of the speed (relative), of angles (rad), and of displacements (relative to the largest one).
 
-    It follows from one Newton step with the residuals at twice as many points, and from the highest harmonic.
+    The error follows from one Newton step with the residuals at twice as many points, and from the highest harmonic.
     """
     scene, (x, omega) = jax.lax.stop_gradient((scene, motion))
     system, nd = collocation(scene, grid, x, omega, forced=forced), scene.coordinates

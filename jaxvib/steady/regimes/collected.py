@@ -107,12 +107,12 @@ def _collected_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]
 def _fields_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
     """Return the fields of `fields_near` for all loads, from a start with the phases of the collected masses."""
     count = np.asarray(_loads_per_mass(scene))
-    plain = assemble_torque_balance(_with_collected_loads(scene))
-    parts = {field.name: getattr(plain, field.name) for field in dataclasses.fields(TorqueBalance)}
+    collected = assemble_torque_balance(_with_collected_loads(scene))
+    parts = {field.name: getattr(collected, field.name) for field in dataclasses.fields(TorqueBalance)}
     balance = _CollectedBalance(**parts, loads_per_mass=tuple(count.tolist()))
     fields = fields_of_balance(balance, omega, phases)
-    apart = _separation_growth(balance, fields)[np.flatnonzero(count > 1)]
-    growth, quasi_static = (jnp.max(apart, initial=fields[name]) for name in ("growth", "quasi_static"))
+    separation = _separation_growth(balance, fields)[np.flatnonzero(count > 1)]
+    growth, quasi_static = (jnp.max(separation, initial=fields[name]) for name in ("growth", "quasi_static"))
     each = np.repeat(np.arange(count.size), count)
     shared = {name: fields[name][each] / count[each] for name in ("torque", "vibrational_torque")}
     stable = fields["stable"] & decays(growth, fields["speed"])

@@ -34,8 +34,8 @@ _LONGEST_STEP = 0.3
 
 
 class Slopes(NamedTuple):
-    """Singular value decomposition U, s, V^T (`left`, `values`, `right`) of the Jacobian of the balance, whose `rows` and
-    `columns` are multiplied by these factors."""
+    """Singular value decomposition U, s, V^T (`left`, `values`, `right`) of the scaled Jacobian of the balance. `rows` and
+    `columns` are the factors by which its rows and columns are multiplied."""
 
     rows: Array
     columns: Array

@@ -170,7 +170,9 @@ def regime_partitions(scene: Scene, *, stable: bool = True) -> RegimePartitions:
     if count > _MAX_MASSES:
         raise InputError("scene", f"has {count} rotating masses; at most {_MAX_MASSES} are possible, which have 63 groups")
     subsets = [each for size in range(1, count + 1) for each in itertools.combinations(range(count), size)]
-    regimes = {subset: _members(scene, subset, stable=stable) for subset in subsets if _can_share(scene, owners[list(subset)])}
+    regimes = {
+        subset: _regimes_of_group(scene, subset, stable=stable) for subset in subsets if _can_share(scene, owners[list(subset)])
+    }
     motions = [_motion(parts, count) for parts in _products(tuple(range(count)), regimes)]
     if motions:
         rows = _Rows(*map(np.array, zip(*motions, strict=True)))
@@ -180,7 +182,7 @@ def regime_partitions(scene: Scene, *, stable: bool = True) -> RegimePartitions:
     interaction = in_chunks(_MOTIONS_PER_PROGRAM, _interactions, rows.speed, rows.group, shared=(scene,))
     kept = np.flatnonzero(interaction <= _LARGEST_INTERACTION)
     kept = kept[np.lexsort((np.max(rows.group[kept], axis=1, initial=0), ~rows.stable[kept]))]
-    kept = kept[_distinct(_Rows(*(field[kept] for field in rows)), exchanges_in(assemble_for_search(scene)))]
+    kept = kept[_distinct_motions(_Rows(*(field[kept] for field in rows)), exchanges_in(assemble_for_search(scene)))]
     return RegimePartitions(
         status=RegimeSearchStatus.done if kept.size else RegimeSearchStatus.none,
         group=rows.group[kept],
@@ -212,7 +214,7 @@ def _can_share(scene: Scene, owners: np.ndarray) -> bool:
     return len({float(each.drive.speed) for each in exciters if each.loads is None and each.drive.ideal}) < 2
 
 
-def _members(scene: Scene, subset: tuple[int, ...], *, stable: bool) -> list[SynchronousRegime]:
+def _regimes_of_group(scene: Scene, subset: tuple[int, ...], *, stable: bool) -> list[SynchronousRegime]:
     """Return the regimes of a group of masses."""
     found: SynchronousRegimes = synchronous_regimes(scene, masses=subset)
     finite = np.isfinite(np.asarray(found.growth))
@@ -254,7 +256,7 @@ def _interactions(speed: Array, group: Array, scene: Scene) -> Array:
     balance = assemble_torque_balance(scene)
     unbalance, inertia = balance.unbalance, balance.averaged.inertia
 
-    def one(speed: Array, group: Array) -> Array:
+    def interaction(speed: Array, group: Array) -> Array:
         influence = jax.vmap(lambda w: magnitude(influence_of(balance, w, speed)))(speed)
         from_each = jnp.diagonal(influence, axis1=0, axis2=2)  # (i, k): at the speed of mass k
         torque = 0.5 * unbalance[:, None] * unbalance[None] * speed[None] ** 4 * from_each
@@ -266,10 +268,10 @@ def _interactions(speed: Array, group: Array, scene: Scene) -> Array:
         found = jnp.max(jnp.sum(jnp.where(acts, torque / resistance, 0.0), axis=1))
         return jnp.where(jnp.any(equal), jnp.inf, found)
 
-    return jax.vmap(one)(speed, group)
+    return jax.vmap(interaction)(speed, group)
 
 
-def _distinct(motions: _Rows, exchanges: list[Exchange]) -> np.ndarray:
+def _distinct_motions(motions: _Rows, exchanges: list[Exchange]) -> np.ndarray:
     """Return indices of motions of which no two differ only by an exchange of masses, or by common shifts of groups."""
     permutations, shifts = (np.array(parts) for parts in zip(*exchanges, strict=True))
     inverses = np.argsort(permutations)

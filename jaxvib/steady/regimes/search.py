@@ -59,7 +59,7 @@ def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
     3. Regimes that differ by a common shift of all phases or by an exchange of equal masses are one regime. Regimes of one
     speed whose phases can change without a change of torques belong to a family, of which one member is kept
 
-    For more than `MAX_COMPLETE` masses the starts first approach stable regimes, see `relaxed`, and step 2 is left out.
+    For more than `MAX_COMPLETE` masses the starts first approach stable regimes, see `relax`, and step 2 is left out.
     """
     count, speed = balance.unbalance.size, np.asarray(balance.speed)
     if balance.is_prescribed.all():
@@ -77,7 +77,7 @@ def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
         grown = kept[kept >= before]
         if grown.size == 0 or count == 1 or count > MAX_COMPLETE:
             break
-        sets = _related(phases[grown], balance.is_prescribed)
+        sets = _related_sets(phases[grown], balance.is_prescribed)
     return known[:2]
 
 
@@ -197,7 +197,7 @@ def _nearly_touching(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return row, point + 1
 
 
-def _related(phases: np.ndarray, prescribed: np.ndarray) -> np.ndarray:
+def _related_sets(phases: np.ndarray, prescribed: np.ndarray) -> np.ndarray:
     """Return sets of phases that follow from those of regimes (n, count) by exchanges, mirroring and half turns."""
     count = phases.shape[1]
     swaps = [np.arange(count)]
@@ -218,7 +218,7 @@ def _solved(omega: Array, phases: Array, balance: TorqueBalance) -> tuple[Array,
 
 def solve_near(omega: Array, phase: Array, balance: TorqueBalance) -> tuple[Array, Array, Array, Array]:
     """Return speed, phases, number of neutral directions, and True if the start leads to a solution."""
-    start = relaxed(unknowns_of(balance, omega, phase), balance)
+    start = relax(unknowns_of(balance, omega, phase), balance)
     x = solve_torques(start, balance, _ITERATIONS)
     w, angles = motion_of(balance, x)
     good = is_balanced(balance, x)
@@ -226,7 +226,7 @@ def solve_near(omega: Array, phase: Array, balance: TorqueBalance) -> tuple[Arra
     return w, jnp.arctan2(jnp.sin(angles), jnp.cos(angles)), neutral, good
 
 
-def relaxed(x: Array, balance: TorqueBalance) -> Array:
+def relax(x: Array, balance: TorqueBalance) -> Array:
     """Return unknowns near a regime of more than `MAX_COMPLETE` masses that is stable according to the quasi-static criterion.
 
         Omega' = mean of r,     alpha_k' - alpha_0' = r_k - r_0,     r_i = (L_i + V_i)/(largest possible V_i)

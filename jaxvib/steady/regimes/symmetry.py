@@ -68,7 +68,10 @@ def _permutations(size: np.ndarray, same: np.ndarray, tolerance: float) -> np.nd
 
 
 def _shifts(influence: np.ndarray, exchanged: np.ndarray, small: np.ndarray) -> np.ndarray:
-    """Return the shifts of the phases (count,), rad: each shift follows from that of a coupled mass whose shift is known."""
+    """Return the shifts of the phases (count,), rad: each shift follows from that of a coupled mass whose shift is known.
+
+    `exchanged` is `influence` after a permutation of the masses; masses are coupled if a coefficient is larger than `small`.
+    """
     count = influence.shape[1]
     coupled, best_speed = np.abs(influence) > small, np.argmax(np.abs(influence), axis=0)
     shift, known = np.zeros(count), np.zeros(count, dtype=bool)

@@ -454,14 +454,14 @@ def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: A
     size = jnp.max(balance.unbalance) / jnp.min(jnp.diagonal(balance.model.mass))
     bounded = jnp.all(magnitude(z) * 100.0 * eps < size)
     good = is_balanced(frozen, x) & _has_one_speed(balance)
-    there = good & bounded
+    exists = good & bounded
     status = RegimeStatus.where(is_still, RegimeStatus.no_vibration, RegimeStatus.found)
     status = RegimeStatus.where(neutral > 0, RegimeStatus.degenerate, status)
     status = RegimeStatus.where(good, status, RegimeStatus.not_converged)
     status = RegimeStatus.where(bounded | ~jnp.isfinite(w), status, RegimeStatus.unbounded)
 
-    speed, at = jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles))
-    growth = regime_growth(frozen, speed, at, neutral) if growth is None else jnp.where(there, growth, jnp.nan)
+    speed, at = jax.lax.stop_gradient((jnp.where(exists, w, jnp.nan), angles))
+    growth = regime_growth(frozen, speed, at, neutral) if growth is None else jnp.where(exists, growth, jnp.nan)
     numbers = {
         "speed": w,
         "phases": angles,
@@ -476,8 +476,8 @@ def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: A
         "foundation_force": force,
         "residual": residual,
     }
-    with_nan = {name: jnp.where(there, value, jnp.nan) for name, value in numbers.items()}
-    stable = there & decays(growth, w)
+    with_nan = {name: jnp.where(exists, value, jnp.nan) for name, value in numbers.items()}
+    stable = exists & decays(growth, w)
     masses, starts = jnp.arange(angles.size), can_start(balance.model.scene)
     return {"status": status, "masses": masses, "stable": stable, "can_start": starts, **with_nan}
 

@@ -23,7 +23,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import solve_torques
 from jaxvib.steady.outcome import outcome, without_numbers
 from jaxvib.steady.regimes.local import Slopes, regime_growth, slopes_of
-from jaxvib.steady.regimes.search import is_balanced, relaxed, sets_of_phases
+from jaxvib.steady.regimes.search import is_balanced, relax, sets_of_phases
 from jaxvib.steady.regimes.synchronous import RegimeStatus, SynchronousRegime, fields_at, require_one_speed
 
 _SETS_PER_SQUARED_UNKNOWN = 4
@@ -110,7 +110,7 @@ def _stable_solution(balance: TorqueBalance) -> tuple[Array, Slopes | None, Arra
 
     def solve(omega: Array, phase: Array) -> tuple[Array, Array, Array]:
         """Return the unknowns, the speed (0 without a solution) and Blekhman's function."""
-        start = relaxed(unknowns_of(balance, omega, phase), balance)
+        start = relax(unknowns_of(balance, omega, phase), balance)
         x = solve_torques(start, balance, _ITERATIONS)
         w, angles = motion_of(balance, x)
         return x, jnp.where(is_balanced(balance, x), w, 0.0), _potential(balance, w, angles)

@@ -19,7 +19,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.parallel import in_parallel
 from jaxvib.steady.balance.criterion import criterion
-from jaxvib.steady.balance.states import balanced_growth, decay_over_turn, stability_changes
+from jaxvib.steady.balance.states import balanced_growth, decays_over_turn, stability_changes
 
 
 class CriterionMap(Result):
@@ -126,7 +126,7 @@ def criterion_map(
         d, m = cell
         scene_of_cell = scene_with(jnp.asarray(mass_factor[m]), drag_factor[d])
         growth = balanced_growth(scene_of_cell, grid, steps=steps)
-        stable = decay_over_turn(grid, growth)
+        stable = decays_over_turn(grid, growth)
         changes = stability_changes(scene_of_cell, grid, stable, rtol=1e-5, steps=steps)
         ends = [*([np.nan] if stable[0] else []), *changes, *([np.nan] if stable[-1] else [])]
         return growth, _shifts(np.reshape(ends, (-1, 2)), grid, boundary[m])

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 import jaxvib as jv
 from jaxvib.equations.torque_balance import assemble_torque_balance, influence_of, torques_at
 from jaxvib.steady.jams import phase_starts
-from jaxvib.steady.jams.phase_starts import _regular_phases, at_speed, distinct_rows, load_speeds, phases_near, starts_of
+from jaxvib.steady.jams.phase_starts import _regular_phases, distinct_rows, load_speeds, phases_near, search_data, starts_of
 from jaxvib.steady.jams.phases import phase_pattern, solve_balance
 
 MACHINE = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
@@ -54,13 +54,13 @@ def test_regular_phases_are_every_split_into_two():
 def test_loads_together_need_the_drag_that_is_computed_by_hand(omega):
     p, w = parts(), jnp.asarray(omega)
     influence = influence_of(p, w)
-    factor, phase, residual = phases_near(p, at_speed(p, w), jnp.array([0.3, 0.3001]))
+    factor, phase, residual = phases_near(p, search_data(p, w), jnp.array([0.3, 0.3001]))
     np.testing.assert_allclose(factor, needed(omega), rtol=1e-9)
     np.testing.assert_allclose(phase, [0.0, 0.0], atol=1e-9)
     assert residual < 1e-14
     # Without a step: how far the loads' multiples differ, beside what their torques could be at most.
     start = jnp.array([0.0, 1.0])
-    factor, phase, residual = phases_near(p, at_speed(p, w), start, 0)
+    factor, phase, residual = phases_near(p, search_data(p, w), start, 0)
     each = -np.asarray(torques_at(p.unbalance, influence, w, jnp.exp(1j * start))) / (0.04 * 0.08**2 * (460.0 - omega))
     most = omega**4 * np.sum(np.abs(influence)) * 0.004**2 / (0.04 * 0.08**2 * (460.0 - omega))
     np.testing.assert_allclose(residual, abs(each[1] - each[0]) / most, rtol=1e-9)
@@ -69,14 +69,14 @@ def test_loads_together_need_the_drag_that_is_computed_by_hand(omega):
 
 def test_a_common_turn_of_the_start_changes_nothing():
     p, start = parts(count=3), jnp.array([0.0, 0.4, -0.3])
-    at = at_speed(p, jnp.asarray(170.0))
+    at = search_data(p, jnp.asarray(170.0))
     for one, other in zip(phases_near(p, at, start), phases_near(p, at, start + 1.1), strict=True):
         np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-12)
 
 
 def test_a_load_alone_needs_what_it_needs():
     p = parts(count=1)
-    factor, phase, residual = phases_near(p, at_speed(p, jnp.asarray(170.0)), jnp.array([2.0]))
+    factor, phase, residual = phases_near(p, search_data(p, jnp.asarray(170.0)), jnp.array([2.0]))
     np.testing.assert_allclose(factor, 2.0 * needed(170.0), rtol=1e-9)
     assert phase.tolist() == [0.0] and residual == 0.0
 
@@ -91,7 +91,7 @@ def test_starts_lie_at_the_jams_that_are_known():
     jams = speeds[:-1][off[1:] * off[:-1] < 0.0]
     assert len(jams) >= 1
     # Either their own multiple is near 1, or they are next to a jam.
-    multiples = jax.vmap(lambda w, a: phases_near(p, at_speed(p, w), a, 0)[0])(jnp.asarray(omega), jnp.asarray(phase))
+    multiples = jax.vmap(lambda w, a: phases_near(p, search_data(p, w), a, 0)[0])(jnp.asarray(omega), jnp.asarray(phase))
     assert np.all((multiples > 1.0 / 3.001) & (multiples < 3.001))
     together = np.abs(np.angle(np.exp(1j * (phase[:, 1] - phase[:, 0])))) < 1e-3
     for jam in jams:
@@ -117,7 +117,7 @@ def test_the_search_is_written_on_single_numbers():
     machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
     p = assemble_torque_balance(jv.Scene(machine, jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed(120.0)))
     w, start = jnp.asarray(100.0), jnp.zeros(3)
-    for search in (lambda: phases_near(p, at_speed(p, w), start), lambda: solve_balance(p, w, start, on_scalars=True)):
+    for search in (lambda: phases_near(p, search_data(p, w), start), lambda: solve_balance(p, w, start, on_scalars=True)):
         loops = [e for e in jax.make_jaxpr(search)().jaxpr.eqns if e.primitive.name == "while"]
         newton = max(loops, key=lambda e: len(e.outvars))
         assert len(newton.outvars) > 10 and all(v.aval.shape == () for v in newton.outvars)

@@ -13,14 +13,14 @@ from jaxvib.equations.linear import jammed_model
 from jaxvib.steady.jams.branch_plot import branch_summary
 from jaxvib.steady.orbits import diagram, search
 from jaxvib.steady.orbits.describe import half_range
-from jaxvib.steady.orbits.search import _interpolated
+from jaxvib.steady.orbits.search import _interpolate
 from jaxvib.steady.orbits.stability import steps_for
 
 
 def test_points_between_follow_the_hermite_cubic():
     x = np.array([0.0, 1.0, 3.0, 3.5])
     cubic, slope = np.poly1d([1.0, -4.0, 2.0, 5.0]), np.polyder(np.poly1d([1.0, -4.0, 2.0, 5.0]))
-    between, values = _interpolated(x, cubic(x), slope(x))
+    between, values = _interpolate(x, cubic(x), slope(x))
     parts = search._PARTS_PER_INTERVAL
     assert between.size == values.size == 3 * parts + 1 and parts > 2
     np.testing.assert_allclose(between[::parts], x)

@@ -13,7 +13,7 @@ from scipy.optimize import fsolve
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.status import status_names
-from jaxvib.steady.orbits.limit import _fold, _Point
+from jaxvib.steady.orbits.limit import _find_fold, _Point
 from jaxvib.steady.orbits.synchronous import plan_synchronous
 from jaxvib.steady.orbits.whole import linear_start, periodic_scene
 from jaxvib.units import Bounds
@@ -416,10 +416,10 @@ def test_limits_are_allowed_values():
         numbers = (np.cos(along) - 0.5, 1.0, np.zeros(2), -np.sin(along), True, along)
         return _Point(*map(np.asarray, numbers))
 
-    ends = [_fold(at, at(None, 1.0), towards, Bounds(0.0)) for towards in (-1.0, 1.0)]
+    ends = [_find_fold(at, at(None, 1.0), towards, Bounds(0.0)) for towards in (-1.0, 1.0)]
     np.testing.assert_allclose(ends[0][0].value, 0.5, rtol=1e-12)
     assert ends[1][0] is None and 0.0 <= float(ends[1][1][-1].value) < 1e-3
-    np.testing.assert_allclose(_fold(at, at(None, 1.0), 1.0, Bounds())[0].value, -1.5, rtol=1e-12)
+    np.testing.assert_allclose(_find_fold(at, at(None, 1.0), 1.0, Bounds())[0].value, -1.5, rtol=1e-12)
 
 
 def test_limit_needs_a_number_and_a_free_motion(general, orbit):

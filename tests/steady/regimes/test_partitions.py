@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import brentq
 
 import jaxvib as jv
-from jaxvib.steady.regimes.partitions import _distinct, _motion, _Rows
+from jaxvib.steady.regimes.partitions import _distinct_motions, _motion, _Rows
 from jaxvib.steady.regimes.symmetry import Exchange
 from jaxvib.steady.regimes.synchronous import RegimeStatus
 
@@ -154,7 +154,7 @@ def test_a_motion_is_stable_if_all_its_groups_are():
 
 
 def distinct(speed, torque, exchanges, phases=None, group=None, family=False):
-    """Return `_distinct` for motions of two masses in groups of their own if no `group` is given."""
+    """Return `_distinct_motions` for motions of two masses in groups of their own if no `group` is given."""
     n, masses = np.shape(speed)
     rows = [
         np.arange(masses) if group is None else group,
@@ -164,7 +164,7 @@ def distinct(speed, torque, exchanges, phases=None, group=None, family=False):
         family,
     ]
     rows = [np.broadcast_to(each, (n, masses)) for each in rows]
-    return _distinct(_Rows(*rows, np.zeros(n), np.ones(n, bool)), exchanges).tolist()
+    return _distinct_motions(_Rows(*rows, np.zeros(n), np.ones(n, bool)), exchanges).tolist()
 
 
 SAME, SWAP = (Exchange(np.array(order), np.zeros(2)) for order in ([0, 1], [1, 0]))
