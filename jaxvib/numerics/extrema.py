@@ -21,9 +21,9 @@ _MIDDLE = (NODES - 1) / 2.0
 
 
 def _hermite() -> tuple[np.ndarray, np.ndarray]:
-    """Return matrices (4, 3) and (4, 4) from sums and differences of the values and slopes, at the two inner points and at the
-    two outer ones, to the even and the odd coefficients of `_polynomial`. Values are relative to the mean of the inner ones,
-    whose sum is therefore 0 and is omitted."""
+    """Return the matrices (4, 3) and (4, 4) that give the even and the odd coefficients of `_polynomial`. They multiply sums
+    and differences of the values and slopes at the two inner points and at the two outer points. Values are relative to the
+    mean of the inner values; the sum of the inner values is therefore 0 and is omitted."""
     nodes, even = np.asarray([[0.5], [1.5]]), np.asarray([0, 2, 4, 6])
 
     def inverse(powers: np.ndarray) -> np.ndarray:
@@ -36,8 +36,8 @@ _EVEN, _ODD = _hermite()
 
 
 def _extrapolation() -> tuple[np.ndarray, np.ndarray]:
-    """Return the matrices (2, 8) from the values and slopes of four samples to value and slope of the polynomial through them,
-    one step before the first sample and one step after the last sample."""
+    """Return two matrices (2, 8) that multiply the values and slopes of four samples. They give value and slope of the
+    polynomial through the samples, one step before the first sample and one step after the last sample."""
     powers = np.arange(2 * NODES)
 
     def rows(positions: np.ndarray) -> np.ndarray:
@@ -125,8 +125,8 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
 
 
 def extremum_value(x: Array, v: Array, position: Array) -> Array:
-    """Return the value at an extremum, whose derivatives include the change of the `position`, in steps from the first of the
-    four samples x (4,) with the slopes v (4,), see `locate_extrema`."""
+    """Return the value at an extremum from four samples x (4,) and their slopes v (4,), see `locate_extrema`. `position`: in
+    steps from the first sample. Derivatives of the value include the change of the position."""
     polynomial, s = _polynomial(x, v), position - _MIDDLE
     slope = _derivative(polynomial)
     curved = _at(_derivative(slope), s)

@@ -48,8 +48,8 @@ class Grid(NamedTuple):
 def grid_of(points: int, symmetric: bool) -> Grid:
     """Return the grid of `points` points, on half a period if `symmetric` is True, otherwise on a period.
 
-    `points` is rounded up to an even number for half a period and to an odd number for a period, so that the grid represents
-    both the cosine and the sine of the highest harmonic of e. Each precision has its own grid, because JAX caches an array with
+    `points` is rounded up: to an even number for half a period, to an odd number for a period. The grid then represents both
+    the cosine and the sine of the highest harmonic of e. Each precision has its own grid, because JAX caches an array with
     the precision of its first use.
     """
     return _grid_of(points, symmetric, jnp.result_type(float).itemsize == 8)

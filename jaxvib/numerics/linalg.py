@@ -147,8 +147,8 @@ def hermitian_modes(square: Array) -> tuple[Array, Array]:
 def _small_modes(square: Array) -> tuple[Array, Array]:
     """Return eigenvalues and eigenvectors of real symmetric matrices up to 3 x 3, by unrolled Jacobi rotations.
 
-    Rotations are faster than library calls, and on two cores, library calls for large batches in one program can deadlock
-    (jaxlib 0.10). Large batches occur for machines of up to three platforms.
+    Rotations are faster than library calls, which can deadlock for large batches, see `solve_in_turn`. Large batches occur for
+    machines of up to three platforms.
     """
     n = square.shape[-1]
     entries = tuple(tuple(square[..., i, j] for j in range(n)) for i in range(n))
@@ -320,8 +320,8 @@ def svd_in_turn(matrix: Array) -> tuple[Array, Array, Array]:
 
 
 def complex_product(matrix: Array, other: Array) -> Array:
-    """Return matrix @ other for a real or complex matrix and a complex vector or matrix, from products of real matrices, which
-    take less than half of the time.
+    """Return matrix @ other for a real or complex matrix and a complex vector or matrix `other`. It is computed from products
+    of real matrices, which take less than half of the time.
 
     >>> complex_product(jnp.asarray([[1.0, 1.0j]]), jnp.asarray([2.0, 1.0j]))
     Array([1.+0.j], dtype=complex128)
@@ -333,8 +333,8 @@ def complex_product(matrix: Array, other: Array) -> Array:
 
 
 def refine_solution(product: Callable[[Array], Array], inverse: Callable[[Array], Array], b: Array, norm: Array) -> Array:
-    """Return x of A x = b, with A x = `product(x)`, an approximate solution `inverse(b)` and the row-sum `norm` of A, corrected
-    by its residual, usually 0 and at most 4 times, until only rounding errors are left."""
+    """Return x of A x = b, where `product(x)` is A x, `inverse(b)` an approximate solution, and `norm` the row-sum norm of A.
+    The residual corrects the solution, usually 0 and at most 4 times, until only rounding errors are left."""
     eps = jnp.finfo(norm.dtype).eps
 
     def residual(x: Array) -> tuple[Array, Array]:
@@ -369,8 +369,8 @@ def solve_definite(a: Array, b: Array) -> Array:
 
 @_compiled
 def eliminate(a: Array, b: Array) -> Array:
-    """Return x (n,) or (n, m) of a x = b, by elimination with pivots, because library calls for large batches in one program
-    can deadlock (jaxlib 0.10, two cores)."""
+    """Return x (n,) or (n, m) of a x = b, by elimination with pivots, because library calls for large batches can deadlock, see
+    `solve_in_turn`."""
     n = a.shape[0]
     row = jnp.arange(n)
 
@@ -389,8 +389,8 @@ def eliminate(a: Array, b: Array) -> Array:
 def unrolled_inverse(matrix: Array) -> Array:
     """Return the inverse of a matrix (n, n) by unrolled Gauss-Jordan elimination.
 
-    A library call would prevent fusion in the time loop, and large batches of such calls can deadlock on few cores (jaxlib
-    0.10). There are no pivots; the matrix must be diagonally dominant, such as 1/(gamma h) - J for small h. For larger h the
+    A library call would prevent fusion in the time loop, and large batches of such calls can deadlock, see `solve_in_turn`.
+    There are no pivots; the matrix must be diagonally dominant, such as 1/(gamma h) - J for small h. For larger h the
     inverse can be inaccurate; the step is then rejected by its error estimate and repeated with a smaller h.
     """
     for i in range(matrix.shape[0]):

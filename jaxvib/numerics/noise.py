@@ -1,9 +1,9 @@
 """Noise of measured samples: its autoregressive models, outliers, bounds, and uncertainties of fits under coloured noise.
 
 A least-squares fit takes account of outliers and bounds by modified residuals. Let psi(e) be the score of a residual e: the
-negative derivative of the logarithm of its probability density. A least-squares fit with the residuals psi(e)/mean(psi') and
-the standard deviation sqrt(mean(psi^2))/mean(psi') has its minimum where the probability of the readings is greatest, and its
-covariance is that of a fit with this score (Huber 1981).
+negative derivative of the logarithm of its probability density. The modified residuals are psi(e)/mean(psi'), and their
+standard deviation is sqrt(mean(psi^2))/mean(psi'). The least-squares fit with them has its minimum where the probability of the
+readings is greatest, and its covariance is that of a fit with this score (Huber 1981).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ these gaps look like coloured noise, and a filter for it makes standard errors t
 _FREQUENCIES = 2**14
 """Number of frequencies at which a spectral density is evaluated."""
 
-_EXPECTATIONS = 40
+_EM_ITERATIONS = 40
 """Number of iterations of the expectation-maximization algorithm for the distribution of outliers."""
 
 _MAX_COMPARED = 100_000
@@ -143,7 +143,7 @@ def outliers_of(white: np.ndarray) -> tuple[float, float, float]:
         return math.sqrt(variance), 0.0, 1.0
     likelihood_of_normal = -0.5 * white.size * (1.0 + math.log(variance)) + math.log(white.size)
     core, share, width = max(_spread(white), 1e-3 * math.sqrt(variance)), 0.05, 5.0
-    for _ in range(_EXPECTATIONS):
+    for _ in range(_EM_ITERATIONS):
         outlying = _outlying(white / core, share, width)
         share = float(np.mean(outlying))
         core = math.sqrt(float(np.sum((1.0 - outlying) * white**2)) / (white.size * (1.0 - share)))

@@ -45,8 +45,8 @@ collocation."""
 
 
 def _forms() -> np.ndarray:
-    """Return the coefficients of the formulas of x_i and x'_i in `transition`, (3 powers of h, 2, stages, stages + 2), the last
-    axis for all k_j, x and x'."""
+    """Return the coefficients of the formulas of x_i and x'_i in `transition`, (3 powers of h, 2, stages, stages + 2). The last
+    axis is that of all k_j, x and x'."""
     forms, ones, stages = np.zeros((3, 2, _STAGES, _STAGES + 2)), np.ones(_STAGES), slice(0, _STAGES)
     forms[2, 0, :, stages], forms[0, 0, :, -2], forms[1, 0, :, -1] = _WEIGHTS @ _WEIGHTS, ones, NODES
     forms[1, 1, :, stages], forms[0, 1, :, -1] = _WEIGHTS, ones
@@ -71,8 +71,8 @@ def transition(slopes: Array, h: float | Array) -> Array:
 
         x_i = x + h c_i x' + h^2 sum_j (a a)_ij k_j,   x'_i = x' + h sum_j a_ij k_j,   k_i = P_i x_i + R_i x'_i
 
-    The order is 11. The method is L-stable: motions that decay fast compared with the step, such as the motion of a load with
-    strong drag relative to the rotor, vanish at the end of the step. An explicit method would have to resolve the decay.
+    The order is 11. The method is L-stable: motions that decay fast compared with the step vanish at its end. An example is the
+    motion of a load with strong drag relative to the rotor. An explicit method would have to resolve the decay.
 
     **Arguments**: `slopes` [P, R] (6, m, 2 m) at `NODES`; `h`: length of the step, s. **Returns** the matrix, which is
     differentiable.

@@ -103,7 +103,7 @@ def next_share(
     tolerance: float | np.floating,
 ) -> Numbers:
     """Return the next point of the search for a root, as a fraction of the way from `newest` to `other`, the ends (x, f(x)) of
-    the bracket. `xp`: numpy or jax.numpy; `before`: the point that was removed last; `tolerance` of x, relative."""
+    the bracket. `xp`: numpy or jax.numpy; `before`: the end that was replaced last; `tolerance` of x, relative."""
     (a, fa), (b, fb), (c, fc) = newest, other, before
     xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
     safe = (1.0 - xp.sqrt(1.0 - xi) < phi) & (phi < xp.sqrt(xi))

@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 
 from jaxvib.ode.types import Batched, Tangents
 
-VECTOR = 8
+VECTOR_WIDTH = 8
 """Number of values in a vector register of a CPU. The number of tangents is padded to a multiple of this number."""
 
 X = TypeVar("X")
@@ -128,7 +128,7 @@ def _tangents_last(function: _WithTangents) -> _WithTangents:
             axes = jax.tree.map(lambda which: 0 if which else None, is_batched)
             out = jax.vmap(single, in_axes=tuple(axes))(x, tangents)
             return out, jax.tree.map(lambda _: True, out)
-        padded = -(-size // VECTOR) * VECTOR
+        padded = -(-size // VECTOR_WIDTH) * VECTOR_WIDTH
 
         def last(tangent: Array, is_batched: bool) -> Array:
             every = jnp.moveaxis(tangent, 0, -1) if is_batched else jnp.repeat(tangent[..., None], size, axis=-1)

@@ -15,8 +15,8 @@ from jaxtyping import PyTree
 from jaxvib.ode.types import VF, Args, BoolScalarLike, IntScalarLike, Norm, RealScalarLike, Terms, Y
 
 Decision: TypeAlias = tuple[BoolScalarLike, RealScalarLike, RealScalarLike, BoolScalarLike, PyTree[Array], diffrax.RESULTS]
-"""Acceptance of a step, beginning and end of the next one, True if the field jumps at its beginning, new state of the
-controller, outcome of the step (`successful` if the run can continue)."""
+"""Acceptance of a step; beginning and end of the next step; True if the field jumps at this beginning; new state of the
+controller; outcome of the step (`successful` if the run can continue)."""
 
 _State: TypeAlias = tuple[Array, Array | None]
 """State of `PIController`: the 32nd root of the last accepted step's error, and the remaining number of steps if it is

@@ -226,8 +226,8 @@ class _Record(NamedTuple):
 
 
 class _Slopes(NamedTuple):
-    """State of the backward pass: derivatives with respect to the fields, of which `numbers` are the arrays of arguments and
-    equations; `ahead`: index of the last saved time that the pass has not reached yet."""
+    """State of the backward pass. Each field is the derivative with respect to the quantity of its name; `numbers` are the
+    arrays of arguments and equations. `ahead`: index of the last saved time that the pass has not reached yet."""
 
     state: Y
     numbers: PyTree[Array | None]
@@ -420,8 +420,11 @@ def _with_tolerances(solver: diffrax.AbstractSolver, controller: diffrax.Abstrac
 
 
 def _share_of_end(controller: diffrax.AbstractStepSizeController, count: Array, j: Array) -> Array:
-    """Return the derivative of the start of step j of `count` with respect to the end of the run: j/count for j > 1 with
-    constant steps, whose first one ends at `first_step`; with adaptive steps only the last one depends on the end."""
+    """Return the derivative of the start of step j of `count` with respect to the end of the run.
+
+    With constant steps it is j/count for j > 1, because the first step ends at `first_step`. With adaptive steps only the end
+    of the last step depends on the end of the run.
+    """
     if isinstance(controller, diffrax.ConstantStepSize):
         return jnp.where((j > 1) | (count == 1), j / count, 0.0)
     return jnp.where(j == count, 1.0, 0.0)

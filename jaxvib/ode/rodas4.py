@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array, lax
 
 from jaxvib.numerics.linalg import unrolled_inverse
-from jaxvib.ode.batching import VECTOR
+from jaxvib.ode.batching import VECTOR_WIDTH
 from jaxvib.ode.interpolation import StepInterpolation
 from jaxvib.ode.types import Args, BoolScalarLike, RealScalarLike, StepResult, Terms
 
@@ -52,8 +52,8 @@ Linearization: TypeAlias = tuple[Callable[[Array], Callable[[Array], Array]], Ar
 
 
 class _Interpolation(StepInterpolation):
-    """Cubic (1 - s) y0 + s (y1 + (1 - s) (c_0 + s c_1)) in the fraction s of the step, of order 3, with `coefficients` c (2,
-    n), without the rates at the ends of the step, which are inaccurate for stiff equations."""
+    """Interpolant (1 - s) y0 + s (y1 + (1 - s) (c_0 + s c_1)) of order 3, with the fraction s of the step and `coefficients` c
+    (2, n). The rates at the ends of the step are not used, because they are inaccurate for stiff equations."""
 
     y0: Array
     y1: Array
@@ -150,7 +150,7 @@ def _dense_linearization(terms: Terms, t: RealScalarLike, y: Array, args: Args) 
 def _jacobian(terms: Terms, t: RealScalarLike, y: Array, args: Args) -> tuple[Array, Array]:
     """Return df/dy (n, n) and df/dt (n,), by forward mode with the tangents along a last axis, padded to whole CPU vectors."""
     n = y.shape[0]
-    directions = jnp.eye(n + 1, -(-(n + 1) // VECTOR) * VECTOR, dtype=y.dtype)
+    directions = jnp.eye(n + 1, -(-(n + 1) // VECTOR_WIDTH) * VECTOR_WIDTH, dtype=y.dtype)
 
     def tangent(*direction: Array) -> Array:
         numbers = (t, *(y[i] for i in range(n)))

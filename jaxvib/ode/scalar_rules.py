@@ -268,8 +268,8 @@ def inlined() -> tuple[Primitive, ...]:
 
 @functools.cache
 def rules() -> dict[Primitive, Rule]:
-    """The rule of each primitive that has one; primitives are found by tracing public functions, not by their names. A function
-    of several primitives in another version of JAX has no rule, and its programs stay on arrays."""
+    """The rule of each primitive that has one; primitives are found by tracing public functions, not by their names. If a
+    function consists of several primitives in another version of JAX, programs with this function stay on arrays."""
     x, v, yes = np.float32(1.0), np.ones((2, 2), np.float32), np.True_
     z = np.complex64(1.0)
     maps: list[tuple[_Function, tuple[ArrayLike, ...], Callable[..., Scalar]]] = [

@@ -63,8 +63,8 @@ def write_table(
 
 
 def main_axis(result: eqx.Module) -> str:
-    """Return the name of the most frequent first axis of the arrays of a result, or, if this axis has only one point (segments
-    of a single spectrum), that of the longest axis with coordinates (frequencies); "" without axes."""
+    """Return the name of the most frequent first axis of the arrays of a result; "" if no array has an axis. If this axis has
+    only one point (segments of a single spectrum), return that of the longest axis with coordinates (frequencies)."""
     arrays = [(name, axes, values) for name, axes, values, _ in columns(result) if axes and values.ndim == len(axes)]
     counts = collections.Counter(axes[0] for _, axes, _ in arrays)
     main = max(counts, key=lambda axis: counts[axis], default="")
@@ -117,8 +117,9 @@ def _label(labels: Labels, axis: str, k: int, n: int) -> str:
 
 
 def _own_unit(unit: str, axes: tuple[str, ...], place: tuple[int, ...], units: Sequence[str]) -> str:
-    """Return the unit of a column: a `unit` such as "m or rad" becomes that of the column's coordinate, or of all coordinates
-    in a table along them, unless they differ. `place`: indices of the column along the `axes` after the first."""
+    """Return the unit of a column: a `unit` such as "m or rad" becomes that of the column's coordinate. In a table along the
+    coordinates it becomes their common unit, and stays unchanged if they have different `units`. `place`: indices of the column
+    along the `axes` after the first."""
     is_of_one = "coordinate" in axes[1:] and len(units) > 0
     return one_unit(unit, [units[place[axes.index("coordinate") - 1]]] if is_of_one else units)
 

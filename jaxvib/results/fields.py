@@ -72,7 +72,7 @@ def in_unit(unit: str, *axes: str, name: str = "", first: int = 0) -> InUnit:
     - `unit`: one unit, or two if it depends on the coordinate, such as "m or rad" for lengths and angles
     - `axes`: names of the axes; "*" is a placeholder for the `outer_axes` of the class
     - `name`: name in labelled data; default: the name of the field
-    - `first`: number of first entries of a tuple that labelled data omit
+    - `first`: number of entries at the start of a tuple that labelled data omit
 
     >>> in_unit("rad/s", "load")
     {'unit': 'rad/s', 'axes': ('load',), 'name': '', 'first': 0}

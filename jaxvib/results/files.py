@@ -260,7 +260,8 @@ def _rebuilt(kind: type, fields: Mapping[str, Plain], arrays: Mapping[str, np.nd
 
 def _class_named(name: str, base: type) -> Any:
     """Return the class with a name in a file, from its module or, if it has moved, from the public names of the package.
-    **Raises** `ValueError` unless one of our packages defines it and it is a `base`: a named tuple, a dataclass or a status."""
+    **Raises** `ValueError` for a class of another package, and for one that is not of the kind of `base`: a named tuple for
+    `tuple`, a dataclass for `object`, a status for `equinox.Enumeration`."""
     module, _, inner = name.partition(":")
     if module.split(".")[0] not in _PACKAGES or not inner.isidentifier():
         raise ValueError(f"{name} is not a class of a result")

@@ -22,7 +22,7 @@ _MISSING = ("", "-", "nan", "na", "n/a", "#n/a", "null", "none")
 """Texts, in lower case, in place of a reading that is missing."""
 
 
-_ONE_COLUMN_MARK = "\n"
+_ONE_COLUMN_DELIMITER = "\n"
 """Separator of a table with one column: a character that occurs in no line."""
 
 
@@ -36,7 +36,7 @@ class TextTable(NamedTuple):
     - `width`: number of columns
     - `remarks`: lines above the header, and those that begin with #
     - `first`: number of lines above the first row of numbers; empty lines and lines that begin with # do not count
-    - `mark`: character between columns, None for blanks, a line break for one column
+    - `delimiter`: character between columns, None for blanks, a line break for one column
     """
 
     path: Path
@@ -45,7 +45,7 @@ class TextTable(NamedTuple):
     width: int
     remarks: list[str]
     first: int
-    mark: str | None
+    delimiter: str | None
 
     def values(self, places: Sequence[int], names: Sequence[str], *, missing: bool = False) -> np.ndarray:
         """Return columns as numbers, (rows, columns).
@@ -57,8 +57,8 @@ class TextTable(NamedTuple):
         finite number.
         """
         try:
-            mark = None if self.mark == _ONE_COLUMN_MARK else self.mark
-            found = np.loadtxt(self._texts(), delimiter=mark, usecols=places, comments=None, quotechar='"', ndmin=2)
+            delimiter = None if self.delimiter == _ONE_COLUMN_DELIMITER else self.delimiter
+            found = np.loadtxt(self._texts(), delimiter=delimiter, usecols=places, comments=None, quotechar='"', ndmin=2)
         except InputError:
             raise
         except ValueError:
@@ -81,12 +81,12 @@ class TextTable(NamedTuple):
     def _texts(self) -> Iterator[str]:
         """Yield the rows for NumPy. **Raises** `ValueError` for a row with another number of columns."""
         for _, text in self._rows():
-            if (len(text.split()) if self.mark is None else text.count(self.mark) + 1) != self.width:
+            if (len(text.split()) if self.delimiter is None else text.count(self.delimiter) + 1) != self.width:
                 raise ValueError
-            yield text if self.mark == "," else text.replace(",", ".")
+            yield text if self.delimiter == "," else text.replace(",", ".")
 
     def _row(self, line: int, text: str, places: Sequence[int], names: Sequence[str], missing: bool) -> list[float]:
-        cells = _cells(text, self.mark)
+        cells = _cells(text, self.delimiter)
         if len(cells) != self.width:
             raise InputError(f"{self.path} line {line}", f"has {len(cells)} columns; the lines above have {self.width}")
         found = []
@@ -95,7 +95,7 @@ class TextTable(NamedTuple):
             if missing and cell.lower() in _MISSING:
                 found.append(np.nan)
                 continue
-            if not is_number(cell, self.mark):
+            if not is_number(cell, self.delimiter):
                 problem = f"has {quoted(cell)} where the {name} should be; a finite number is needed"
                 raise InputError(f"{self.path} line {line}", problem)
             found.append(float(cell.replace(",", ".")))
@@ -125,60 +125,62 @@ def read_table(path: str | Path, needs: str) -> TextTable:
     texts = [text for _, text in itertools.islice(_content(path), _MAX_PREAMBLE + 2)]
     if not texts:
         raise InputError(str(path), f"contains no lines of numbers; it needs {needs}")
-    mark, count = _mark(texts), 0
-    while count < min(2, len(texts)) and not _has_number(texts[count], mark):
+    delimiter, count = _delimiter(texts), 0
+    while count < min(2, len(texts)) and not _has_number(texts[count], delimiter):
         count += 1
     start = 0
     # A second row without a number is a line of names below lines such as "serial 5".
-    if not _is_table(texts[: count + 2], mark) or not all(_has_number(text, mark) for text in texts[count + 1 : count + 2]):
+    if not _is_table(texts[: count + 2], delimiter) or not all(
+        _has_number(text, delimiter) for text in texts[count + 1 : count + 2]
+    ):
         for k in range(1, len(texts) - 1):
-            this = _mark(texts[k:])
-            if _has_number(texts[k], this) or not _has_number(texts[k + 1], this) or not _is_table(texts[k : k + 3], this):
+            other = _delimiter(texts[k:])
+            if _has_number(texts[k], other) or not _has_number(texts[k + 1], other) or not _is_table(texts[k : k + 3], other):
                 continue
-            alike = [above for above in texts[:k] if _is_table([above, texts[k]], this)]
-            if any(_has_number(above, this) for above in alike):  # numbers above the names: the table is damaged
+            alike = [above for above in texts[:k] if _is_table([above, texts[k]], other)]
+            if any(_has_number(above, other) for above in alike):  # numbers above the names: the table is damaged
                 break
-            has_units = bool(alike) and alike[-1] == texts[k - 1] and len(_cells(texts[k], this)) > 1
-            start, mark, count = (k - 1, this, 2) if has_units else (k, this, 1)
+            has_units = bool(alike) and alike[-1] == texts[k - 1] and len(_cells(texts[k], other)) > 1
+            start, delimiter, count = (k - 1, other, 2) if has_units else (k, other, 1)
             break
     if start + count == len(texts):
         raise InputError(str(path), "contains no lines of numbers below its header")
-    heads = [_cells(text, mark) for text in texts[start : start + count]]
-    width = len(heads[0]) if heads else len(_cells(texts[0], mark))
+    heads = [_cells(text, delimiter) for text in texts[start : start + count]]
+    width = len(heads[0]) if heads else len(_cells(texts[0], delimiter))
     units = heads[1] if len(heads) == 2 else []
     if units and len(units) != width:
         raise InputError(str(path), f"has {width} names but {len(units)} units below them")
     below = [unit.strip("()[]{} ") for unit in units]
-    return TextTable(path, heads[0] if heads else [], below, width, remarks + texts[:start], start + count, mark)
+    return TextTable(path, heads[0] if heads else [], below, width, remarks + texts[:start], start + count, delimiter)
 
 
-def is_number(cell: str, mark: str | None) -> bool:
-    """Return True for the text of a finite number, which may have a decimal comma unless `mark`, between columns, is one."""
+def is_number(cell: str, delimiter: str | None) -> bool:
+    """Return True for the text of a finite number. It may have a decimal comma, unless the comma is the `delimiter`."""
     try:
         # Python would read "1_000".
-        return "_" not in cell and bool(np.isfinite(float(cell if mark == "," else cell.replace(",", "."))))
+        return "_" not in cell and bool(np.isfinite(float(cell if delimiter == "," else cell.replace(",", "."))))
     except ValueError:
         return False
 
 
-def _has_number(text: str, mark: str | None) -> bool:
-    return any(is_number(cell, mark) for cell in _cells(text, mark))
+def _has_number(text: str, delimiter: str | None) -> bool:
+    return any(is_number(cell, delimiter) for cell in _cells(text, delimiter))
 
 
-def _is_table(texts: list[str], mark: str | None) -> bool:
+def _is_table(texts: list[str], delimiter: str | None) -> bool:
     """Return True if all lines have the same number of columns."""
-    return len({len(_cells(text, mark)) for text in texts}) == 1
+    return len({len(_cells(text, delimiter)) for text in texts}) == 1
 
 
-def _mark(texts: list[str]) -> str | None:
+def _delimiter(texts: list[str]) -> str | None:
     """Return the character between columns from the first lines of a table; None for blanks, a line break for one column."""
-    mark = next((mark for mark in (";", "\t", ",") if mark in texts[0]), None)
-    row = next((text for text in texts if _has_number(text, mark)), texts[0])
-    return _ONE_COLUMN_MARK if mark is None and len(row.split()) == 1 else mark
+    delimiter = next((delimiter for delimiter in (";", "\t", ",") if delimiter in texts[0]), None)
+    row = next((text for text in texts if _has_number(text, delimiter)), texts[0])
+    return _ONE_COLUMN_DELIMITER if delimiter is None and len(row.split()) == 1 else delimiter
 
 
-def _cells(text: str, mark: str | None) -> list[str]:
-    return [cell.strip().strip('"') for cell in text.split(mark)]
+def _cells(text: str, delimiter: str | None) -> list[str]:
+    return [cell.strip().strip('"') for cell in text.split(delimiter)]
 
 
 def _content(path: Path) -> Iterator[tuple[int, str]]:
