@@ -1,7 +1,7 @@
 """Checks of the arguments of public functions against the annotations of their signatures.
 
-The decorator `validated` is applied to every public function and to the public methods of results. An argument of a wrong type,
-such as None in place of a scene or a string in place of a count, therefore raises an error before anything is traced. The
+The decorator `validated` is applied to every public function and to the public methods of results. An argument of a wrong type
+therefore raises an error before anything is traced, for example None in place of a scene or a string in place of a count. The
 message of this error is one sentence. Each function itself checks the properties that a type does not express: bounds, units
 and names of parameters.
 """

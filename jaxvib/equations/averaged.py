@@ -533,8 +533,8 @@ def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
     """Return the amplitudes of a state of the full equations: Re Y e^{i theta} = q, Re V e^{i theta} = q'.
 
     The state determines only these real parts. The imaginary parts follow from the assumption that the carrier vibrates at the
-    loads' mean speed. If the loads turn at less than half the lowest natural frequency, they cannot have caused the vibration,
-    and the carrier is assumed to vibrate freely at its natural frequencies. Each load's rate is used as its mean rate.
+    loads' mean speed. Loads that turn at less than half the lowest natural frequency cannot have caused the vibration. The
+    carrier is then assumed to vibrate freely at its natural frequencies. Each load's rate is used as its mean rate.
     """
     angle, rate = rotating_angles(scene, state)
     model = linear_model(scene)

@@ -177,8 +177,8 @@ def step_extrema(x: Array, v: Array) -> tuple[Array, Array]:
 
 
 def _cubic_extremum(rise: Array, begin: Array, end: Array) -> tuple[Array, Array]:
-    """Return True where a motion has an extremum between two samples, and its position from 0 to 1 on the cubic polynomial with
-    the `rise` of the values and the slopes `begin` and `end`, times the sampling step."""
+    """Return True where a motion has an extremum between two samples, and its position from 0 to 1. The motion is a cubic
+    polynomial with the `rise` of the values and with the slopes, times the sampling step, at its `begin` and `end`."""
     turns = begin * end < 0.0
     bend = 3.0 * rise - 2.0 * begin - end
     root = jnp.sqrt(jnp.where(turns, jnp.abs(bend**2 - 3.0 * (begin + end - 2.0 * rise) * begin), 1.0))
@@ -188,7 +188,7 @@ def _cubic_extremum(rise: Array, begin: Array, end: Array) -> tuple[Array, Array
 
 def _extrema_between(x: Array, v: Array) -> tuple[Array, Array]:
     """Return, for each step between samples x with slopes v (n,), the position of the extremum, from 0 to 1, and the value
-    there (that of the first sample in a step without an extremum), both (n - 1,)."""
+    there, both (n - 1,). In a step without an extremum the value is that of the first sample."""
     n, rise, begin, end, origin = len(x), x[1:] - x[:-1], v[:-1], v[1:], -0.5
     # A sample beyond each end, on the polynomial of the outermost four. The samples of each step are then slices, which are
     # read several times as fast as samples at given indices.

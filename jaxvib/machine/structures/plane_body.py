@@ -62,9 +62,9 @@ def support(
       is that of all parts in `mass`, with each unbalance as a mass on the axis of its exciter
     - `stiffness` (k1, k2), N/m; typical: 1e4 to 1e6. Also a static deflection with the mass or force on this support, "25 mm
       under 325 kg"
-    - `damping` (c1, c2), N s/m; typical: 0.01 to 0.08 of the critical damping 2 sqrt(k m). Also a percentage of the critical
-      damping, with the mass m that this support carries, "5 % of 250 kg", or a loss factor of rubber at a frequency of
-      vibration, "loss factor 0.1 at 16 Hz"
+    - `damping` (c1, c2), N s/m; typical: 0.01 to 0.08 of the critical damping 2 sqrt(k m). Also a ratio to the critical damping
+      with the mass m that this support carries, "5 % of 250 kg". Also a loss factor of rubber at a frequency of vibration,
+      "loss factor 0.1 at 16 Hz"
     - `angle` of the first spring, rad, anticlockwise from x; typical: 0 (the default)
     - `body`: number of the body in a `plane_network`, from 0; typical: 0 (the default)
     - `to`: number of the body at the other end; default: the foundation
