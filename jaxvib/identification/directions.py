@@ -97,7 +97,7 @@ def information_of(fitted: Fitted) -> Information:
     prior_of_free_gains[gains, gains] = 0.0
 
     information, information_of_free_gains = (eliminate(data + known, kept) for known in (prior, prior_of_free_gains))
-    errors, axes = _errors(information)
+    errors, axes = principal_errors(information)
     single = np.abs(axes) > _SINGLE
     error = np.sum(single * errors, axis=1)
     # Unbalances are left out: if the size of an unbalance tends to 0, its angle is unknown, too.
@@ -107,7 +107,7 @@ def information_of(fitted: Fitted) -> Information:
     factors = np.where(vanished, 10.0 * error, 1.0)
     determined_part = covariance_of(information * np.outer(factors, factors))
     covariance, undetermined = determined_part.covariance, determined_part.undetermined
-    loose_errors, loose_axes = _errors(information_of_free_gains * np.outer(factors, factors))
+    loose_errors, loose_axes = principal_errors(information_of_free_gains * np.outer(factors, factors))
     by_gain = loose_axes[:, loose_errors > UNDETERMINED]
     # Directions that nothing determines are left out of those that the gains determine.
     by_gain = by_gain - undetermined @ (undetermined.T @ by_gain)
@@ -133,7 +133,7 @@ class Covariance(NamedTuple):
 
 def covariance_of(information: np.ndarray) -> Covariance:
     """Return the covariance that follows from an information matrix, see `Covariance`."""
-    errors, axes = _errors(information)
+    errors, axes = principal_errors(information)
     is_undetermined = errors > UNDETERMINED
     covariance = (axes[:, ~is_undetermined] * errors[~is_undetermined] ** 2) @ axes[:, ~is_undetermined].T
     return Covariance(
@@ -203,7 +203,7 @@ def _free(matrix: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     return free, size, vectors[:, is_determined], values[is_determined]
 
 
-def _errors(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def principal_errors(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the standard errors (k,) of the principal directions (k, k), the best determined last."""
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
     floor = 1e-14 * max(float(values[-1]), 1e-300) if values.size else 0.0

@@ -22,7 +22,8 @@ from jaxvib.identification.alternatives.support_friction import likely_friction
 from jaxvib.identification.checks import FitStatus, resembles, status_of
 from jaxvib.identification.directions import information_of
 from jaxvib.identification.fit import Fitted, fit_from
-from jaxvib.identification.problem import build_problem, is_nonlinear
+from jaxvib.identification.problem import MOTIONS, build_problem, is_nonlinear
+from jaxvib.identification.records.decimation import MIN_SAMPLES
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.identification.supports.start import with_first_states
 from jaxvib.machine.effects.base import Effect
@@ -90,7 +91,7 @@ def law_notes(
     if not resembles(fitted) or any("drive." in name for name in names):
         return []
     better: list[tuple[_Law, float]] = []
-    for law in (*_laws_of_loads(fitted, scene), *_laws_of_supports(fitted, scene)):
+    for law in (*_laws_of_loads(fitted, scene), *_laws_of_supports(fitted, scene, runs)):
         problem = build_problem(law.scene, runs, [*unknown, law.name], known)
         linear = fitted.linear if is_nonlinear(scene) else with_first_states(fitted.problem, fitted.x, fitted.linear)
         of_sensors = fitted.x[len(names) : fitted.x.size - fitted.problem.unknowns.errors]
@@ -144,8 +145,10 @@ def _laws_of_loads(fitted: Fitted, scene: Scene) -> Iterator[_Law]:
     if ContactFriction not in terms and not loads.has_bearing:
         size = size if loads.ball_radius is None else float(loads.ball_radius)
         sized = eqx.tree_at(lambda loads: loads.ball_radius, loads, jnp.asarray(size), is_leaf=lambda x: x is None)
-        friction = RollingFriction(lever * size / radius)
-        yield _law_of_loads(scene, sized, friction, "coefficient", "rolling friction of the loads", _ADVICE)
+        friction, advice = RollingFriction(lever * size / radius), _ADVICE
+        if loads.ball_radius is None:
+            advice = f"give the loads a ball_radius, {advice}"
+        yield _law_of_loads(scene, sized, friction, "coefficient", "rolling friction of the loads", advice)
     if LoadResistance not in terms:
         words, effect = (
             "a drag of the air, proportional to the squared speed of the loads",
@@ -165,9 +168,15 @@ def _law_of_loads(scene: Scene, loads: Loads, effect: Effect, coefficient: str, 
     return _Law(words, advice.format(effect=type(effect).__name__, name=quoted(name)), other, name)
 
 
-def _laws_of_supports(fitted: Fitted, scene: Scene) -> Iterator[_Law]:
-    """Yield dry friction at the support or link of a linear machine where it explains the most of the residuals."""
-    friction = None if is_nonlinear(scene) or len(scene.exciters) > 1 else likely_friction(fitted, scene)
+def _laws_of_supports(fitted: Fitted, scene: Scene, runs: Sequence[MeasuredRun]) -> Iterator[_Law]:
+    """Yield dry friction at the support or link of a linear machine where it explains the most of the residuals.
+
+    Long runs are left out: their rate is reduced for a linear machine, but not for one with friction.
+    """
+    samples = max(run.times[channel.name].size for run in runs for channel in run.of_kind(*MOTIONS))
+    if is_nonlinear(scene) or len(scene.exciters) > 1 or samples >= MIN_SAMPLES:
+        return
+    friction = likely_friction(fitted, scene)
     if friction is not None:
         place = f"platform={friction.platform}" + ("" if friction.to is None else f", to={friction.to}")
         name = f"effects.{friction.kind}[0].force"

@@ -10,7 +10,13 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.errors import InputError
-from jaxvib.identification.further_runs.planned import PlannedRun, expected_errors, expected_information, expected_run
+from jaxvib.identification.further_runs.planned import (
+    PlannedRun,
+    expected_errors,
+    expected_information,
+    expected_run,
+    range_of_errors,
+)
 from jaxvib.identification.further_runs.speed_profile import optimized_profile, read_limits, require_within
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.problem import require_linear_motion
@@ -20,6 +26,9 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.units import Number
 
+_MAX_SINGLE_RATIO = 1.2
+"""Ratio of the largest to the smallest expected error above which the summary states both."""
+
 
 class RunPlan(Result):
     """Expected errors after candidate runs. Returned by `plan_runs`.
@@ -28,7 +37,9 @@ class RunPlan(Result):
 
     - `candidates` (c,): names of the runs, the best one first; `numbers` (k,): names of the parameters
     - `errors` (c, k): expected relative standard errors after the runs so far and the candidate, infinite for parameters that
-      remain undetermined
+      remain undetermined. They are computed with the fitted parameters
+    - `errors_low`, `errors_high` (c, k): smallest and largest expected errors if the parameters of the machine differ from the
+      fitted ones by two standard errors along each direction whose standard error is above 2 %. NaN for a nonlinear motion
     - `now` (k,): relative standard errors after the runs so far
     - `minutes` (c,): durations, min
     - `benefit` (c,): sum over the parameters of log(error now / error after the run), per minute of the run. An error above 1,
@@ -42,6 +53,8 @@ class RunPlan(Result):
     candidates: tuple[str, ...]
     numbers: tuple[str, ...]
     errors: np.ndarray = eqx.field(metadata=in_unit("", "candidate", "number"))
+    errors_low: np.ndarray = eqx.field(metadata=in_unit("", "candidate", "number"))
+    errors_high: np.ndarray = eqx.field(metadata=in_unit("", "candidate", "number"))
     now: np.ndarray = eqx.field(metadata=in_unit("", "number"))
     minutes: np.ndarray = eqx.field(metadata=in_unit("min", "candidate"))
     benefit: np.ndarray = eqx.field(metadata=in_unit("1/min", "candidate"))
@@ -49,17 +62,21 @@ class RunPlan(Result):
 
     def summary(self) -> str:
         """Return the candidates with their expected errors as text, the best one first."""
-        lines = [f"errors now: {self._row(self.now)}"]
-        for name, row, minutes, benefit in zip(self.candidates, self.errors, self.minutes, self.benefit, strict=True):
-            lines.append(f"{name} ({minutes:.3g} min, benefit {benefit:.3g} per minute): {self._row(row)}")
+        lines = [f"errors now: {self._row(self.now, self.now, self.now)}"]
+        rows = map(self._row, self.errors, self.errors_low, self.errors_high)
+        for name, row, minutes, benefit in zip(self.candidates, rows, self.minutes, self.benefit, strict=True):
+            lines.append(f"{name} ({minutes:.3g} min, benefit {benefit:.3g} per minute): {row}")
         if self.profile is not None:
             points = zip(np.asarray(self.profile.times), np.asarray(self.profile.speeds), strict=True)
             lines.append("optimized speed: " + ", ".join(f"{speed_text(float(n), 4)} at {t:.4g} s" for t, n in points))
         return "\n".join(lines)
 
-    def _row(self, errors: np.ndarray) -> str:
-        pairs = zip(self.numbers, errors, strict=True)
-        return ", ".join(f"{name} {f'{each:.2g}' if np.isfinite(each) else 'not determined'}" for name, each in pairs)
+    def _row(self, errors: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:
+        words = []
+        for name, *values in zip(self.numbers, errors, low, high, strict=True):
+            error, least, most = (f"{each:.2g}" if np.isfinite(each) else "not determined" for each in values)
+            words.append(f"{name} {error}" + (f" ({least} to {most})" if values[2] > _MAX_SINGLE_RATIO * values[1] else ""))
+        return ", ".join(words)
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
@@ -88,6 +105,7 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
     - With `limits`, the speeds of the best candidate at 9 evenly spaced times are optimized for the smallest errors, with
       gradients, by sequential quadratic programming. If the result is better than all candidates, it is one more candidate, of
       the same duration
+    - If a direction of the fitted parameters has a standard error above 2 %, the errors have a range, see `RunPlan`
 
     **Arguments**
 
@@ -127,6 +145,7 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
     errors = [expected_errors(fit.information + expected_information(fit, each), k) for each in runs]
     now, minutes = expected_errors(fit.information, k), [each.duration / 60.0 for each in candidates]
     benefit = [_benefit(now, *each) for each in zip(errors, minutes, strict=True)]
+    ranges = [range_of_errors(fit, *each) for each in zip(candidates, errors, strict=True)]
     names, profile = [each.name for each in candidates], None
     if checked_limits is not None:
         best = int(np.argmax(benefit))
@@ -136,15 +155,19 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
         if _benefit(now, optimized_errors, minutes[best]) > benefit[best]:
             names.append(f"{names[best]}, optimized speed")
             errors.append(optimized_errors)
+            ranges.append(range_of_errors(fit, planned, optimized_errors))
             benefit.append(_benefit(now, optimized_errors, minutes[best]))
             minutes.append(minutes[best])
         else:
             profile = None
     order = np.argsort(-np.array(benefit), kind="stable")
+    low, high = np.swapaxes(np.array(ranges)[order], 0, 1)
     return RunPlan(
         tuple(names[i] for i in order),
         fit.names,
         np.array(errors)[order],
+        low,
+        high,
         now,
         np.array(minutes)[order],
         np.array(benefit)[order],

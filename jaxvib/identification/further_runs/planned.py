@@ -13,14 +13,15 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
-from jaxvib.identification.directions import covariance_of, eliminate, in_polar_unbalances
+from jaxvib.identification.directions import covariance_of, eliminate, in_polar_unbalances, principal_errors
 from jaxvib.identification.fit import Fitted, information_at, unknown_count
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.jammed.start import is_jammed, with_jam
-from jaxvib.identification.problem import MOTIONS, Problem, build_problem, has_nonlinear_supports, with_noise
+from jaxvib.identification.problem import MOTIONS, Problem, build_problem, has_nonlinear_supports, is_nonlinear, with_noise
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive
+from jaxvib.machine.numbers.named import find_number, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.noise import Noise, noise_of, resampled
 from jaxvib.results.readable import Readable
@@ -28,6 +29,11 @@ from jaxvib.units import Number, count, number
 
 _BYTES_PER_SAMPLE = 1000.0
 """Memory for each sample of a planned run, bytes: readings, their derivatives and copies."""
+
+_INACCURATE, _MAX_ERROR, _MAX_DECREASE = 0.02, 1.0, 0.9
+"""Relative changes that give the range of expected errors: standard error of a direction of the fit above which the direction
+is changed; largest standard error that counts, because an undetermined direction has no bound; largest decrease of a positive
+parameter."""
 
 
 class PlannedRun(Readable):
@@ -222,3 +228,36 @@ def expected_errors(information: np.ndarray, count: int) -> np.ndarray:
     """Return the relative standard errors (count,) of the parameters, infinite for those that are not determined."""
     result = covariance_of(eliminate(information, np.arange(count)))
     return np.where(result.determined, np.sqrt(np.diagonal(result.covariance)), np.inf)
+
+
+def range_of_errors(fit: MachineFit, planned: PlannedRun, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest expected errors (k,) after a planned run, for machines that differ from the fitted
+    one by two standard errors of each inaccurate direction. NaN for a nonlinear motion.
+
+    The information of the runs so far is not computed again.
+
+    **Arguments**: the `errors` (k,) that are expected for the fitted machine.
+    """
+    count, found = len(fit.names), [errors]
+    if is_nonlinear(fit.scene):
+        return np.full(count, np.nan), np.full(count, np.nan)
+    sizes, axes = principal_errors(eliminate(fit.information, np.arange(count)))
+    for size, axis in zip(sizes, axes.T, strict=True):
+        for sign in (-1.0, 1.0) if size > _INACCURATE else ():
+            other = _changed_fit(fit, sign * 2.0 * min(float(size), _MAX_ERROR) * axis)
+            found.append(expected_errors(fit.information + expected_information(other, expected_run(other, planned)), count))
+    return np.min(found, axis=0), np.max(found, axis=0)
+
+
+def _changed_fit(fit: MachineFit, change: np.ndarray) -> MachineFit:
+    """Return the fit with relative changes (k,) of its parameters, shortened such that none of a positive parameter is below
+    -0.9.
+
+    The changes are not those of logarithms: modal dampings, which the runs so far may determine, are linear in the dampings.
+    """
+    numbers = [find_number(fit.scene, name, "unknown") for name in fit.names]
+    values = np.array([float(each.read(fit.scene)[0]) for each in numbers])
+    is_positive = values == fit.scale
+    new = values + fit.scale * change * min(1.0, _MAX_DECREASE / np.max(-change, where=is_positive, initial=_MAX_DECREASE))
+    scene = put_numbers(fit.scene, numbers, new)
+    return dataclasses.replace(fit, scene=scene, scale=np.where(is_positive, new, fit.scale))

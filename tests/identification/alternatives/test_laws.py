@@ -10,9 +10,11 @@ from run_ups_by_scipy import scene_of as linear_scene_of
 from scipy.signal import lsim
 
 import jaxvib as jv
+from jaxvib.identification.alternatives import laws
 from jaxvib.identification.alternatives.laws import AirDrag
 from jaxvib.identification.alternatives.support_friction import _responses
 from jaxvib.identification.problem import build_problem
+from jaxvib.identification.records.decimation import MIN_SAMPLES
 
 FORCE = "effects.friction_support[0].force"
 
@@ -58,6 +60,14 @@ def test_law_of_jammed_balls_is_named(law, words):
     assert fit.status_name == "patterned"
     (note,) = law_notes(fit)
     assert note.startswith(f"the model fits clearly better with {words}")
+
+
+@pytest.mark.parametrize(("count", "is_tried"), [(MIN_SAMPLES - 1, True), (MIN_SAMPLES, False)])
+def test_friction_of_supports_is_not_tried_for_long_runs(monkeypatch, count, is_tried):
+    """The rate of a long run is reduced for a linear machine only."""
+    monkeypatch.setattr(laws, "likely_friction", lambda fitted, scene: jv.FrictionSupport(20.0, 0.01, platform=2))
+    run = jv.MeasuredRun.from_arrays([jv.Channel("a1", "acceleration", at=1)], 0.01 * np.arange(count), {"a1": np.zeros(count)})
+    assert [law.name for law in laws._laws_of_supports(None, linear_scene_of(MACHINE), [run])] == [FORCE] * is_tried
 
 
 def test_responses_are_those_of_scipy():

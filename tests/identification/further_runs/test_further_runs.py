@@ -89,15 +89,19 @@ def test_remedy_gives_the_predicted_errors(case):
     fit = jv.identify(first_scene(0.25), first, unknown=unknown, throw=False)
     assert any(words in each.sentence for each in (*fit.undetermined, *fit.by_gain))
     change = {"machine.mass[0]": "+10 kg"} if remedy.change else {}
+    run = planned(remedy, noise={"a1": NOISE, "a2": NOISE}, change=change)
+    inaccurate = jv.plan_runs(fit, [run])
     if case != "gains":
         fit = jv.identify(first_scene(0.25), record_first(NOISE / 50.0), unknown=unknown, throw=False)
         fit = eqx.tree_at(lambda each: each.information, fit, fit.information / 50.0**2)
-    plan = jv.plan_runs(fit, [planned(remedy, noise={"a1": NOISE, "a2": NOISE}, change=change)])
+    plan = jv.plan_runs(fit, [run])
     both = jv.identify(first_scene(), [first, remedy], unknown=unknown)
     assert both.status_name == "found", both.notes
     found = np.array([each.error / each.value for each in both.estimates])
     assert both.undetermined == () and np.all(np.isfinite(found))
     np.testing.assert_allclose(plan.errors[0], found, rtol=0.2 if case == "gains" else 0.1)
+    if case == "first resonance only":
+        assert np.all(inaccurate.errors_low[0] < 1.2 * found) and np.all(found < 1.2 * inaccurate.errors_high[0])
 
 
 @functools.cache

@@ -1,5 +1,6 @@
 """Plans of runs: what a run shares with a fit, errors, benefits, and the optimized speed."""
 
+import dataclasses
 import functools
 from types import SimpleNamespace
 
@@ -21,6 +22,7 @@ from jaxvib.identification.further_runs.planned import (
     expected_information,
     expected_run,
     own_precisions,
+    range_of_errors,
     shared_indices,
 )
 from jaxvib.identification.further_runs.speed_profile import Limits, _spread, optimized_profile, require_within
@@ -222,6 +224,10 @@ def planned_as(monkeypatch, errors, better=None, limits=None):
         plan, "expected_run", lambda fit, each: "optimized" if isinstance(each.drive, jv.SpeedProfile) else each.name
     )
     monkeypatch.setattr(plan, "expected_information", lambda fit, name: table[name] - fit.information)
+    factor = {"a": 2.0, "b": 1.0, "c": 1.0}
+    monkeypatch.setattr(
+        plan, "range_of_errors", lambda fit, each, errors: (errors / factor[each.name], errors * factor[each.name])
+    )
     asked = []
     monkeypatch.setattr(plan, "optimized_profile", lambda *args: asked.append(args) or speed)
     candidates = [
@@ -245,7 +251,7 @@ def test_candidates_are_ordered_by_benefit_per_minute(monkeypatch):
     assert found.summary().splitlines() == [
         "errors now: mass 0.2, stiffness not determined, damping 0.1",
         "b (2 min, benefit 3.45 per minute): mass 0.02, stiffness 0.1, damping 0.01",
-        "a (1 min, benefit 1.39 per minute): mass 0.1, stiffness 0.5, damping 0.1",
+        "a (1 min, benefit 1.39 per minute): mass 0.1 (0.05 to 0.2), stiffness 0.5 (0.25 to 1), damping 0.1 (0.05 to 0.2)",
         "c (3 min, benefit 0 per minute): mass 0.2, stiffness not determined, damping 0.1",
     ]
 
@@ -267,11 +273,26 @@ def test_optimized_speed_is_a_candidate_if_it_is_better(monkeypatch, better, fir
         planned_as(monkeypatch, errors, better, {"speed": 10.0, "acceleration": 3.0})
 
 
+@pytest.mark.parametrize(("error", "factors"), [(0.3, [1.6, 0.4]), (5.0, [3.0, 0.1])])
+def test_range_of_errors_is_that_of_the_unbalance(error, factors):
+    """The information about the logarithm of the unbalance is proportional to its square; all else is known."""
+    parts = vars(fit()) | {"information": np.diag([1e12, error**-2, 1e12, 1e12, 1e12, 1e12])}
+    other = dataclasses.make_dataclass("Fit", parts)(**parts)
+    errors = expected_errors(other.information + expected_information(other, expected_run(other, ramp())), 3)
+    low, high = range_of_errors(other, ramp(), errors)
+    of_run = [each[1] ** -2 - error**-2 for each in (errors, low, high)]
+    np.testing.assert_allclose(np.sqrt(of_run[1:] / of_run[0]), factors, rtol=1e-5)
+    accurate = dataclasses.replace(other, information=1e6 * other.information)
+    np.testing.assert_array_equal(range_of_errors(accurate, ramp(), errors), [errors, errors])
+    stopped = dataclasses.replace(other, scene=other.scene.replace(effects=jv.CubicSupport(1e9)))
+    assert np.all(np.isnan(range_of_errors(stopped, ramp(), errors)))
+
+
 def test_empty_plan_and_chart():
     with pytest.raises(jv.InputError, match="candidates is empty; give at least one PlannedRun"):
         plan_runs.__wrapped__(None, [])
     errors = np.array([[0.1, np.inf], [0.3, 0.2]])
-    shown = RunPlan(("a", "b"), ("m", "k"), errors, errors[0], np.ones(2), np.ones(2), None).plot()
+    shown = RunPlan(("a", "b"), ("m", "k"), errors, errors, errors, errors[0], np.ones(2), np.ones(2), None).plot()
     (line,) = [each for each in shown.axes[0].lines if len(each.get_ydata()) == 2] or [None]
     if line is not None:
         np.testing.assert_allclose(line.get_ydata(), [1.0, 0.3])
