@@ -89,7 +89,7 @@ def advance_by_steps(
         return moved, moved
 
     last, later = jax.lax.scan(single_step, packed, indices[:-1])
-    return last, (begin + step * indices, motion.unpack(_prepended(packed, later)))
+    return last, (begin + step * indices, motion.unpack(_prepend(packed, later)))
 
 
 def divide_run(
@@ -150,11 +150,16 @@ class BatchPlan(NamedTuple):
 class BatchRun(NamedTuple):
     """Run of a batch with its measurements.
 
-    **Attributes**: `scene`; `window`: trajectory in the measuring window; `measured`: the quantities measured in the window;
-    `regime` of the window, None for a scene that is not plain (`Scene.is_plain`); `part_speed` (PARTS_OF_RUN, count): mean
-    speeds of the loads, or of rotors without loads, rad/s, over the equal parts before the window; `part_length` of such a
-    part, s; `finite`: True if the motion stayed finite; `resolved`: False if the steps are too long, see `resolves`; `peaks` of
-    the whole run, None if the plan has no blocks.
+    **Attributes**
+
+    - `scene`
+    - `window`: trajectory in the measuring window; `measured`: the quantities measured in it
+    - `regime` of the window, None for a scene that is not plain (`Scene.is_plain`)
+    - `part_speed` (PARTS_OF_RUN, count), rad/s: mean speeds of the loads, or of rotors without loads, over the equal parts
+      before the window; `part_length` of such a part, s
+    - `finite`: True if the motion stayed finite and bounded
+    - `resolved`: False if the steps are too long, see `resolves`
+    - `peaks` of the whole run, None if the plan has no blocks
     """
 
     scene: Scene
@@ -210,11 +215,11 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     packed, begins, lengths = divide_run(motion, first, *sizes, PARTS_OF_RUN, implicit=plan.implicit)
     packed, (parts, part_peaks) = jax.lax.scan(part_with_peaks if plan.blocks else part, packed, (begins, lengths))
     _, (later, extrema) = jax.lax.scan(sample, packed, jnp.arange(plan.samples - 1, dtype=dtype))
-    packed_history = _prepended(first, parts)
+    packed_history = _prepend(first, parts)
     azimuth, _ = turning_angles(
         scene, lambda: length * jnp.arange(PARTS_OF_RUN + 1, dtype=dtype), motion.unpack(packed_history)
     )
-    states = motion.unpack(_prepended(packed, later))
+    states = motion.unpack(_prepend(packed, later))
     times = begin + spacing * jnp.arange(plan.samples, dtype=dtype)
     window = trajectory(model, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length
@@ -231,5 +236,5 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     return BatchRun(scene, window, measured, kind, speed, jnp.asarray(length, dtype), finite, resolved, peaks)
 
 
-def _prepended(first: IntegratorState, later: IntegratorState) -> IntegratorState:
+def _prepend(first: IntegratorState, later: IntegratorState) -> IntegratorState:
     return jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, later)

@@ -94,12 +94,13 @@ class Ensemble(Result):
       for a scene with one exciter
     - `masses`: for several exciters, the `RotatingMasses` of each run: angle turned in the last quarter, phase at the end, and
       the resonance that catches the mass; `regimes` names the motions that follow from them. None for one exciter
-    - `speed_group` (B,): groups of runs by the speed of their masses, from 1, ascending; 0 for runs with different speeds
+    - `speed_group` (B,): groups of runs by the speed of their masses, from 1, ascending; 0 for a run whose masses turn at
+      different speeds, or whose motion did not stay finite
     - `error` (B,): estimated error of the final state, as for a `Run`; the largest displacement and velocity are those of the
       final state. Typical: below 1e-6 with the default steps. NaN if no estimate was requested or the motion did not stay
       finite; infinite for 4 steps or fewer, because a run with larger steps does not exist
     - `allowed` (B,): False if `make` returned a scene with a value that its constructor does not allow
-    - `finite` (B,): True if the motion stayed finite
+    - `finite` (B,): True if the motion stayed finite (with contacts: and did not grow by the factor 1e8)
     - `resolved` (B,): False if explicit steps are too long for the fastest decay, which is possible under a JAX transformation,
       or if steps are too long for contacts with a `Stop` or between loads (3 steps per contact or fewer, or 4 per decay time of
       its damper)
@@ -171,9 +172,9 @@ class Ensemble(Result):
         """
         speeds = np.abs(np.asarray(self.load_speed))
         largest = np.max(speeds[np.asarray(self.finite)], initial=0.0)
-        is_one = np.asarray(self.finite) & (np.ptp(speeds, axis=1) <= _EQUAL_SPEEDS * largest)
+        has_one_speed = np.asarray(self.finite) & (np.ptp(speeds, axis=1) <= _EQUAL_SPEEDS * largest)
         mean = np.mean(speeds, axis=1)
-        order = np.flatnonzero(is_one)[np.argsort(mean[is_one], kind="stable")]
+        order = np.flatnonzero(has_one_speed)[np.argsort(mean[has_one_speed], kind="stable")]
         groups = np.zeros(mean.shape, int)
         groups[order] = 1 + np.cumsum(np.diff(mean[order], prepend=mean[order[:1]]) > _SPEED_GAP * largest)
         return groups
@@ -344,9 +345,12 @@ def _run_batch(
 
 
 def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equations, implicit: bool) -> _Ends:
-    """Integrate a run with equal steps in `ENSEMBLE_PARTS` parts, once for each entry of `counts` (steps in a part), and return
-    for the first: the final state, the mean load speeds over the last part, the distance of the final state from that with the
-    last count, True if the motion stayed finite, True for loads that lost contact with their track, and the number of steps."""
+    """Integrate a run with equal steps in `ENSEMBLE_PARTS` parts, once for each entry of `counts` (steps in a part).
+
+    **Returns** for the first entry: the final state; the mean load speeds over the last part; the distance of the final state
+    from that with the last entry; True if the motion stayed finite; True for loads that lost contact with their track; and the
+    number of steps.
+    """
     scene, (state, end) = with_first_derivatives(scene, (state, end))
     has_one_sided_loads = any(exciter.loads is not None and exciter.loads.one_sided for exciter in scene.exciters)
     field, start = field_of(equations, scene), state

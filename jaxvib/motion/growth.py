@@ -70,8 +70,8 @@ class Growth(Result):
     - `status`: a `GrowthStatus`
     - `exponent`: the largest Lyapunov exponent, 1/s, over the later half of the segments
     - `uncertainty` of the exponent, 1/s: the largest of the standard error, half of the change of the rate between the two
-      quarters of this half, and 0.1 divided by the length of this half. (The last one is needed because exponents that are
-      closer to each other cannot be separated.)
+      quarters of this half, and 0.1 divided by the length of this half. (The last value is needed because exponents whose
+      difference is smaller cannot be separated.)
     - `horizon`: the time, s, after which rounding errors have grown to the size of the motion itself, ln(1/eps)/exponent, with
       the relative rounding error eps. A derivative with respect to a parameter has then grown by the factor 1/eps, and predicts
       nothing about a change that is larger than rounding. The horizon is infinite for a regular motion; for an undecided one it
@@ -183,11 +183,11 @@ def growth(
             quarters.append(state)
         first, second = run_on(state), run_on(neighbour)
         scale = error_scale(first.window.state, unit)
-        ours, neighbour_end = (jax.tree.map(lambda x: x[-1], run.window.state) for run in (first, second))
-        if angle_wrapping(scene, ours.displacement.dtype)[0]:
-            neighbour_end = with_nearest_turns(neighbour_end, ours)
-        rates.append(math.log(max(_distance(ours, neighbour_end, scale), 1e-300) / initial_distance) / segment)
-        state, difference = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, neighbour_end)
+        reference_end, neighbour_end = (jax.tree.map(lambda x: x[-1], run.window.state) for run in (first, second))
+        if angle_wrapping(scene, reference_end.displacement.dtype)[0]:
+            neighbour_end = with_nearest_turns(neighbour_end, reference_end)
+        rates.append(math.log(max(_distance(reference_end, neighbour_end, scale), 1e-300) / initial_distance) / segment)
+        state, difference = last_state(scene, first), jax.tree.map(lambda x, y: y - x, reference_end, neighbour_end)
         neighbour = _at_distance(state, jax.tree.map(jnp.add, state, difference), scale, initial_distance)
     late = np.array(rates[segments // 2 :])
     exponent, uncertainty = float(np.mean(late)), _uncertainty(late, segment)

@@ -182,8 +182,11 @@ class IntegrationPlan(NamedTuple):
 def integrate(
     scene: Scene, end: Array, state: State, plan: IntegrationPlan, is_measured: Array | np.ndarray | None = None
 ) -> Run:
-    """Integrate the full equations of motion from 0 to `end` by a plan, and measure a window at the end if `is_measured` is not
-    False; None: always, without a branch in the program."""
+    """Integrate the full equations of motion from 0 to `end` by a plan.
+
+    `is_measured`: True to measure the window at the end; False to leave the measured quantities NaN; None to measure it
+    without a branch in the program.
+    """
     scene, (end, state) = with_first_derivatives(scene, (end, state))
     # An initial state that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
     exists = is_finite(state)
@@ -276,8 +279,8 @@ def _steps(
         if control.steps is not None:
             first = end / jnp.asarray(control.steps)
         if control.tolerance is not None:
-            # The first step depends on the tolerance, nearly as the further steps do, which are proportional to its power 1/8;
-            # therefore different tolerances give different steps.
+            # The first step is proportional to the power 1/9 of the tolerance, the further steps to about its power 1/8.
+            # Different tolerances therefore give different steps from the beginning.
             first = 0.4 * jnp.asarray(control.tolerance) ** (1.0 / 9.0) / fastest
         return first, _controller(motion, state, unit, control)
     return None if isinstance(control, diffrax.StepTo) else 0.05 / fastest, control

@@ -54,6 +54,7 @@ _UNKNOWN_STEPS, _UNKNOWN_SAMPLES = 2**20, 2000
 """Maximum number of steps, and number of samples, of a run whose length or speeds are unknown."""
 
 _FEW_SAMPLES, _MANY_SAMPLES = 2**14, 2**18
+"""Default numbers of samples of short and of long runs."""
 
 _MAX_WINDOW_SAMPLES = 2**17
 """Largest number of samples in the measuring window of a run with stops."""
@@ -114,7 +115,7 @@ class EqualSteps:
     """A number of steps of equal length.
 
     **Arguments**: `number` of steps; typical: 4 for each radian of the fastest motion, 25 for each turn. The computing time is
-    proportional to it.
+    proportional to this number.
 
     **Raises** `InputError` for a value that is not a real number.
 
@@ -133,7 +134,7 @@ StepChoice = Tolerance | Accuracy | EqualSteps | diffrax.AbstractStepSizeControl
 """Types of `stepsize_controller`."""
 
 
-def require(chosen: object, *kinds: type) -> None:
+def require_step_choice(chosen: object, *kinds: type) -> None:
     """**Raises** `InputError` for a choice of steps of another type."""
     if chosen is not None and not isinstance(chosen, kinds):
         names = {diffrax.AbstractStepSizeController: "a step size controller of diffrax"}
@@ -314,7 +315,7 @@ def _sample_size(scene: Scene) -> float:
 
 def _step_control(end: Array, chosen: StepChoice | None, estimate: bool | None) -> Control:
     """Return the control of the steps. **Raises** `InputError` for a choice that the precision does not allow."""
-    require(chosen, Tolerance, Accuracy, EqualSteps, diffrax.AbstractStepSizeController)
+    require_step_choice(chosen, Tolerance, Accuracy, EqualSteps, diffrax.AbstractStepSizeController)
     if isinstance(chosen, diffrax.AbstractStepSizeController):
         if estimate:
             problem = "is True together with a controller, whose steps cannot be enlarged; give a Tolerance"
@@ -337,6 +338,7 @@ ENSEMBLE_PARTS = 4
 """Number of equal parts of a run of an ensemble; mean speeds are taken over the last part."""
 
 _EXPLICIT_STEPS_PER_RADIAN, _MIN_STEPS = 4.0, 16
+"""Default number of explicit steps of an ensemble for each radian of the fastest motion, and minimum of the default number."""
 
 
 class EnsemblePlan(NamedTuple):
@@ -397,7 +399,7 @@ def plan_ensemble(
         allowed = allowed & is_positive
     require_start(scenes, states)
     known = is_known(scenes, states, end)
-    require(steps, EqualSteps)
+    require_step_choice(steps, EqualSteps)
     if steps is None and not known:
         raise InputError("stepsize_controller", "is missing; under a JAX transformation give EqualSteps(...)")
     fastest, decay, contact = _rates(scenes)

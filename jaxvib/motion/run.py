@@ -35,7 +35,7 @@ from jaxvib.motion.analysis.points import (
     vibration_of,
 )
 from jaxvib.motion.analysis.regime import STILL_SHARE, Regime, regime
-from jaxvib.motion.analysis.separation import overlap, would_separate
+from jaxvib.motion.analysis.separation import has_overlap, would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
 from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.results.fields import in_unit, part
@@ -245,7 +245,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         return f"  the following values are those from {start} to {end} s, while the motion still changes"
 
     def _pass_through_note(self) -> list[str]:
-        if not overlap(self.scene, self._stored):
+        if not has_overlap(self.scene, self._stored):
             return []
         return [f"  loads passed through each other on the way, which may change the result; {_CONTACT}"]
 
@@ -278,11 +278,11 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """
         self.require_single()
         loads = [exciter.loads for exciter in self.scene.exciters if exciter.loads is not None]
-        is_pushed = np.repeat([one_kind.one_sided for one_kind in loads], [one_kind.count for one_kind in loads])
-        if not np.any(is_pushed):
-            return jnp.asarray(np.full(is_pushed.size, np.nan), self.window.time.dtype)
+        is_one_sided = np.repeat([one_kind.one_sided for one_kind in loads], [one_kind.count for one_kind in loads])
+        if not np.any(is_one_sided):
+            return jnp.asarray(np.full(is_one_sided.size, np.nan), self.window.time.dtype)
         times = _detachment_times(self.scene, self.window if self.trajectory is None else self.trajectory)
-        return times if np.all(is_pushed) else jnp.where(is_pushed, times, np.nan)
+        return times if np.all(is_one_sided) else jnp.where(is_one_sided, times, np.nan)
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
@@ -404,12 +404,14 @@ def _histories(trajectory: Trajectory) -> list[np.ndarray]:
 
 
 def with_separation_status(run: Run, *, is_settled: bool = True) -> Run:
-    """Return the run with the status `overlapping` (loads with a size are inside each other at its end) or `would_separate`
-    (loads stay at nearly one angle although this motion is unstable; only for a settled run) if it applies, otherwise
-    unchanged."""
+    """Return the run, with another status if its loads cannot move in this way.
+
+    The status is `overlapping` if loads with a size are inside each other at the end, and `would_separate` if the run is
+    settled and its loads stay at nearly one angle although this motion is unstable.
+    """
     if status_name(run.status) not in ENDS:
         return run
-    if overlap(run.scene, run.window if is_settled else jax.tree.map(lambda leaf: np.asarray(leaf)[-1:], run.window)):
+    if has_overlap(run.scene, run.window if is_settled else jax.tree.map(lambda leaf: np.asarray(leaf)[-1:], run.window)):
         return dataclasses.replace(run, status=member(RunStatus, "overlapping"))
     if is_settled and would_separate(run.scene, run.window):
         return dataclasses.replace(run, status=member(RunStatus, "would_separate"))

@@ -26,7 +26,15 @@ from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.regime import Regime, RegimeName
 from jaxvib.motion.analysis.separation import prepare_separation, would_separate
 from jaxvib.motion.integrate import WINDOW_SAMPLES, frequency_bounds, whole_turns
-from jaxvib.motion.plan import EqualSteps, RunPlan, StepChoice, Tolerance, plan_segment, require, with_settled_drives
+from jaxvib.motion.plan import (
+    EqualSteps,
+    RunPlan,
+    StepChoice,
+    Tolerance,
+    plan_segment,
+    require_step_choice,
+    with_settled_drives,
+)
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.simulate import last_state, prepare_run, run_planned
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state, must_compile_jams, start_state
@@ -143,7 +151,7 @@ class _SettlePlan:
     **Attributes**: `first`: plan of the first segment; `segments`: their largest number; `drift`: the drift below which the
     motion has settled; `default_drift`: the default drift of the precision; `mean_segments`: the number of segments that
     show whether the motion is steady in the mean, None if the motion must reach the drift; `decay`: the slowest decay of the
-    carrier without friction at supports, 1/s; `has_resistance`: True if effects at supports can damp it.
+    carrier without friction at supports, 1/s; `has_resistance`: True if effects at supports can damp the carrier.
     """
 
     first: RunPlan
@@ -172,7 +180,7 @@ def _plan_settle(
     scene = validate_scene(scene)
     scene = with_settled_drives(scene, start, "a motion settles at a constant rotor speed; use ConstantSpeed")
     count(periods, "periods")
-    require(steps, Tolerance, EqualSteps, diffrax.AbstractStepSizeController)
+    require_step_choice(steps, Tolerance, EqualSteps, diffrax.AbstractStepSizeController)
     double = scene.top_speed.dtype.itemsize >= 8
     default_drift = 1e-6 if double else 1e-3
     # Each segment is a whole number of turns, so that an imbalance continues at its angle.
@@ -210,7 +218,10 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
             return run, False
         drifts.append(float(run.drift))
         decay = plan.decay or (_slowest_decay(plan.first.scene, run.window) if plan.has_resistance else 0.0)
-        if drifts[-1] < plan.drift and _distance(drifts, run, decay, length) < _MAX_DISTANCE_IN_DRIFTS * plan.drift:
+        if (
+            drifts[-1] < plan.drift
+            and _distance_from_steady_state(drifts, run, decay, length) < _MAX_DISTANCE_IN_DRIFTS * plan.drift
+        ):
             final = _with_final_status(run, "done")
             # If the loads are not at exactly one angle and would separate, the run continues until they have left this motion.
             if is_coincident or status_name(final.status) == "done" or not would_separate(run.scene, run.window):
@@ -219,7 +230,7 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
             force = float(np.nan_to_num(run.foundation_force))  # 0 if it is unknown
             lengths = plan.first.scene.machine.carrier().as_lengths(run.amplitude)
             measured.append([drifts[-1], float(run.omega), force, *np.asarray(lengths).tolist()])
-            if len(measured) >= plan.mean_segments and _steady_in_the_mean(np.array(measured[-plan.mean_segments :])):
+            if len(measured) >= plan.mean_segments and _is_steady_in_the_mean(np.array(measured[-plan.mean_segments :])):
                 return _with_final_status(run, "beating"), True
             is_plain = plan.first.scene.is_plain
             if is_plain and drifts[-1] < SETTLED_DRIFT and decay * length * len(measured) > -math.log(plan.default_drift):
@@ -252,14 +263,16 @@ def _matrices(scene: Scene, window: Trajectory | None) -> tuple[Array, Array, Ar
 
 
 def _slowest_decay(scene: Scene, window: Trajectory | None = None) -> float:
-    """Return the smallest decay rate of free vibrations of the carrier with its loads, 1/s, 0 if a vibration does not decay;
-    for a small vibration beside the motion in a `window` with friction at supports."""
+    """Return the smallest decay rate of free vibrations of the carrier with its loads, 1/s; 0 if a vibration does not decay.
+
+    With a `window`, it is that of a small vibration in addition to the motion in the window, with friction at supports.
+    """
     poles = poles_of(*(np.asarray(matrix, float) for matrix in _matrices(scene, window)))
     slowest = float(np.min(-poles.real))
     return slowest if slowest > 1e-12 * float(np.max(np.abs(poles))) else 0.0
 
 
-def _distance(drifts: Sequence[float], run: Run, decay: float, segment: float) -> float:
+def _distance_from_steady_state(drifts: Sequence[float], run: Run, decay: float, segment: float) -> float:
     """Estimate the relative distance of a motion from its steady state from the drifts of its segments so far.
 
     A distance that decays at the rate a decreases by the fraction 1 - exp(-a T) during the time T between the two halves of the
@@ -277,7 +290,7 @@ def _distance(drifts: Sequence[float], run: Run, decay: float, segment: float) -
     return math.inf if fall == 0.0 or (fall < 0.5 and len(drifts) < 3) else recent / fall
 
 
-def _steady_in_the_mean(measured: np.ndarray) -> bool:
+def _is_steady_in_the_mean(measured: np.ndarray) -> bool:
     """Return True if measured values scatter about constant means, except for changes below half the drift; `measured` (4 n, 3
     + nd): for each segment the drift, the load speed, the force and the amplitudes as lengths (`Carrier.as_lengths`)."""
     drift, values = measured[:, 0], measured[:, 1:]

@@ -21,7 +21,7 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, with_nearest_turns
 from jaxvib.motion.integrate import IntegrationPlan, StepControl, angle_wrapping, integrate, whole_turns
-from jaxvib.motion.integration.stiffness import advice
+from jaxvib.motion.integration.stiffness import advice_on_stiffness
 from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, StepChoice, plan_run
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.start import Start, must_compile_jams
@@ -203,7 +203,7 @@ def _run_in_segments(plan: RunPlan, control: Control, *, is_measured: bool) -> R
     angles at the beginning of a segment are within one turn.
     """
 
-    def added(counts: list[Array]) -> Array:
+    def total(counts: list[Array]) -> Array:
         return on_device(np.sum([np.asarray(step_count) for step_count in counts], dtype=counts[0].dtype))
 
     number, end = plan.segments, float(plan.end)
@@ -221,7 +221,7 @@ def _run_in_segments(plan: RunPlan, control: Control, *, is_measured: bool) -> R
     last = runs[-1]
     return dataclasses.replace(
         last,
-        **{name: added([getattr(run, name) for run in runs]) for name in ("steps", "rejected", "evaluations")},
+        **{name: total([getattr(run, name) for run in runs]) for name in ("steps", "rejected", "evaluations")},
         window=dataclasses.replace(last.window, time=last.window.time + length * (number - 1)),
         coincident=on_device(np.all([numpy_if_known(run.coincident) for run in runs])),
     )
@@ -231,7 +231,7 @@ _COARSE_TOLERANCE_RATIO = 100.0
 """Largest tolerance of the second run (for the error estimate), in units of that of the first run."""
 
 
-def _coarser(control: StepControl) -> StepControl:
+def _coarser_control(control: StepControl) -> StepControl:
     """Return the control of the second run, with larger steps."""
     if control.steps is not None:
         return StepControl(steps=np.asarray(np.ceil(control.steps / 2.0), control.steps.dtype))
@@ -241,11 +241,13 @@ def _coarser(control: StepControl) -> StepControl:
 
 
 def _run_with_estimate(plan: RunPlan) -> Run:
-    """Return a run with its error, estimated by a second run with larger steps, computed in parallel, but not with a progress
-    meter or under a JAX transformation."""
+    """Return a run with its error, which a second run with larger steps estimates.
+
+    Both runs are computed in parallel, except with a progress meter and under a JAX transformation.
+    """
     control = plan.integration.control
     assert isinstance(control, StepControl)
-    coarser = _coarser(control)
+    coarser = _coarser_control(control)
     runs = partial(_run, plan, control), partial(_run, plan, coarser, is_measured=False)
     if plan.is_known and plan.integration.progress_meter is None:
         fine, coarse = in_threads(lambda k: runs[k](), 2)
@@ -263,7 +265,7 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
     or the last one with the status `not_accurate`."""
     control, dtype = plan.integration.control, plan.scene.top_speed.dtype
     assert isinstance(control, StepControl)
-    floor, coarser = 10.0 * float(jnp.finfo(dtype).eps), _coarser(control)
+    floor, coarser = 10.0 * float(jnp.finfo(dtype).eps), _coarser_control(control)
     previous = run = _run(plan, coarser)
     for _ in range(_MAX_ACCURACY_RUNS - 1):
         latest = _run(plan, control)
@@ -321,8 +323,11 @@ def _estimate_error(
     evaluations: tuple[Array, Array | np.ndarray],
     order: int,
 ) -> tuple[Array, Array]:
-    """Return the estimated error of a run with a method of this `order` from its `window`, and from the `coarse_states` of the
-    window and the `status` of a run with larger steps, and the sum of the `evaluations`; `fastest`: see `frequency_bounds`."""
+    """Return the estimated error of a run, and the sum of the `evaluations`.
+
+    **Arguments**: `fastest`: see `frequency_bounds`; `window` and `steps` of the run; `coarse_states` of the window and
+    `status` of a run with larger steps; `control` and `coarser`: controls of both runs; `order` of the method.
+    """
     # The error is unknown if the second run failed, or if it has the same steps.
     is_known = status == RunStatus.done
     if control.steps is not None:
@@ -365,8 +370,8 @@ def _hint(plan: RunPlan, run: Run, name: str) -> str:
     if name == "no_step":
         hint += "; give a smaller tolerance, or an explicit solver"
     if name == "max_steps_reached":
-        max_steps = plan.integration.max_steps
-        hint += f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run{advice(run.scene)}"
+        hint += f" ({plan.integration.max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run"
+        hint += advice_on_stiffness(run.scene)
     if name == "not_accurate":
         hint += f" ({float(run.error):.1e}; requested {plan.accuracy:.1e}); allow a larger error, or give a shorter run"
     return hint

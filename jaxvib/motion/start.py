@@ -95,7 +95,7 @@ def initial_state(
     def phases(exciter: Exciter, loads: Loads, rest: float | Array) -> Array:
         middle = numpy_if_known(rest if angles is None else numbers(angles, "rad", "angles", loads.count))
         one_each = angles is not None and not isinstance(angles, str) and np.ndim(angles) > 0  # pyright: ignore[reportArgumentType]
-        return middle + _places(exciter, loads, start, separation, one_each=one_each)
+        return middle + _load_offsets(exciter, loads, start, separation, one_each=one_each)
 
     def at_rest(exciter: Exciter) -> ExciterState:
         hangs = exciter.unbalance is not None and 1 in total_gravity((*scene.effects, *exciter.effects))
@@ -138,7 +138,9 @@ def must_compile_jams(scene: Scene, mode: int | None) -> bool:
     return not jams_of.is_ready(scene)
 
 
-def _places(exciter: Exciter, loads: Loads, start: Start, separation: Number | None, *, one_each: bool) -> Array | np.ndarray:
+def _load_offsets(
+    exciter: Exciter, loads: Loads, start: Start, separation: Number | None, *, one_each: bool
+) -> Array | np.ndarray:
     """Return the angles (count,), rad, of the loads relative to their middle; `one_each`: True if each load has a given
     angle."""
     n = loads.count

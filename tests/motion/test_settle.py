@@ -12,7 +12,7 @@ from small_machine import small_machine, small_run, small_start
 
 import jaxvib as jv
 from jaxvib.motion.integrate import whole_turns
-from jaxvib.motion.settle import _distance, _is_creeping, _slowest_decay, _steady_in_the_mean
+from jaxvib.motion.settle import _distance_from_steady_state, _is_creeping, _is_steady_in_the_mean, _slowest_decay
 from jaxvib.motion.simulate import last_state, run_planned
 
 
@@ -118,7 +118,7 @@ def test_what_is_steady_in_the_mean():
     noise, drift = random.normal(size=(32, 3)), 1e-3 * random.uniform(0.5, 2.0, 32)
 
     def steady(drift, values):
-        return _steady_in_the_mean(np.column_stack([drift, np.broadcast_to(np.transpose(values), (3, 32)).T]))
+        return _is_steady_in_the_mean(np.column_stack([drift, np.broadcast_to(np.transpose(values), (3, 32)).T]))
 
     assert steady(drift, 5.0 + 0.01 * noise)
     assert steady(drift, 5.0 + 0.01 * np.sin(2.3 * k))
@@ -172,7 +172,7 @@ def test_means_of_quarters_are_compared_with_their_error(separation, steady):
     quarters = [1.0 + swing + (separation * error if k == 2 else 0.0) for k in range(4)]
     values = np.concatenate(quarters)
     seen = np.stack([np.full(160, 1e-7) * (1.0 + 0.1 * np.tile([1.0, -1.0], 80)), values, values, values, values], axis=1)
-    assert _steady_in_the_mean(seen) is steady
+    assert _is_steady_in_the_mean(seen) is steady
 
 
 def begins_at(monkeypatch, s, **given):
@@ -201,7 +201,7 @@ def test_at_least_32_segments_are_judged(monkeypatch, periods, segments):
     """A segment has 100 slow periods; every quarter has a whole number of segments."""
     run, seen = small_run(save="window"), []
     monkeypatch.setattr("jaxvib.motion.settle.run_planned", lambda *_, **__: run)
-    monkeypatch.setattr("jaxvib.motion.settle._steady_in_the_mean", lambda rows: seen.append(rows.shape) or len(seen) > 1)
+    monkeypatch.setattr("jaxvib.motion.settle._is_steady_in_the_mean", lambda rows: seen.append(rows.shape) or len(seen) > 1)
     found = jv.settle(small_machine(), start=small_start(), periods=periods)
     assert found.status_name == "beating" and seen == [(segments, 5)] * 2
 
@@ -209,7 +209,7 @@ def test_at_least_32_segments_are_judged(monkeypatch, periods, segments):
 def test_rotations_are_compared_as_lengths(monkeypatch):
     run, seen = jv.simulate(turning_body(), 1.0, estimate=False, save="window"), []
     monkeypatch.setattr("jaxvib.motion.settle.run_planned", lambda *_, **__: run)
-    monkeypatch.setattr("jaxvib.motion.settle._steady_in_the_mean", lambda rows: seen.append(rows[0, 3:]) or True)
+    monkeypatch.setattr("jaxvib.motion.settle._is_steady_in_the_mean", lambda rows: seen.append(rows[0, 3:]) or True)
     jv.settle(turning_body(), start="rest")
     np.testing.assert_allclose(seen[0], run.amplitude * np.array([1.0, 1.0, 0.3]), rtol=1e-12)
 
@@ -234,7 +234,7 @@ def test_means_scatter_by_their_standard_errors():
         for share, steady in ((0.98, True), (1.02, False)):
             shift = np.repeat([0.0, 0.0, 0.0, share * 3.6 / np.sqrt(n)], n)
             values = 5.0 + np.tile(spread, 4) + shift
-            assert _steady_in_the_mean(np.column_stack([drift, values, values, values])) == steady
+            assert _is_steady_in_the_mean(np.column_stack([drift, values, values, values])) == steady
 
 
 @pytest.mark.parametrize(("share", "steady"), [(0.45, True), (0.55, False)])
@@ -242,7 +242,7 @@ def test_less_than_half_the_drift_is_not_seen(share, steady):
     """Quarters that do not scatter, and the last of which is another by a share of the drift."""
     drift = 1e-3 * np.resize([0.9, 1.1, 1.1, 0.9], 128)
     values = 5.0 * (1.0 + share * np.median(drift) * np.repeat([0.0, 0.0, 0.0, 1.0], 32))
-    assert _steady_in_the_mean(np.column_stack([drift, values, values, values])) == steady
+    assert _is_steady_in_the_mean(np.column_stack([drift, values, values, values])) == steady
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -271,7 +271,7 @@ def test_the_distance_from_the_end_follows_from_decays():
     run = SimpleNamespace(window=SimpleNamespace(time=np.array([3.0, 5.0])))
 
     def far(drifts, decay):
-        return _distance(drifts, run, decay, 10.0)
+        return _distance_from_steady_state(drifts, run, decay, 10.0)
 
     np.testing.assert_allclose(far([1e-3], 1.0), 1e-3 / (1.0 - np.exp(-1.0)), rtol=1e-12)
     weak = 1.0 - np.exp(-0.1)

@@ -215,10 +215,10 @@ def regimes_of_runs(masses: RotatingMasses, load_speed: np.ndarray, finite: np.n
     values = [np.asarray(each)[used] for each in (masses.rotation, masses.phase, masses.resonance, load_speed)]
     order = _order_of_equal(values[0], values[1], masses.equal)
     rotation, phase, resonance, speed = (np.take_along_axis(each, order, 1) for each in values)
-    speed, group = np.sign(rotation) * np.abs(speed), _groups(rotation)
+    speed, group = np.sign(rotation) * np.abs(speed), _group_numbers(rotation)
     first = np.argmax(group[:, :, None] == group[:, None], axis=2)
-    phase = _wrapped(phase - np.take_along_axis(phase, first, 1))
-    number = _numbers(np.concatenate([group, resonance], axis=1), phase)
+    phase = _wrap_angle(phase - np.take_along_axis(phase, first, 1))
+    number = _regime_numbers(np.concatenate([group, resonance], axis=1), phase)
     counts = np.bincount(number)
     by_share = np.argsort(-counts, kind="stable")
     regime = np.zeros(runs, int)
@@ -231,7 +231,7 @@ def regimes_of_runs(masses: RotatingMasses, load_speed: np.ndarray, finite: np.n
     counts = counts[by_share]
     share, (low, high) = counts / runs, wilson(counts, np.full(counts.shape, runs))
     mean = of_regimes(lambda own: np.angle(np.mean(np.exp(1j * phase[own]), axis=0)))
-    around = [_wrapped(phase[own] - mean[k]) for k, own in enumerate(rows)]
+    around = [_wrap_angle(phase[own] - mean[k]) for k, own in enumerate(rows)]
     return EnsembleRegimes(
         status=EnsembleRegimesStatus.named if rows else EnsembleRegimesStatus.none,
         regime_of_run=regime,
@@ -252,12 +252,12 @@ def regimes_of_runs(masses: RotatingMasses, load_speed: np.ndarray, finite: np.n
     )
 
 
-def _wrapped(angle: np.ndarray) -> np.ndarray:
+def _wrap_angle(angle: np.ndarray) -> np.ndarray:
     """Return angles, rad, from -pi to pi."""
     return np.arctan2(np.sin(angle), np.cos(angle))
 
 
-def _groups(rotation: np.ndarray) -> np.ndarray:
+def _group_numbers(rotation: np.ndarray) -> np.ndarray:
     """Return the number, from 0, of the group of masses of equal `rotation` (runs, mass), rad, to which each mass belongs, and
     -1 for masses that make less than one turn. Groups are numbered in the order of their first masses."""
     order = np.argsort(rotation, axis=1)
@@ -286,28 +286,28 @@ def _order_of_equal(rotation: np.ndarray, phase: np.ndarray, equal: Sequence[int
         gaps = np.diff(ascending, axis=1, prepend=ascending[:, -1:] - 2.0 * np.pi)
         start = np.take_along_axis(ascending, np.argmax(gaps, axis=1)[:, None], 1)
         after = np.mod(phase[:, own] - start + 1e-6, 2.0 * np.pi)
-        group = _groups(rotation[:, own])
+        group = _group_numbers(rotation[:, own])
         first = np.argmax(group[:, :, None] == group[:, None], axis=2)
         fastest = np.where(group < 0, np.inf, -np.take_along_axis(rotation[:, own], first, 1))
         order[:, own] = own[np.lexsort((after, fastest), axis=1)]
     return order
 
 
-def _numbers(pattern: np.ndarray, phase: np.ndarray) -> np.ndarray:
+def _regime_numbers(pattern: np.ndarray, phase: np.ndarray) -> np.ndarray:
     """Return numbers (runs,), from 0, that are equal for runs with equal rows of `pattern` (runs, n) and with `phase`
     (runs, mass) in the same ranges, which gaps of at least `_PHASE_GAP` separate."""
     _, number = np.unique(pattern, axis=0, return_inverse=True)
     keys = np.column_stack([number.ravel(), np.zeros(phase.shape, int)])
     for each in np.unique(keys[:, 0]):
         own = np.flatnonzero(keys[:, 0] == each)
-        keys[own, 1:] = np.stack([_ranges(column) for column in phase[own].T], axis=1)
+        keys[own, 1:] = np.stack([_range_numbers(column) for column in phase[own].T], axis=1)
     return np.unique(keys, axis=0, return_inverse=True)[1].ravel()
 
 
-def _ranges(angle: np.ndarray) -> np.ndarray:
+def _range_numbers(angle: np.ndarray) -> np.ndarray:
     """Return the number, from 0, of the range of angles (n,), rad, on the circle to which each belongs.
 
-    >>> _ranges(np.array([3.1, -3.1, 0.1, -0.1])).tolist()
+    >>> _range_numbers(np.array([3.1, -3.1, 0.1, -0.1])).tolist()
     [1, 1, 0, 0]
     """
     angle = np.mod(angle, 2.0 * np.pi)

@@ -179,9 +179,9 @@ def turning_angles(scene: Scene, times: Callable[[], Array], states: State) -> t
         if exciter_state.angle:
             columns.append((exciter_state.angle[0], exciter_state.rate[0]))
         else:
-            drive, moments = exciter.turning_drive, times()
-            angle = jax.vmap(drive.rotor_angle)(moments, exciter_state.rotor)
-            rate = jax.vmap(drive.rotor_speed)(moments, exciter_state.rotor)
+            drive, time = exciter.turning_drive, times()
+            angle = jax.vmap(drive.rotor_angle)(time, exciter_state.rotor)
+            rate = jax.vmap(drive.rotor_speed)(time, exciter_state.rotor)
             columns.append((angle[:, None], rate[:, None]))
     if len(columns) == 1:
         return columns[0]
@@ -325,8 +325,8 @@ def _kinked_extrema(outputs: Callable[[Array, Array], Array], field: Field, time
 
     def extremum(output: Array, place: Array, sign: Array) -> Array:
         k = first_sample(place)
-        moments, ends = jax.tree.map(lambda leaf: leaf[k + np.arange(2)], (times, states))
-        first, second = zip(*motion(ends, jax.vmap(field)(moments, ends)), strict=True)
+        end_times, ends = jax.tree.map(lambda leaf: leaf[k + np.arange(2)], (times, states))
+        first, second = zip(*motion(ends, jax.vmap(field)(end_times, ends)), strict=True)
 
         def value(place: Array) -> Array:
             return at(first, second, place - k)[output]
@@ -418,8 +418,8 @@ def _sampled_outputs(model: Model, field: Field, times: Array, states: State) ->
     return jax.vmap(lambda *y: _outputs(model, step, *y), out_axes=-1)(states, rates)
 
 
-def _rates(moment: tuple[Array, State], field: Field) -> State:
-    return field(*moment)
+def _rates(time_and_state: tuple[Array, State], field: Field) -> State:
+    return field(*time_and_state)
 
 
 def _outputs(model: Model, step: Array, state: State, rates: State) -> tuple[Array, Array]:

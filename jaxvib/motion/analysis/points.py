@@ -39,8 +39,9 @@ _MIN_SHARE = 0.5
 vibration measures. It is about 1 in a steady motion, and small if a rotor slows down or a free vibration decays."""
 
 _PURE_SHARE = 0.95
-"""The same share, below which a summary states that its measures do not describe the whole motion. Typical: 0.9 for loads that
-are jammed on a rotor with an imbalance, which vibrates at the rotor speed too."""
+"""Share of the amplitude at the speed of the exciters, see `_MIN_SHARE`, below which a summary states that its measures do not
+describe the whole motion. Typical: 0.9 for loads that are jammed on a rotor with an imbalance, which also vibrates at the rotor
+speed."""
 
 _HARMONICS = 3
 """Number of fitted harmonics. The second and the third are included because they would otherwise influence the first."""
@@ -178,13 +179,13 @@ def measures_text(
     the `reason` for which there is none."""
     if reason:
         return [f"no vibration to measure: {reason}"]
-    shaking = vibration()
-    lines = (measures or vibration_measures(scene, shaking)).summary().splitlines()
-    share = float(_harmonic_share(scene.machine, shaking.displacement, shaking.amplitude))
+    motion = vibration()
+    lines = (measures or vibration_measures(scene, motion)).summary().splitlines()
+    share = float(_harmonic_share(scene.machine, motion.displacement, motion.amplitude))
     if share >= _PURE_SHARE:
         return lines
     note = (
-        f"only {100.0 * share:.3g} % of the amplitude is at the mean speed of the exciters, {speed_text(shaking.speed, 4)}; "
+        f"only {100.0 * share:.3g} % of the amplitude is at the mean speed of the exciters, {speed_text(motion.speed, 4)}; "
         "g and mm/s are computed from the whole amplitude and this speed, forces on supports from this part only"
     )
     return [note, *lines]

@@ -32,14 +32,14 @@ first and the second half of the window."""
 _LOCKED_PHASE_CHANGE = 0.1
 """Change of the relative phases, rad, from one half of the window to the other below which they count as constant."""
 
-_STEADY_SLIP = 0.02
+_MAX_LAG_CHANGE = 0.02
 """Relative difference between the lags of a load (angles by which it falls behind the rotor) in the two halves of the window,
 below which the lag is steady. A load with a steady lag is jammed, even if the lag is small."""
 
 STILL_SHARE = 0.01
 """Speed of a rotor, relative to a working or resonance speed, below which texts state that it is at rest."""
 
-_BACKWARD = -0.98
+_MAX_BACKWARD_DIRECTIVITY = -0.98
 """Directivity of a whirl up to which it counts as a backward circle, that is with at most 1 % of forward motion."""
 
 _EQUAL_FREQUENCIES = 1e-6
@@ -134,7 +134,7 @@ class Regime(Result):
             place_text = f"{relation} resonance {int(self.resonance)} at {speed} (mode {int(self.mode)})"
             evidence += [place_text, pattern]
         if bool(self.name == RegimeName.balanced) or bool(self.name == RegimeName.unbalanced):
-            evidence += [self._remainder(), pattern]
+            evidence += [self._remainder_text(), pattern]
         if bool(self.caught):
             evidence.append("the rotor itself is caught at a resonance, below the speed of its motor")
         if abs(float(self.rotor_speed)) > STILL_SHARE * float(self.resonance_speed):
@@ -148,7 +148,7 @@ class Regime(Result):
         angles = ", ".join(f"{degrees(float(a)) % 360.0:.4g}" for a in self.phase)
         return f"at {angles} deg {frame}"
 
-    def _remainder(self) -> str:
+    def _remainder_text(self) -> str:
         share = float(self.unbalance)
         if share < 1.005:
             return f"{100.0 * share:.3g} % of the loads' unbalance is left"
@@ -227,7 +227,7 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
     swings = is_known & (jnp.max(phi, axis=0) - jnp.min(phi, axis=0) < 2.0 * jnp.pi)
     lags = [speeds[:-1] - speeds[-1] for speeds in (early, late)]
     is_behind = jnp.abs(phi[-1] - phi[0] - (turn[-1] - turn[0])) > _LOCKED_PHASE_CHANGE
-    is_behind = is_behind & (jnp.abs(lags[1] - lags[0]) < _STEADY_SLIP * jnp.abs(lags[1] + lags[0]) / 2.0)
+    is_behind = is_behind & (jnp.abs(lags[1] - lags[0]) < _MAX_LAG_CHANGE * jnp.abs(lags[1] + lags[0]) / 2.0)
     with_rotor = (jnp.abs(speed - rotor) < _MAX_EQUAL_SPEED_DIFFERENCE * reference) & ~is_behind
     # Circular means of phi_j - phi_1. If the means of the two halves differ, the phase is not constant.
     to_first, load_phase_change = _mean_phases(phi - phi[:, :1], half)
@@ -304,9 +304,12 @@ def _unbalances(scene: Scene, turn: Array) -> tuple[Array, Array]:
 
 
 def _unbalance(scene: Scene, unbalances: Array, rotor_unbalance: Array, turn: Array) -> Array:
-    """Return the residual unbalance of the loads (count,) and the rotor, complex, relative to all loads at one angle, or, if
-    larger, the moment of a rotor that tilts about the point of the loads, relative to their levers, or to the radius of
-    gyration of the rotor if the levers are 0."""
+    """Return the residual unbalance of the loads and the rotor, relative to that of all loads at one angle.
+
+    `unbalances` (count,) and `rotor_unbalance` are complex. For a rotor that tilts, the result is the larger of this value and
+    the moment about the point of the loads, relative to that of the loads' levers, or to the radius of gyration of the rotor if
+    the levers are 0.
+    """
     mount, origin = scene.mount(), jnp.zeros_like(turn[0])
     imbalances = [term.at(origin) for term in terms_of(scene.all_effects, RotorImbalance)]
     size = jnp.sum(jnp.abs(unbalances))
@@ -332,5 +335,5 @@ def _resonances(scene: Scene, rotor_speed: Array) -> Array:
     if scene.mounting.gyroscopic is None:
         return estimated_frequencies(scene)
     whirls = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
-    excited = (whirls.speed[0] > 0.0) & (whirls.directivity[0] > _BACKWARD)
+    excited = (whirls.speed[0] > 0.0) & (whirls.directivity[0] > _MAX_BACKWARD_DIRECTIVITY)
     return jnp.sort(jnp.where(excited, whirls.speed[0], jnp.inf))

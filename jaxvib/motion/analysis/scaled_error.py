@@ -58,8 +58,8 @@ def _exciter_units(exciter: Exciter) -> tuple[list[Array], ExciterState]:
 def error_scale(state: State, unit: State) -> State:
     """Return the scales by which differences between states are divided, a scalar for each part of the `State`.
 
-    The scale of displacements and of velocities is their largest modulus in one or several states, but at least the natural
-    `unit`, because these values of a machine at rest are 0. That of angles and rates is the natural unit.
+    The scale of displacements, of velocities and of the drilling spin is their largest modulus in one or several states, but at
+    least the natural `unit`, because these values of a machine at rest are 0. The scale of all other parts is the natural unit.
     """
     xp = array_module((state, unit))
 

@@ -110,7 +110,7 @@ def smallest_distance(scene: Scene, segment: Trajectory) -> float:
     return min(distances)
 
 
-def overlap(scene: Scene, segment: Trajectory) -> bool:
+def has_overlap(scene: Scene, segment: Trajectory) -> bool:
     """Return True if the distance of two loads with a size is below 0.9 diameters at some time, which the effect `LoadContact`
     would prevent. Smaller overlaps count as contact."""
     return not has_term(scene.all_effects, LoadInteraction) and smallest_distance(scene, segment) < MIN_DISTANCE

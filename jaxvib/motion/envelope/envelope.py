@@ -41,7 +41,7 @@ from jaxvib.motion.analysis.separation import MIN_SEPARATION_GROWTH, nearly_coin
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite, with_jump_times
 from jaxvib.motion.integration.system import with_first_derivatives
-from jaxvib.motion.plan import Tolerance, require, require_error_estimate
+from jaxvib.motion.plan import Tolerance, require_error_estimate, require_step_choice
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.motion.start import Start, initial_state, must_compile_jams, start_state, with_spin_up_drive
 from jaxvib.numerics.linalg import magnitude
@@ -66,10 +66,12 @@ _MAX_WINDOW_TURNS = 256
 """Largest length of the measuring window, in turns of the rotor, as in `simulate`."""
 
 
-class _Tolerance(WrappedController):
-    """Step size controller with errors relative to the largest entry of a block of variables, such as all parts of Y, because
-    the real or imaginary part of an amplitude is often 0. `blocks`: the number of variables in each block; only absolute errors
-    count in the last one, the phases."""
+class _BlockSteps(WrappedController):
+    """Step size controller with errors relative to the largest entry of a block of variables, such as all parts of Y.
+
+    The real or imaginary part of an amplitude is often 0, so that an error relative to this part alone would have no meaning.
+    `blocks`: the number of variables in each block. In the last block, the phases, only the absolute error counts.
+    """
 
     controller: diffrax.AbstractStepSizeController
     blocks: tuple[int, ...] = eqx.field(static=True)
@@ -77,8 +79,8 @@ class _Tolerance(WrappedController):
     def __init__(self, controller: diffrax.AbstractStepSizeController, blocks: tuple[int, ...]):
         self.controller, self.blocks = controller, blocks
 
-    def wrap(self, direction: IntScalarLike) -> _Tolerance:
-        return _Tolerance(self.controller.wrap(direction), self.blocks)
+    def wrap(self, direction: IntScalarLike) -> _BlockSteps:
+        return _BlockSteps(self.controller.wrap(direction), self.blocks)
 
     def init(
         self,
@@ -206,7 +208,7 @@ def envelope(
     count(samples, "samples", low=2, each=1e3)
     count(window_periods, "window_periods")
     chosen = Tolerance(1e-4) if stepsize_controller is None else stepsize_controller
-    require(chosen, Tolerance, diffrax.AbstractStepSizeController)
+    require_step_choice(chosen, Tolerance, diffrax.AbstractStepSizeController)
     require_error_estimate(solver, chosen)
     if isinstance(chosen, Tolerance):
         chosen = np.asarray(validate_tolerance(chosen.tolerance, "tolerance", end.dtype, 10.0), end.dtype)
@@ -290,7 +292,7 @@ def _run(
         y0=units.pack(begin),
         args=args,
         saveat=diffrax.SaveAt(subs=saves),
-        controller=with_jump_times(scene, _Tolerance(controller, (2 * nd, 2 * nd, *begin.rate.shape, *begin.phase.shape))),
+        controller=with_jump_times(scene, _BlockSteps(controller, (2 * nd, 2 * nd, *begin.rate.shape, *begin.phase.shape))),
         adjoint=adjoint,
         max_steps=max_steps,
     )
@@ -299,19 +301,19 @@ def _run(
     def envelopes(times: Array, flat: Array) -> Envelopes:
         return jax.vmap(lambda t, y: _at(model, field, t, units.unpack(y, nd)))(times, flat)
 
-    kept = envelopes(solution.ts[0], solution.ys[0])
+    window = envelopes(solution.ts[0], solution.ys[0])
     finite = is_finite(solution.ys[0])
-    turning = _turning(scene, field, begin, kept)
+    turning = _can_turn_fully(scene, field, begin, window)
     status = _status(solution.result, exists, finite, turning)
     whole = envelopes(solution.ts[1], solution.ys[1]) if samples else None
-    values = (_measure(model, kept), jnp.max(kept.ripple, axis=0), whole, kept)
-    measured, ripple, whole, kept = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), values)
+    values = (_measure(model, window), jnp.max(window.ripple, axis=0), whole, window)
+    measured, ripple, whole, window = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), values)
     return Envelope(
         **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
         ripple=ripple,
         status=status,
         trajectory=whole,
-        window=kept,
+        window=window,
         steps=solution.stats["num_steps"],
         rejected=solution.stats["num_rejected_steps"],
         scene=scene,
@@ -425,7 +427,7 @@ def _measure(model: Model, window: Envelopes) -> Measured:
     )
 
 
-def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
+def _can_turn_fully(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
     """Return True if every rotating mass can make full turns in the potential of gravity.
 
     At the end of the run a mass must have the energy to pass the top from the mean height, where it has its averaged speed w:

@@ -135,8 +135,8 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         """
         self.require_single()
         mean = jnp.mean(self.window.displacement, axis=0)
-        away = self.window.displacement - mean[None]
-        rest = 0.5 * (away.T @ jnp.conj(away)).real / away.shape[0]
+        deviation = self.window.displacement - mean[None]
+        rest = 0.5 * (deviation.T @ jnp.conj(deviation)).real / deviation.shape[0]
         return Harmonic(self.scene.machine, jnp.mean(self.window.omega), mean, rest)
 
     @property
@@ -224,14 +224,14 @@ def plot_histories(run: Envelope, *, resonances: Sequence[float] = (), unit: Spe
     """Plot an averaged run, with natural frequencies `resonances`, rad/s, as lines in the panel of the speeds."""
     from jaxvib.draw.motion.histories import amplitude_histories  # slow import
 
-    kept, structure = run.window if run.trajectory is None else run.trajectory, run.scene.machine.structure()
+    stored, structure = run.window if run.trajectory is None else run.trajectory, run.scene.machine.structure()
     is_load = np.array([e.loads is not None for e in run.scene.exciters])[mass_owners(run.scene)]
     return amplitude_histories(
-        np.asarray(kept.time),
-        np.asarray(kept.amplitude),
-        np.asarray(kept.load_speed)[:, is_load],
-        np.asarray(kept.foundation_force),
-        np.stack([np.asarray(speed) for speed in kept.rotor_speeds], axis=1),
+        np.asarray(stored.time),
+        np.asarray(stored.amplitude),
+        np.asarray(stored.load_speed)[:, is_load],
+        np.asarray(stored.foundation_force),
+        np.stack([np.asarray(speed) for speed in stored.rotor_speeds], axis=1),
         names=structure.coordinates,
         units=structure.units,
         directions=structure.foundation_directions,

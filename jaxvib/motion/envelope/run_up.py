@@ -33,7 +33,7 @@ _SAMPLES = 4096
 """Number of stored times of a run-up, from which peaks are read."""
 
 _START_ANGLES = 8
-"""Number of initial angles, and of runs, for each motor of `_turned_motors`."""
+"""Number of initial angles, and of runs, for each motor of `_varied_motors`."""
 
 _LIFTING_SHARE = 0.02
 """Relative difference between the least torque and the torque that lifts an unbalance up to which they count as equal; the
@@ -110,7 +110,7 @@ class MotorRunUp(Result):
         structure = self.scene.machine.structure()
         named = zip(structure.coordinates, self.peak_amplitude, structure.units, strict=True)
         peaks = ", ".join(f"{name} {quantity_text(a, unit, 4)}" for name, a, unit in named)
-        of = " (largest of several initial angles; the figure shows one run)" if _turned_motors(self.scene) else ""
+        of = " (largest of several initial angles; the figure shows one run)" if _varied_motors(self.scene) else ""
         force = quantity_text(self.peak_force, "N", 4)
         lines += [f"  peaks on the way{of}:", f"    {peaks}; magnitude of the foundation force {force}"]
         if self.weight_error > _MIN_SHOWN_ERROR:
@@ -234,18 +234,18 @@ def _require_switched_on(scene: Scene, end: Array) -> None:
 
 
 def _runs(scene: Scene, end: Array) -> list[Envelope]:
-    """Return the run from rest, and the runs with other initial angles of the motors of `_turned_motors`."""
+    """Return the run from rest, and the runs with other initial angles of the motors of `_varied_motors`."""
     runs = [envelope(scene, end, samples=_SAMPLES, throw=False)]
-    turned = _turned_motors(scene)
-    rest, count = initial_state(scene), _START_ANGLES * len(turned)
+    varied = _varied_motors(scene)
+    rest, count = initial_state(scene), _START_ANGLES * len(varied)
     for k in range(1, count):
-        angles = [jnp.asarray(2.0 * np.pi * k * (2 * j + 1) / count, end.dtype) for j in range(len(turned))]
-        start = eqx.tree_at(lambda s: [cast(tuple, s.exciters[j].rotor)[0] for j in turned], rest, angles)
+        angles = [jnp.asarray(2.0 * np.pi * k * (2 * j + 1) / count, end.dtype) for j in range(len(varied))]
+        start = eqx.tree_at(lambda s: [cast(tuple, s.exciters[j].rotor)[0] for j in varied], rest, angles)
         runs.append(envelope(scene, end, start=start, samples=_SAMPLES, throw=False))
     return runs
 
 
-def _turned_motors(scene: Scene) -> list[int]:
+def _varied_motors(scene: Scene) -> list[int]:
     """Return the numbers of the motors whose initial angles are varied. If all rotating masses belong to motors, the first
     motor is not varied, because only differences of the angles matter."""
     masses = [k for k, each in enumerate(scene.exciters) if each.unbalance is not None or each.loads is not None]

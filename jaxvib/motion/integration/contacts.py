@@ -169,7 +169,7 @@ def _with_shifts_jvp(
     begins = (before <= 0.0) & (after > 0.0)
     share = jnp.where(begins, before / jnp.where(begins, before - after, 1.0), 0.0)
     shift = jnp.where(begins, (1.0 - share) * dbefore + share * dafter, 0.0)
-    step = _Step(start, system.unwrapped(end, start), *span, args, system)
+    step = _Step(start, system.unwrap(end, start), *span, args, system)
     zero = jax.tree.map(jnp.zeros_like, end)
     changes = jax.lax.cond(jnp.any(begins), lambda: step.change(begins, share, shift), lambda: zero)
     moves = [0.0 if move is None else move for move in flat_tangents(dend, end)]

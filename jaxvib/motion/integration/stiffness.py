@@ -217,7 +217,7 @@ def resolves(scene: Scene, step: float, displacements: Array, *, implicit: bool)
     return is_resolved if contact is None else is_resolved & resolves_contact(contact, step)
 
 
-def advice(scene: Scene) -> str:
+def advice_on_stiffness(scene: Scene) -> str:
     """Return the cause of short steps as the end of a sentence; "" if no decay is more than 10 times as fast as the motion."""
     decay, motion = float(fastest_decay(scene)), float(frequency_bounds(scene)[0])
     if not decay > 10.0 * motion:

@@ -184,7 +184,7 @@ class PackedSystem(eqx.Module):
         ]
         return jax.tree.unflatten(self.treedef, parts)
 
-    def unwrapped(self, packed: IntegratorState, like: IntegratorState) -> IntegratorState:
+    def unwrap(self, packed: IntegratorState, like: IntegratorState) -> IntegratorState:
         """Return a state of the integrator whose angles are counted from the whole turns of the state `like`."""
         if not self.wrapped:
             return packed

@@ -17,7 +17,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.friction import dry_lever
-from jaxvib.motion.plan import Tolerance, require
+from jaxvib.motion.plan import Tolerance, require_step_choice
 from jaxvib.ode.types import RealScalarLike
 from jaxvib.results.fields import in_unit
 from jaxvib.results.readable import Readable
@@ -223,7 +223,7 @@ def swing(
     """
     times = numbers(time, "s", "time", None)
     chosen = Tolerance(1e-9 if times.dtype.itemsize >= 8 else 1e-5) if stepsize_controller is None else stepsize_controller
-    require(chosen, Tolerance, diffrax.AbstractStepSizeController)
+    require_step_choice(chosen, Tolerance, diffrax.AbstractStepSizeController)
     if times.ndim != 1:
         raise InputError("time", "is one number; a list of times is needed")
     problem = "must ascend, each time later than the one before"

@@ -8,8 +8,8 @@ from scenes import scene
 
 import jaxvib as jv
 from jaxvib.motion.analysis.separation import (
+    has_overlap,
     nearly_coincident_pairs,
-    overlap,
     separation_rate,
     smallest_distance,
     would_separate,
@@ -67,7 +67,7 @@ def test_loads_that_passed_each_other_are_in_the_summary():
     np.testing.assert_allclose(smallest_distance(s, crossed.trajectory), 0.2 * np.sin(0.05) / 0.022, rtol=1e-9)
     assert "loads passed through each other on the way" in crossed.summary() and "load_contact" in crossed.summary()
     touching = s.replace(effects=(*s.all_effects, jv.LoadContact(1e5)))
-    assert not overlap(touching, crossed.trajectory) and not overlap(three_balls(), crossed.trajectory)
+    assert not has_overlap(touching, crossed.trajectory) and not has_overlap(three_balls(), crossed.trajectory)
 
 
 def at_speed(s):

@@ -15,7 +15,7 @@ from scenes import jam_rotor_speed, published
 import jaxvib as jv
 from jaxvib.equations.model import assemble
 from jaxvib.machine.effects.terms import LoadResistance
-from jaxvib.motion.envelope.envelope import _measure, _Tolerance
+from jaxvib.motion.envelope.envelope import _BlockSteps, _measure
 
 
 def one(eps, speed, damping=0.2):
@@ -186,7 +186,7 @@ def test_the_ripple_of_a_run_is_the_greatest_in_its_window():
 def test_envelope_error_is_relative_to_vector_lengths():
     """A block of two numbers, of which one is 0, and an angle of 1e6 rad: what each may be off by to a relative 1e-3."""
     controller = diffrax.PIDController(rtol=1e-3, atol=1e-9, norm=lambda error: jnp.max(jnp.abs(error)))
-    steps = _Tolerance(controller=controller, blocks=(2, 1))
+    steps = _BlockSteps(controller=controller, blocks=(2, 1))
     y, state = jnp.asarray([0.0, 1.0, 1e6]), (jnp.asarray(False), jnp.asarray(1.0), jnp.asarray(1.0))
     state = steps.init(None, 0.0, 1.0, y, 0.1, None, lambda *_: y, 4)[1]
 

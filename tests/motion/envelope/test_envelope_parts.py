@@ -218,7 +218,7 @@ def begins(*rates):
 
 def is_turning(scene, begin, window):
     scene = jv.Scene(scene.machine, exciters=scene.exciters, effects=scene.effects)
-    return bool(module._turning(scene, averaged_model(linear_model(scene)), begin, window))
+    return bool(module._can_turn_fully(scene, averaged_model(linear_model(scene)), begin, window))
 
 
 def test_loads_turn_above_the_speed_that_passes_the_top():
