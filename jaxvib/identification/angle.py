@@ -1,9 +1,9 @@
 """Angle of a rotor over time, from the pulses of a tachometer, an angle, a speed, or a prescribed drive.
 
 Pulses and samples are fitted by a spline of degree 5 (`records/spline.py`). If a wheel has several marks, each mark has an
-unknown offset from its place, because marks are unevenly spaced. All pulses have an unknown common delay, because recorders
-round times up, down, or to the nearest sample; its standard error is that of the time of one pulse. The errors e_m(t) of the
-angle follow from the covariance of the coefficients:
+unknown offset from its nominal place, because marks are unevenly spaced. All pulses have an unknown common delay, because
+recorders round times up, down, or to the nearest sample; its standard error is that of the time of one pulse. The errors e_m(t)
+of the angle follow from the covariance of the coefficients:
 
     angle(t) = spline(t) + sum_m z_m e_m(t),      z_m independent and standard normal
 
@@ -41,8 +41,8 @@ _MAX_SPEED_CHANGE = 0.1
 MAX_ERRORS = 64
 """Largest number of errors z_m of an angle."""
 
-_ERRORS_TOGETHER = 8
-"""The number of errors is a multiple of this number, so that runs with nearly equal splines share a program."""
+_ERROR_COUNT_STEP = 8
+"""The number of errors is a multiple of this number. Runs with nearly equal splines therefore share a program."""
 
 
 class RecordedDrive(IdealDrive):
@@ -58,7 +58,7 @@ class RecordedDrive(IdealDrive):
     kind: str = eqx.field(static=True, default="recorded", kw_only=True)
 
     def columns_at(self, t: Array, order: int) -> Array:
-        """Return the derivatives of the given `order` of the angle and of its errors e_m (1 + m,) at time `t`; order 0: the
+        """Return the derivatives (1 + m,) of the given `order` of the angle and of its errors e_m at the time `t`; order 0: the
         values."""
         k = jnp.maximum(jnp.searchsorted(self.starts, t, side="right") - 1, 0)
         rows, since = self.table[k], t - self.starts[k]
@@ -158,11 +158,11 @@ def rotor_angles(scene: Scene, run: MeasuredRun) -> list[RotorAngle]:
             "identify needs a scene with one exciter for such a channel; otherwise remove the channel and prescribe the speeds",
         )
     if channel:
-        return [_measured(run, channel)]
-    return [_prescribed(scene, k, exciter, run) for k, exciter in enumerate(scene.exciters)]
+        return [_angle_of_channel(run, channel)]
+    return [_angle_of_drive(scene, k, exciter, run) for k, exciter in enumerate(scene.exciters)]
 
 
-def _prescribed(scene: Scene, k: int, exciter: Exciter, run: MeasuredRun) -> RotorAngle:
+def _angle_of_drive(scene: Scene, k: int, exciter: Exciter, run: MeasuredRun) -> RotorAngle:
     if not exciter.drive.ideal:
         raise InputError(
             run.source,
@@ -172,7 +172,7 @@ def _prescribed(scene: Scene, k: int, exciter: Exciter, run: MeasuredRun) -> Rot
     return RotorAngle(exciter.drive, None, (-math.inf, math.inf), False, 0.0, 0.0, ())
 
 
-def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
+def _angle_of_channel(run: MeasuredRun, channel: Channel) -> RotorAngle:
     time, value = np.asarray(run.times[channel.name], float), np.asarray(run.values[channel.name], float)
     time, value = time[np.isfinite(value)], value[np.isfinite(value)]
     field = f"{run.source}: channel {channel.name!r}"
@@ -254,7 +254,7 @@ def _drive_of(starts: np.ndarray, coefficients: np.ndarray, speeds: np.ndarray) 
     """Return the drive with polynomials (intervals, powers, 1 + m), padded to a power of two and to 1 + 8 k columns."""
     intervals, powers, count = coefficients.shape
     padded = 2 ** math.ceil(math.log2(intervals))
-    table = np.zeros((padded, powers, 1 - (1 - count) // _ERRORS_TOGETHER * _ERRORS_TOGETHER))
+    table = np.zeros((padded, powers, 1 - (1 - count) // _ERROR_COUNT_STEP * _ERROR_COUNT_STEP))
     table[:intervals, :, :count] = coefficients
     starts = np.concatenate([starts, np.full(padded - intervals, np.inf)])
     return RecordedDrive(jnp.asarray(float(np.max(np.abs(speeds)))), jnp.asarray(table), jnp.asarray(starts))

@@ -21,7 +21,7 @@ the angle of the rotor and for that of jammed loads. If its residuals are pure n
 
 _ANGLE_NAMES = ("the rotor's angle", "the angle of the jammed loads")
 
-_WINDOWS, _ORDERS = 16, 3
+_SEGMENTS, _ORDERS = 16, 3
 """Number of equal segments of a record in which residuals are compared with noise, and number of orders of the rotor speed that
 are compared."""
 
@@ -195,10 +195,10 @@ def residual_p_value(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray,
     valid = np.convolve(~np.isfinite(residuals), np.ones(len(taps)))[: residuals.size] < 0.5
     valid[: len(taps) - 1] = False
     place = np.flatnonzero(valid)
-    if place.size < 8 * _WINDOWS * (2 * _ORDERS + 1) or not np.any(white[place]):
+    if place.size < 8 * _SEGMENTS * (2 * _ORDERS + 1) or not np.any(white[place]):
         return 1.0
     explained, columns = 0.0, 0
-    for part in np.array_split(place, _WINDOWS):
+    for part in np.array_split(place, _SEGMENTS):
         waves = [np.ones(part.size)]
         for k in range(1, _ORDERS + 1):
             waves += [np.cos(k * angle[part]), np.sin(k * angle[part])]
@@ -230,16 +230,16 @@ def coverage_notes(fitted: Fitted, frequency: np.ndarray, damping_ratio: np.ndar
     decay = np.max(1.0 / np.where(decays, damping_ratio * frequency, 1.0), where=decays, initial=0.0)
     longest = float(decay) if np.all(decays) else math.inf
     for k, time in enumerate(problem.times):
-        lasts = float(time[-1] - time[0])
-        if lasts < _DECAY_TIMES * longest:
+        duration = float(time[-1] - time[0])
+        if duration < _DECAY_TIMES * longest:
             if math.isfinite(longest):
                 reason = f"less than two decay times of the mode that decays most slowly ({longest:.3g} s each)"
                 remedy = "record a longer run"
             else:
                 reason, remedy = "and a mode of the fitted machine does not decay", "check its damping"
             yield (
-                f"run {k + 1} lasts {lasts:.3g} s, {reason}: its response cannot be distinguished from the free vibration at "
-                f"its start; {remedy}"
+                f"run {k + 1} lasts {duration:.3g} s, {reason}: its response cannot be distinguished from the free vibration "
+                f"at its start; {remedy}"
             )
 
 
@@ -329,14 +329,14 @@ def _disagreements(fitted: Fitted) -> Iterator[str]:
     kept = np.array([*range(p - unknowns.turns - unknowns.errors), *range(p, p + 2 * len(exciters))])
     names = [*(number.name for number in unknowns.numbers), *(f"the gain of channel {name!r}" for name in unknowns.gains)]
     names += [f"{what} exciters[{k}].unbalance" for k in exciters for what in ("the size of", "the angle (rad) of")]
-    turn, _ = polar_unbalances(problem, fitted.linear)
+    jacobian, _ = polar_unbalances(problem, fitted.linear)
     parts = []
     equations = [(each[:-1, :-1], each[:-1, -1]) for each in run_equations(problem, fitted.x, fitted.linear)]
     for matrix, gradient in (*equations, prior_equations(problem, fitted.x, fitted.linear)):
-        polar = turn.T @ matrix @ turn
-        parts.append((eliminate(polar, kept), elimination(polar, kept).T @ (turn.T @ gradient)))
+        polar = jacobian.T @ matrix @ jacobian
+        parts.append((eliminate(polar, kept), elimination(polar, kept).T @ (jacobian.T @ gradient)))
     total, gradient_sum = (np.sum(each, axis=0) for each in zip(*parts, strict=True))
-    # Rest of the way from the fitted values to the minimum. It matters for a run with much less information than the others.
+    # Remaining step from the fitted values to the minimum: it matters for a run with much less information than the others.
     step = pseudoinverse(total)[0] @ gradient_sum
     for k, (part, gradient) in enumerate(parts[:-1]):
         deviation = disagreement(total - part, part, gradient - part @ step, names)

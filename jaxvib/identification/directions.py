@@ -30,8 +30,8 @@ _MIN_SHARE = 0.05
 undetermined."""
 
 _MIN_COMMON_PART = 0.95
-"""Part of the direction of the common factor (of all masses, stiffnesses, dampings and unbalances) that lies within the
-undetermined directions; above this value the factor itself counts as undetermined."""
+"""The direction of the common factor of all masses, stiffnesses, dampings and unbalances is a vector of length 1. If the part
+of this vector within the undetermined directions is longer than this number, the factor itself counts as undetermined."""
 
 _ADVICE = "give one of these parameters as known, or record a run with a known mass added"
 
@@ -102,14 +102,14 @@ def information_of(fitted: Fitted) -> Information:
     error = np.sum(single * errors, axis=1)
     # Unbalances are left out: if the size of an unbalance tends to 0, its angle is unknown, too.
     vanished = logarithmic & (error > UNDETERMINED) & (error < _UNBOUNDED_ERROR) & (np.arange(kept.size) < number_count)
-    # A vanished parameter is measured in units of ten times its standard error instead of its value, so that it counts as
+    # Changes of a vanished parameter are divided by ten times its standard error instead of by its value: it then counts as
     # determined.
     factors = np.where(vanished, 10.0 * error, 1.0)
     determined_part = covariance_of(information * np.outer(factors, factors))
     covariance, undetermined = determined_part.covariance, determined_part.undetermined
     loose_errors, loose_axes = principal_errors(information_of_free_gains * np.outer(factors, factors))
     by_gain = loose_axes[:, loose_errors > UNDETERMINED]
-    # Directions that nothing determines are left out of those that the gains determine.
+    # Directions that are undetermined even with known gains are removed from those that the gains determine.
     by_gain = by_gain - undetermined @ (undetermined.T @ by_gain)
     basis, sizes_of, _ = np.linalg.svd(by_gain, full_matrices=False)
     by_gain = basis[:, : int(np.sum(sizes_of > 0.5))]
@@ -193,8 +193,8 @@ def elimination(matrix: np.ndarray, kept: np.ndarray) -> np.ndarray:
 
 
 def _free(matrix: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the unknowns other than `kept` (r,), their scales (r,), and the eigenvectors (r, s) and eigenvalues (s,) > 0 of
-    their scaled information."""
+    """Return the indices (r,) of the unknowns that are not `kept` and about which there is information, their scales (r,), and
+    the eigenvectors (r, s) and eigenvalues (s,) > 0 of their scaled information."""
     free = np.setdiff1d(np.arange(len(matrix)), kept)
     free = free[np.diagonal(matrix)[free] > 0.0]
     size = np.sqrt(np.diagonal(matrix)[free])
@@ -204,7 +204,8 @@ def _free(matrix: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 def principal_errors(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the standard errors (k,) of the principal directions (k, k), the best determined last."""
+    """Return the standard errors (k,) of the principal directions, and these directions, the columns (k, k). The direction
+    with the smallest error is the last one."""
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
     floor = 1e-14 * max(float(values[-1]), 1e-300) if values.size else 0.0
     return 1.0 / np.sqrt(np.maximum(values, floor)), vectors

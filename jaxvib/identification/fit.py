@@ -128,7 +128,7 @@ def unknown_count(problem: Problem) -> int:
     return problem.unknowns.count + _linear_count(problem)
 
 
-def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+def solve_scaled(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the solution (k,) of normal equations with a `matrix` (k, k) and a `right` side (k,), scaled by the diagonal."""
     size = np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
     scaled = matrix / np.outer(size, size) + _RIDGE * np.eye(len(size))
@@ -163,11 +163,11 @@ def project(problem: Problem, x: np.ndarray) -> _Trial:
     damping = np.zeros(len(right))  # limits the steps of known unbalances, whose angles may be undetermined
     for k, known in enumerate(problem.unbalances):
         damping[2 * k : 2 * k + 2] = 0.0 if known is None else 1.0 / known.value**2
-    linear = solved(matrix + np.diag(damping), right)
+    linear = solve_scaled(matrix + np.diag(damping), right)
     if any(problem.unbalances):
-        for _ in range(8):  # the information of known unbalances depends on the directions of the last ones
+        for _ in range(8):  # the information of known unbalances depends on the directions in the previous iteration
             information, gradient, _ = unbalance_prior(problem, linear)
-            linear = linear + solved(matrix + information + np.diag(damping), right - matrix @ linear + gradient)
+            linear = linear + solve_scaled(matrix + information + np.diag(damping), right - matrix @ linear + gradient)
     data = square - 2.0 * linear @ right + linear @ matrix @ linear
     return _Trial(x, linear, max(float(data), 0.0) + known_cost(problem, x, linear))
 
@@ -216,7 +216,7 @@ def linear_at(problem: Problem, x: np.ndarray, unbalance: np.ndarray | None) -> 
     if unbalance is None:
         return project(problem, x).linear
     total, n = _linear_equations(problem, x), unbalance.size
-    return np.concatenate([unbalance, solved(total[n:-1, n:-1], total[n:-1, -1] - total[n:-1, :n] @ unbalance)])
+    return np.concatenate([unbalance, solve_scaled(total[n:-1, n:-1], total[n:-1, -1] - total[n:-1, :n] @ unbalance)])
 
 
 def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
@@ -296,15 +296,15 @@ def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.nd
 
 
 def _minimize_nonlinear(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
-    """Return the same as `minimize` for a nonlinear motion, in which no unknown is linear.
+    """Return the result of `minimize` for a nonlinear motion, on which no unknown has a linear influence.
 
-    The size and the angle of the unbalance are damped separately, because its size may be known.
+    Steps of the size and of the angle of the unbalance are damped separately, because the size may be known.
     """
     p, columns = x.size, np.zeros((0, 0))
 
     def in_polar(trial: _Trial, data: np.ndarray, prior: np.ndarray, gradient: np.ndarray) -> Equations:
-        turn, _ = polar_unbalances(problem, trial.linear)
-        return turn.T @ data @ turn, turn.T @ prior @ turn, turn.T @ gradient
+        jacobian, _ = polar_unbalances(problem, trial.linear)
+        return jacobian.T @ data @ jacobian, jacobian.T @ prior @ jacobian, jacobian.T @ gradient
 
     def equations(trial: _Trial) -> Equations:
         nonlocal columns
@@ -320,16 +320,16 @@ def _minimize_nonlinear(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.nda
         return _nonlinear_trial(problem, *moved(trial, limited_step(problem, step)))
 
     def bend(trial: _Trial, step: np.ndarray) -> np.ndarray:
-        turn, slopes = polar_unbalances(problem, trial.linear)[0], columns[:, :-1]
-        change = nonlinear_differences(problem, *moved(trial, step)) - columns[:, -1] + slopes @ (turn @ step)
-        return turn.T @ (slopes.T @ change)
+        jacobian, slopes = polar_unbalances(problem, trial.linear)[0], columns[:, :-1]
+        change = nonlinear_differences(problem, *moved(trial, step)) - columns[:, -1] + slopes @ (jacobian @ step)
+        return jacobian.T @ (slopes.T @ change)
 
     start = project(problem, x)
     count = p + start.linear.size
     with np.errstate(over="ignore", invalid="ignore"):  # a trial may diverge; its cost is then infinite
         best, found, converged = descend(start, equations, stepped, count, positive_indices(problem), bend)
-    back = np.linalg.inv(polar_unbalances(problem, best.linear)[0])
-    return best, back.T @ found[0] @ back, back.T @ found[1] @ back, converged
+    to_polar = np.linalg.inv(polar_unbalances(problem, best.linear)[0])
+    return best, to_polar.T @ found[0] @ to_polar, to_polar.T @ found[1] @ to_polar, converged
 
 
 def positive_indices(problem: Problem) -> np.ndarray:
@@ -368,7 +368,7 @@ def descend(
         matrix, gradient = _without_vanished(current, positive)
         if not np.all(np.isfinite(matrix)):
             return best, current, False
-        undamped = _undamped(matrix, gradient)
+        undamped = _undamped_step(matrix, gradient)
         if gradient @ undamped < tolerance:
             return best, current, True
         if bend is None and gradient @ undamped < _NEAR_REDUCTION * best.cost:
@@ -405,16 +405,16 @@ def _damped_step(
     A change of the logarithm of a parameter near 0 hardly changes the model; the step of this logarithm is therefore long. It
     is shortened, and the other unknowns adapt to it. If all unknowns were shortened together, the descent would stop.
     """
-    size, step, free = np.sqrt(np.diagonal(damped)), solved(damped, gradient), np.ones(len(gradient), bool)
+    size, step, free = np.sqrt(np.diagonal(damped)), solve_scaled(damped, gradient), np.ones(len(gradient), bool)
     while np.max(np.abs(step[positive]), initial=0.0) > 1.001 * _LONGEST_STEP:
         k = positive[np.argmax(np.abs(step[positive]))]
         shorter, free[k] = math.copysign(_LONGEST_STEP, step[k]), False
         gradient = gradient - damped[k] * shorter
         damped[k], damped[:, k], damped[k, k], gradient[k] = 0.0, 0.0, 1.0, shorter
-        step = solved(damped, gradient)
+        step = solve_scaled(damped, gradient)
     if bend is None:
         return step
-    correction = solved(damped, free * bend(best, _PROBE * step)) / _PROBE**2
+    correction = solve_scaled(damped, free * bend(best, _PROBE * step)) / _PROBE**2
     is_short = np.linalg.norm(size * correction) < _LONGEST_CORRECTION * np.linalg.norm(size * step)
     return step + correction if is_short else None
 
@@ -428,8 +428,8 @@ def _without_vanished(equations: Equations, positive: np.ndarray) -> tuple[np.nd
     return matrix, gradient
 
 
-def _undamped(matrix: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    return solved(matrix + 1e-9 * np.diag(np.diagonal(matrix)), gradient)
+def _undamped_step(matrix: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    return solve_scaled(matrix + 1e-9 * np.diag(np.diagonal(matrix)), gradient)
 
 
 def limited_step(problem: Problem, step: np.ndarray) -> np.ndarray:
@@ -445,7 +445,7 @@ def _follow_valley(
     cost, such as that of two dampings with very small noise. The damped method needs about ten times as many steps."""
     for _ in range(_VALLEY_STEPS):
         matrix, gradient = _without_vanished(equations(trial), positive)
-        step = _undamped(matrix, gradient)
+        step = _undamped_step(matrix, gradient)
         if not np.all(np.isfinite(step)) or gradient @ step < _CONVERGED**2:
             break
         trial = stepped(trial, step)
@@ -480,7 +480,7 @@ def _delayed(values: np.ndarray, delay: float) -> np.ndarray:
 
 
 def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
-    """Return the fit of a problem: the best one of those from the unknowns `starts`.
+    """Fit a problem from each of the `starts` (values of x), and return the fit with the lowest cost.
 
     The first pass weights each channel by the size of its readings, the second pass by its residuals. All later passes use
     filters that make the residuals white.
@@ -522,8 +522,8 @@ def _is_absorbed(noise: Sequence[Sequence[Noise]], before: Fitted, after: Fitted
 
 def _has_changing_weights(problem: Problem, noise: Sequence[Sequence[Noise]]) -> bool:
     """Return True if the weights of the readings depend on the last fit, as they do with outliers and clipped readings."""
-    heavy = any(each.outliers for of_run in noise for each in of_run)
-    return heavy or any(np.any(each) for each in problem.bounds)
+    has_outliers = any(each.outliers for of_run in noise for each in of_run)
+    return has_outliers or any(np.any(each) for each in problem.bounds)
 
 
 def angle_shares(fitted: Fitted) -> list[np.ndarray]:
@@ -548,7 +548,8 @@ def _pass(
     differences: Sequence[np.ndarray] | None,
     starts: Sequence[np.ndarray],
 ) -> Fitted:
-    """Return the fit with this noise, the best one of those from `starts`; for `differences` see `with_noise`."""
+    """Fit with the given noise from each of the `starts`, and return the fit with the lowest cost; for `differences` see
+    `with_noise`."""
     problem = with_noise(problem, noise, differences)
     minima = [minimize(problem, x) for x in starts]
     trial, information, prior, converged = min(minima, key=lambda each: each[0].cost)

@@ -31,7 +31,7 @@ from jaxvib.identification.jammed.start import first_states, with_first_motion
 from jaxvib.identification.problem import Problem, build_problem, damped_modes, has_nonlinear_supports
 from jaxvib.identification.profile_likelihood import QUANTILE, profile_intervals
 from jaxvib.identification.run import MeasuredRun
-from jaxvib.identification.start import track_orders
+from jaxvib.identification.start import fit_amplitudes
 from jaxvib.identification.supports.start import untouched_stops, with_guided_motion
 from jaxvib.identification.torque import fit_with_torques
 from jaxvib.machine.numbers.named import find_number, put_numbers
@@ -50,9 +50,9 @@ _REFITS_NEAR_FIRST_VALUES = 2
 """Largest number of repeated fits that begin with undetermined combinations of parameters moved back towards their first
 values."""
 
-_SAME_NOISE = 1.01
-"""Ratio of the noise of a channel in such a repeated fit to that in the fit before it. Above this ratio the repeated fit has
-ended at another, worse minimum."""
+_MAX_NOISE_RATIO = 1.01
+"""Largest ratio of a channel's noise in such a repeated fit to its noise in the fit before. Above it, the repeated fit has
+ended at a worse minimum."""
 
 _STEP = 1e-4
 """Relative change of a parameter in a difference quotient."""
@@ -69,9 +69,9 @@ class MachineFit(Result):
     - `notes`: sentences with repairs, doubts and advice
     - `scene` with the fitted parameters
     - `names` (k,), `units` (k,) and `estimates` (k,) of the parameters; the interval of an undetermined parameter is unbounded
-    - `scale` (k,), in `units`: the value to which changes of each parameter are relative in `covariance` and `information`. It
-      is the fitted value of a positive parameter; for other parameters it is the modulus of the first value (a typical
-      magnitude if the first value is 0)
+    - `scale` (k,), in `units`: reference value of each parameter. A relative change, as in `covariance` and `information`, is
+      the change divided by this value: the fitted value of a positive parameter; for other parameters the absolute first value
+      (a typical magnitude if the first value is 0)
     - `covariance` (k, k) of the relative errors of the parameters in the determined directions
     - `information` (k + g + 1, k + g + 1): Fisher information about relative changes of the parameters and of the gains, and
       about the angle of the first unbalance
@@ -85,8 +85,8 @@ class MachineFit(Result):
       the loads, their speeds and the angle of the rotor at the first sample; empty without loads
     - `channels`: names of the compared channels of each run, and their `kinds`
     - `noise`: standard deviation of the residuals of each run's channels, SI
-    - `p_value`: smallest p-value of all channels. It is the probability that the vibrations of pure noise at orders of the
-      rotor speed are at least as strong as those of the residuals
+    - `p_value`: smallest p-value of all channels. The p-value of a channel is the probability that pure noise vibrates at
+      orders of the rotor speed at least as strongly as the residuals
     - `time` (n,), s, `readings` (n, C) and `fitted` (n, C), SI: times, readings and values of the fitted model, for each run
       with n samples of C channels; NaN for readings that do not count
     """
@@ -241,8 +241,7 @@ def identify(
     """
     if isinstance(subject, BearingPendulum):
         for name in (name for name, value in {"unknown": unknown, "known": known}.items() if value):
-            problem = "is for a Scene; the unknowns of a BearingPendulum are selected by dry, air and torque"
-            raise InputError(name, problem)
+            raise InputError(name, "is for a Scene; the unknowns of a BearingPendulum are selected by dry, air and torque")
         if not isinstance(records, Record):
             raise InputError(
                 "records", f"is {type(records).__name__}; it must be a Record(time, angle) or come from read_record"
@@ -258,8 +257,8 @@ def identify(
     problem = build_problem(scene, runs, unknown, known or {})
     free, readings = unknown_count(problem), sum(int(np.count_nonzero(mask)) for mask in problem.masks)
     if free >= readings:
-        problem = f"has {free} unknowns, including initial states and offsets of the runs, for {readings} readings"
-        raise InputError("unknown", f"{problem}; record longer runs")
+        text = f"has {free} unknowns, including initial states and offsets of the runs, for {readings} readings"
+        raise InputError("unknown", f"{text}; record longer runs")
     if problem.has_loads:
         problem, first = with_first_motion(problem)
         starts = [first]
@@ -267,9 +266,9 @@ def identify(
         problem, first = with_guided_motion(problem)
         starts = [first]
     else:
-        starts = [np.zeros(problem.unknowns.count), track_orders(problem)]
+        starts = [np.zeros(problem.unknowns.count), fit_amplitudes(problem)]
     fitted = fit_with_torques(problem, starts)
-    fitted = _near_first_values(scene, problem, fitted)
+    fitted = _refit_near_first_values(scene, problem, fitted)
     found = _interpret(scene, problem, fitted)
     if found.status_name == "patterned":
         notes = clock_notes(fitted) or law_notes(fitted, found.scene, runs, unknown, known or {})
@@ -279,7 +278,7 @@ def identify(
     return found
 
 
-def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted:
+def _refit_near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted:
     """Return a fit in which undetermined combinations of parameters have nearly their first values.
 
     A single fit ends at an arbitrary point of a curved valley of equal residuals, and plans of further runs would depend on
@@ -287,65 +286,67 @@ def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted
     """
     first = [float(np.asarray(scene.exciters[k].unbalance, float)) for k in free_unbalances(problem)]
     for _ in range(_REFITS_NEAR_FIRST_VALUES):
-        known = information_of(fitted)
-        axes, number_count = known.undetermined, len(problem.unknowns.numbers)
+        information = information_of(fitted)
+        axes, number_count = information.undetermined, len(problem.unknowns.numbers)
         if not axes.size or not fitted.converged:
             break
-        away = np.concatenate([fitted.x[:number_count], np.log(known.values[number_count:] / first)])
+        deviation = np.concatenate([fitted.x[:number_count], np.log(information.values[number_count:] / first)])
         start = fitted.x[: problem.unknowns.count].copy()
-        start[:number_count] -= (axes @ (axes.T @ away))[:number_count]
-        back = fit_with_torques(problem, [start])
-        noise_ratio = max(float(np.max(new / old)) for new, old in zip(back.noise, fitted.noise, strict=True))
-        if not back.converged or noise_ratio > _SAME_NOISE:
+        start[:number_count] -= (axes @ (axes.T @ deviation))[:number_count]
+        refit = fit_with_torques(problem, [start])
+        noise_ratio = max(float(np.max(new / old)) for new, old in zip(refit.noise, fitted.noise, strict=True))
+        if not refit.converged or noise_ratio > _MAX_NOISE_RATIO:
             break
-        fitted = back
+        fitted = refit
     return fitted
 
 
 def _interpret(scene: Scene, first: Problem, fitted: Fitted) -> MachineFit:
     """Return a fit of the problem `first` with intervals, directions, a status and notes."""
-    problem, known = fitted.problem, information_of(fitted)
-    status, p_value, notes = status_of(fitted, known)
+    problem, information = fitted.problem, information_of(fitted)
+    status, p_value, notes = status_of(fitted, information)
     notes = ([] if status in (FitStatus.found, FitStatus.undetermined) else description_notes(first)) + list(notes)
-    undetermined, by_gain = directions_of(known)
+    undetermined, by_gain = directions_of(information)
     fit_scene = fitted_scene(problem, fitted.x, fitted.linear)
     modes = propagate(
         fit_scene,
-        known.names,
-        known.scale,
-        known.covariance,
-        known.undetermined,
-        known.errors,
+        information.names,
+        information.scale,
+        information.covariance,
+        information.undetermined,
+        information.errors,
         lambda scene: np.concatenate(damped_modes(scene)),
     )
-    logarithmic = known.logarithmic & ~known.vanished
-    spreads = np.sqrt(np.maximum(np.diagonal(known.covariance), 0.0))
-    estimates = list(map(_estimate, known.values, known.scale, logarithmic, spreads, known.determined))
+    logarithmic = information.logarithmic & ~information.vanished
+    spreads = np.sqrt(np.maximum(np.diagonal(information.covariance), 0.0))
+    estimates = list(map(_estimate, information.values, information.scale, logarithmic, spreads, information.determined))
     estimates = [
         each._replace(low=max(each.low, 0.0)) if is_zero else each
-        for each, is_zero in zip(estimates, known.vanished, strict=True)
+        for each, is_zero in zip(estimates, information.vanished, strict=True)
     ]
     has_profiles = resembles(fitted) and not fitted.misfits
-    ends = profile_intervals(fitted, known) if has_profiles else {}
+    ends = profile_intervals(fitted, information) if has_profiles else {}
     for name, (low, high) in ends.items():
-        i = known.names.index(name)
-        estimates[i] = _with_ends(estimates[i], known.scale[i], bool(known.logarithmic[i]), low, high)
-        if not known.vanished[i]:
+        i = information.names.index(name)
+        estimates[i] = _with_ends(estimates[i], information.scale[i], bool(information.logarithmic[i]), low, high)
+        if not information.vanished[i]:
             notes.append(
                 f"the interval of {name} follows from its profile likelihood, because the cost is not quadratic about it"
             )
-    for i in np.flatnonzero(known.vanished & known.determined):
-        unit = find_number(scene, known.names[i], "unknown").unit
-        notes.append(f"{known.names[i]} is not distinguishable from 0; it is at most {estimates[i].high:.3g} {unit}".rstrip())
+    for i in np.flatnonzero(information.vanished & information.determined):
+        unit = find_number(scene, information.names[i], "unknown").unit
+        notes.append(
+            f"{information.names[i]} is not distinguishable from 0; it is at most {estimates[i].high:.3g} {unit}".rstrip()
+        )
     return MachineFit(
         status=status,
         notes=(*problem.notes, *notes, *untouched_stops(fitted), *coverage_notes(fitted, *damped_modes(fit_scene))),
         scene=fit_scene,
-        names=known.names,
-        units=tuple(find_number(scene, name, "unknown").unit for name in known.names),
+        names=information.names,
+        units=tuple(find_number(scene, name, "unknown").unit for name in information.names),
         estimates=tuple(estimates),
-        scale=known.scale,
-        covariance=known.covariance,
+        scale=information.scale,
+        covariance=information.covariance,
         information=combined_information(fitted),
         undetermined=undetermined,
         by_gain=by_gain,
@@ -376,7 +377,8 @@ def fitted_scene(problem: Problem, x: np.ndarray, linear: np.ndarray) -> Scene:
 
 
 def _estimate(value: float, scale: float, logarithmic: bool, spread: float, determined: bool) -> Estimate:
-    """Return an estimate from the standard error `spread` of its logarithm if `logarithmic`, otherwise in units of `scale`."""
+    """Return an estimate with its 95 % interval. `spread` is the standard error of the logarithm of the value if `logarithmic`,
+    otherwise the standard error of the value divided by `scale`."""
     value, error = float(value), float(scale * spread)
     if not determined:
         return Estimate(value, math.inf, 0.0 if logarithmic else -math.inf, math.inf)
@@ -386,8 +388,8 @@ def _estimate(value: float, scale: float, logarithmic: bool, spread: float, dete
 
 
 def _with_ends(estimate: Estimate, scale: float, logarithmic: bool, low: float, high: float) -> Estimate:
-    """Return an estimate whose interval ends at the distances `low` and `high` from its value: logarithms of factors if
-    `logarithmic`, otherwise in units of `scale`."""
+    """Return an estimate whose interval ends at the distances `low` and `high` from its value. A distance is the logarithm of
+    a factor if `logarithmic`, otherwise it is in units of `scale`."""
     if logarithmic:
         return estimate._replace(low=estimate.value * math.exp(low), high=estimate.value * math.exp(high))
     return estimate._replace(low=estimate.value + scale * low, high=estimate.value + scale * high)
@@ -414,9 +416,9 @@ def propagate(
 ) -> list[Estimate]:
     """Return the values (m,) of a function of the scene with their intervals, by central differences.
 
-    **Arguments**: `names` (k,) of the uncertain parameters; `scale` (k,), SI: change of each parameter that counts as the
-    relative change 1; the `covariance` (k, k) of their relative errors; undetermined directions `axes` (k, u) and their
-    `errors` (u,); the `function`, which returns values (m,).
+    **Arguments**: `names` (k,) of the uncertain parameters, and their `scale` (k,), SI, see `MachineFit`; the `covariance`
+    (k, k) of their relative errors; undetermined directions `axes` (k, u) and their `errors` (u,); the `function`, which
+    returns values (m,).
     """
     values, slopes = function(scene), []
     for name, step in zip(names, _STEP * scale, strict=True):

@@ -56,11 +56,12 @@ DELAY_MARGIN = 2
 """Number of steps by which both readings and model are delayed, so that the interpolation has samples on both sides."""
 
 _MAX_DELAY = 450
-"""Largest delay of readings in steps; the longest filter contains it and a whitening filter."""
+"""Largest delay of readings in steps. The longest filter must contain this delay and a whitening filter."""
 
 
 _LEAST_RELATIVE_ERROR = 1e-12
-"""Relative standard error up to which a value counts as exactly known. The square of its inverse is lost in rounding errors."""
+"""Relative standard error up to which a value counts as exactly known. With a smaller one, 1/error^2 would be so large that its
+rounding errors hide the information of the readings."""
 
 
 class Known(NamedTuple):
@@ -124,7 +125,7 @@ class Problem(NamedTuple):
 def read_known(text: Number, number: NamedNumber, field: str) -> Known:
     """Return a known value with its standard error: "95 kg", "95 kg +- 1 %" or "95 kg +- 0.5 kg".
 
-    The number after the sign is the standard error. One of at most 1e-12 of the value counts as 0.
+    The number after the sign is the standard error. An error of at most 1e-12 of the value counts as 0.
     """
     parts = re.split(r"\+-|\+/-|±", text) if isinstance(text, str) else []
     if not isinstance(text, str) or len(parts) < 2:
@@ -153,18 +154,18 @@ def _unbounded(number: NamedNumber) -> NamedNumber:
 def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[str], known: Mapping[str, Number]) -> Problem:
     """Return the least-squares problem of an identification.
 
-    **Raises** `InputError` for unknowns that the scene does not have, for loads, effects and motors that are not included, and
-    for runs without a usable channel, and if JAX computes in single precision.
+    **Raises** `InputError` for unknowns that the scene does not have; for loads, effects and motors that are not included; for
+    runs without a usable channel; and if JAX computes in single precision.
     """
     scene = require_double(scene, "an identification")
     _require_included(scene, runs)
     if isinstance(unknown, str) or not unknown:
         raise InputError("unknown", f"is {quoted(unknown)}; it must be a list of names, such as ['machine.stiffness']")
-    numbers = _singles(scene, unknown)
+    numbers = _single_numbers(scene, unknown)
     known_numbers = {
         number.name: (number, read_known(text, number, f"known[{name!r}]"))
         for name, text in known.items()
-        for number in _singles(scene, [name], "known")
+        for number in _single_numbers(scene, [name], "known")
     }
     fixed = [(number, each) for number, each in known_numbers.values() if each.error == 0.0]
     if fixed:
@@ -186,7 +187,7 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     runs = [_with_reduced_rate(scene, run) for run in runs]
     notes = [note for run in runs for note in run.notes]
     notes += [f"{run.source}: channel {c.name!r} of kind {c.kind} is not used" for run in runs for c in run.of_kind(*UNUSED)]
-    angles = [rotor_angles(_changed(scene, run), run) for run in runs]
+    angles = [rotor_angles(_changed_scene(scene, run), run) for run in runs]
     notes += [note for each in angles for angle in each for note in angle.notes]
     marked = [all(angle.marked for angle in each) for each in angles]
     gains = gain_errors(channel for run in runs for channel in run.of_kind(*MOTIONS))
@@ -261,7 +262,7 @@ def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs:
 
 
 def _with_reduced_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
-    """Return a long run with a lower sampling rate, which its highest frequency still allows; return other runs unchanged.
+    """Return a long run with its sampling rate reduced to what the highest frequency needs; return other runs unchanged.
 
     The natural frequencies are increased by a margin, because they are computed with the first values of the unknowns. Runs
     with a stop or with friction at a support are not changed, because contacts and friction change accelerations faster than
@@ -342,7 +343,7 @@ def _resists_loads(term: Term) -> bool:
     return isinstance(term, ContactFriction) or (isinstance(term, LoadResistance) and term.is_smooth)
 
 
-def _singles(scene: Scene, names: Sequence[str], field: str = "unknown") -> list[NamedNumber]:
+def _single_numbers(scene: Scene, names: Sequence[str], field: str = "unknown") -> list[NamedNumber]:
     """Return the named parameters, each entry of a named array as one parameter. Entries 0 of an array of springs or dampers
     are left out, because these parts are absent."""
     singles: dict[str, NamedNumber] = {}
@@ -365,13 +366,13 @@ def _known_unbalance(
 
 
 def _changes(scene: Scene, run: MeasuredRun) -> tuple[list[NamedNumber], list[str], list[float]]:
-    """Return the changed parameters of a run, the actions and their amounts in SI.
+    """Return the changed parameters of a run, the actions, and their amounts (SI, or a factor).
 
-    **Raises** `InputError` for a change of an unbalance, which is one linear unknown of all runs.
+    **Raises** `InputError` for a change of an unbalance, because all runs share the unknown unbalance.
     """
     numbers, actions, amounts = [], [], []
     for name, change in run.change.items():
-        for number in _singles(scene, [name], "change"):
+        for number in _single_numbers(scene, [name], "change"):
             if number.path[-1] == "unbalance":
                 problem = "is an unbalance, which must be the same in all runs; fit runs with other unbalances on their own"
                 raise InputError(f"{run.source}: change[{name!r}]", problem)
@@ -382,7 +383,7 @@ def _changes(scene: Scene, run: MeasuredRun) -> tuple[list[NamedNumber], list[st
     return numbers, actions, amounts
 
 
-def _changed(scene: Scene, run: MeasuredRun) -> Scene:
+def _changed_scene(scene: Scene, run: MeasuredRun) -> Scene:
     numbers, actions, amounts = _changes(scene, run)
     for number, action, amount in zip(numbers, actions, amounts, strict=True):
         now = np.asarray(number.read(scene))
@@ -392,15 +393,15 @@ def _changed(scene: Scene, run: MeasuredRun) -> Scene:
     return scene
 
 
-def with_angle_errors(problem: Problem, runs: Sequence[bool]) -> Problem:
+def with_angle_errors(problem: Problem, is_included: Sequence[bool]) -> Problem:
     """Return the problem with the errors of the rotor's angle as further unknowns, which have the standard normal distribution.
 
-    **Arguments**: `runs`: True for each run whose errors become unknowns.
+    **Arguments**: `is_included`: for each run, True if its errors become unknowns.
     """
     first, samples, left_out = problem.unknowns.count, list(problem.runs), list(problem.angle_errors)
     count = 0
-    for k, (of_run, rotors, is_included) in enumerate(zip(problem.runs, problem.rotors, runs, strict=True)):
-        if is_included:
+    for k, (of_run, rotors, included) in enumerate(zip(problem.runs, problem.rotors, is_included, strict=True)):
+        if included:
             first_error, errors = first + count, max(rotor.error_count for rotor in rotors)
             drives = tuple(rotor.drive for rotor in rotors)
             samples[k] = dataclasses.replace(of_run, drives=drives, errors=(first_error, errors))
@@ -417,7 +418,10 @@ def with_angle_errors(problem: Problem, runs: Sequence[bool]) -> Problem:
 def _samples(
     scene: Scene, run: MeasuredRun, angles: Sequence[RotorAngle], turn: int | None
 ) -> tuple[Samples, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the samples of a run, the mask, the readings, their bounds, the times and the angles of the rotors."""
+    """Return the samples of a run, and its entries of `masks`, `raw`, `bounds`, `times` and `angles` of `Problem`.
+
+    **Arguments**: `angles` of the rotors; `turn`: see `Samples`.
+    """
     channels = run.of_kind(*MOTIONS)
     if not channels:
         kinds = f"{', '.join(MOTIONS[:-1])} or {MOTIONS[-1]}"
@@ -459,7 +463,7 @@ def _samples(
         changed=tuple(numbers),
         actions=tuple(actions),
         turn=turn,
-        segments=divide(_changed(scene, run), count, step, largest) if is_nonlinear(scene) else (0, 0, 0),
+        segments=divide(_changed_scene(scene, run), count, step, largest) if is_nonlinear(scene) else (0, 0, 0),
         guide=jnp.zeros((state_count(scene, channels), len(channels))) if has_nonlinear_supports(scene) else None,
     )
     return samples, mask, raw, bounds, time, np.stack([angle.at(time) for angle in angles], axis=1)
@@ -574,7 +578,7 @@ def _delay_taps(delay: float) -> tuple[np.ndarray, np.ndarray]:
 
 @cached
 def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
-    """Return the matrices (nd, nd) of mass, damping and stiffness."""
+    """Return the matrices (nd, nd) of mass, damping and stiffness of the linear model."""
     model = linear_model(scene)
     return model.mass, model.carrier.damping, model.carrier.stiffness
 

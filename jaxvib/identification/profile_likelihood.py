@@ -23,7 +23,7 @@ from jaxvib.identification.fit import (
     nonlinear_differences,
     prior_equations,
     project,
-    solved,
+    solve_scaled,
 )
 from jaxvib.identification.problem import Known, Problem
 
@@ -83,9 +83,9 @@ class _Profile:
     def rise(self, distance: float, is_exact: bool) -> float:
         """Return the rise of the cost at a `distance` in standard errors. If `is_exact`, all other unknowns are fitted.
         Otherwise only the linear ones are fitted, and the others follow from the quadratic form. A nonlinear motion has no
-        linear unknown; see `_in_valley`."""
+        linear unknown; see `_descend_into_valley`."""
         target, p = self.center + self.shift(distance), self.fitted.x.size
-        problem, known_cost = self._fixed(target)
+        problem, known_cost = self._fix_parameter(target)
         change = distance * self.spread * self.slopes
         x = self.fitted.x + change[:p]
         if self.is_vanished:
@@ -93,15 +93,14 @@ class _Profile:
         if problem.linear is not None:
             linear, pair = problem.linear + change[p:], complex(*problem.linear[:2]) * cmath.exp(complex(*change[p : p + 2]))
             linear[:2] = pair.real, pair.imag
-            x, linear = self._in_valley(problem, x, linear)
+            x, linear = self._descend_into_valley(problem, x, linear)
             problem = problem._replace(linear=linear)
         trial = minimize(problem, x)[0] if is_exact else project(problem, x)
         return trial.cost + known_cost - self.floor
 
-    def _in_valley(self, problem: Problem, x: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the unknowns of a nonlinear motion after a few steps of the Gauss-Newton method with the derivatives
-        at the fit. The valley of the cost is curved, and the unknowns of the quadratic form are outside it at a large
-        distance."""
+    def _descend_into_valley(self, problem: Problem, x: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the unknowns of a nonlinear motion after a few steps of the Gauss-Newton method with the derivatives at the
+        fit. The valley of the cost is curved: far from the fit, the unknowns of the quadratic form are outside the valley."""
         assert self.columns is not None and self.data is not None
         p, best, last = x.size, (x, linear), math.inf
         for _ in range(_VALLEY_STEPS):
@@ -111,11 +110,11 @@ class _Profile:
                 break
             best, last = (x, linear), cost
             prior, gradient = prior_equations(problem, x, linear)
-            step = solved(self.data + prior, self.columns.T @ differences + gradient)
+            step = solve_scaled(self.data + prior, self.columns.T @ differences + gradient)
             x, linear = x + step[:p], linear + step[p:]
         return best
 
-    def _fixed(self, target: float) -> tuple[Problem, float]:
+    def _fix_parameter(self, target: float) -> tuple[Problem, float]:
         """Return the problem with the parameter fixed at `target`, and the cost of the difference between
         `target` and the known value of the parameter."""
         problem, relative_error = self.fitted.problem, _TIGHT_ERROR * min(self.spread, 1.0)
@@ -156,14 +155,14 @@ class _Profile:
         return math.inf
 
 
-def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[float, float]]:
+def profile_intervals(fitted: Fitted, information: Information) -> Mapping[str, tuple[float, float]]:
     """Return, for each parameter for which the cost is not a quadratic function, the distances of both ends of its interval
     from the fitted value, by name. A distance is a change of the parameter's entry of x, or of the logarithm of an unbalance.
 
     The lower distance of a parameter that is not distinguishable from 0 is minus infinity. Undetermined parameters are left
     out.
 
-    **Arguments**: `fitted`, and `known`: the `Information` about its parameters.
+    **Arguments**: `fitted`, and the `information` about its parameters.
     """
     problem, p, number_count = fitted.problem, fitted.x.size, len(fitted.problem.unknowns.numbers)
     data, prior, sizes = in_polar_unbalances(fitted)
@@ -174,16 +173,16 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
     if problem.linear is not None:
         columns = np.concatenate(nonlinear_columns(problem, fitted.x, problem.linear))[:, :-1]
         derivatives = columns, columns.T @ columns
-    for i, name in enumerate(known.names):
-        if not known.determined[i]:
+    for i, name in enumerate(information.names):
+        if not information.determined[i]:
             continue
-        is_unbalance, is_vanished = i >= number_count, bool(known.vanished[i])
+        is_unbalance, is_vanished = i >= number_count, bool(information.vanished[i])
         entry = p + i - number_count if is_unbalance else i
         index = free_exciters[i - number_count] if is_unbalance else i
         center = math.log(sizes[index]) if is_unbalance else float(fitted.x[i])
         slopes, variance = elimination(data + prior, indices[[entry]])[:, 0], covariance[entry, entry]
-        if is_vanished:  # the information about it may be below the accuracy of the pseudoinverse
-            slopes, variance = np.zeros(len(data)), known.covariance[i, i]
+        if is_vanished:  # the information about this parameter may be below the accuracy of the pseudoinverse
+            slopes, variance = np.zeros(len(data)), information.covariance[i, i]
         spread = math.sqrt(variance)
         profile = _Profile(fitted, index, is_unbalance, center, spread, slopes, floor, is_vanished, *derivatives)
         if is_vanished:

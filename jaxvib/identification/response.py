@@ -58,7 +58,7 @@ class Unknowns(eqx.Module):
       parameters
     - `gains`: names of the channels whose gains are unknown; each gain is exp(x)
     - `turns`: number of runs whose rotor angle has an unknown zero; x is this zero, rad
-    - `errors`: number of unknown errors of rotor angles; x is in standard errors
+    - `errors`: number of unknown errors of rotor angles; x is the error divided by its standard error
     """
 
     numbers: tuple[NamedNumber, ...] = eqx.field(static=True)
@@ -101,11 +101,11 @@ class Samples(eqx.Module):
     - `step` h, s
     - `changed`: parameters of the scene that differ in this run; `actions` ("add", "scale" or "set") and `amounts` of the
       changes
-    - `channels` that are compared; `turn`: index of the run's unknown zero of the angle, or None
-    - `errors`: index of the first error of the rotor's angle among the unknowns, and their number
-    - `segments` in which the motion of loads or on nonlinear supports is integrated: their number, samples of each, steps per
-      sample; (0, 0, 0) for a linear response
-    - `guide` (ns, C) of a motion on nonlinear supports: change of the state at a sample per difference between recorded and
+    - `channels` that are compared; `turn`: index of the run's unknown zero of the rotor's angle; None for a known zero
+    - `errors` of the rotor's angle: index of the first one among the unknowns, and their number
+    - `segments` in which a nonlinear motion (with loads, or on nonlinear supports) is integrated: their number, samples of
+      each, steps per sample; (0, 0, 0) for a linear response
+    - `guide` (ns, C), for nonlinear supports only: change of the state at a sample per difference between recorded and
       computed readings; otherwise None
     """
 
@@ -289,7 +289,7 @@ def _filtered(taps: Array, before: Array, values: Array) -> tuple[Array, Array]:
     return out, every[n:]
 
 
-def _built(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> _Steps:
+def _build_steps(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> _Steps:
     """Return the steps of a run, with the gains of its channels, at the unknowns `x`."""
     scene_of_run = samples.scene(unknowns.scene(scene, x))
     turn = 0.0 if samples.turn is None else x[unknowns.first.shape[0] + len(unknowns.gains) + samples.turn]
@@ -350,7 +350,7 @@ def _linear_columns(steps: _Steps, samples: Samples):
 def linear_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> Array:
     """Return Z^T Z at the unknowns `x`, with the weighted columns Z = (derivatives of the readings with respect to the linear
     unknowns of the run, readings)."""
-    first, columns = _linear_columns(_built(unknowns, samples, scene, x), samples)
+    first, columns = _linear_columns(_build_steps(unknowns, samples, scene, x), samples)
 
     def segment(carry, part):
         (state, total), (k, readings, weights) = carry, part
@@ -370,19 +370,19 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
 
     **Arguments**: `linear`: state at the first sample, components of the unbalances, offsets.
     """
-    steps = _built(unknowns, samples, scene, x)
+    steps = _build_steps(unknowns, samples, scene, x)
     first, columns = _linear_columns(steps, samples)
     _, unbalance, _ = _split(steps, linear)
     first_error, errors = samples.errors
-    moved = x.shape[0] - unknowns.errors
+    tangent_count = x.shape[0] - unknowns.errors
 
     def tangent(direction: Array) -> _Steps:
-        return jax.jvp(lambda at: _built(unknowns, samples, scene, at), (x,), (direction,))[1]
+        return jax.jvp(lambda at: _build_steps(unknowns, samples, scene, at), (x,), (direction,))[1]
 
-    changes = jax.vmap(tangent)(jnp.eye(x.shape[0])[:moved])
+    changes = jax.vmap(tangent)(jnp.eye(x.shape[0])[:tangent_count])
 
     def segment(carry, part):
-        (linear_state, (moving, turning, before), total), (k, readings, weights) = carry, part
+        (linear_state, (tangent_states, error_states, before), total), (k, readings, weights) = carry, part
         force, force_changes = _forces(samples, scene, x, k)
         at = linear_state[0] @ linear[: linear_state[0].shape[1]]
         linear_state, found = columns(linear_state, force)
@@ -390,24 +390,24 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
         def along(change: _Steps, start: Array) -> tuple[Array, Array]:
             return jax.jvp(lambda steps, start: _response(steps, force, start, unbalance), (steps, at), (change, start))[1]
 
-        slopes, moving = jax.vmap(along)(changes, moving)
+        slopes, tangent_states = jax.vmap(along)(changes, tangent_states)
         if errors:
-            by_error, turning = jax.vmap(lambda change, start: _response(steps, change, start, unbalance))(
-                force_changes, turning
+            by_error, error_states = jax.vmap(lambda change, start: _response(steps, change, start, unbalance))(
+                force_changes, error_states
             )
-            others = jnp.zeros((unknowns.errors, *slopes.shape[1:]))
-            slopes = jnp.concatenate([slopes, others.at[first_error - moved : first_error - moved + errors].set(by_error)])
+            others, place = jnp.zeros((unknowns.errors, *slopes.shape[1:])), first_error - tangent_count
+            slopes = jnp.concatenate([slopes, others.at[place : place + errors].set(by_error)])
         elif unknowns.errors:
             slopes = jnp.concatenate([slopes, jnp.zeros((unknowns.errors, *slopes.shape[1:]))])
         slopes, after = _filtered(samples.taps, before, jnp.moveaxis(slopes, 0, 2))
-        left = readings - found @ linear
-        z = jnp.concatenate([slopes, found, left[:, :, None]], axis=2) * weights[:, :, None]
+        difference = readings - found @ linear
+        z = jnp.concatenate([slopes, found, difference[:, :, None]], axis=2) * weights[:, :, None]
         z = z.reshape(-1, z.shape[2])
-        return (linear_state, (moving, turning, after), total + z.T @ z), None
+        return (linear_state, (tangent_states, error_states, after), total + z.T @ z), None
 
     count, size, states = x.shape[0], x.shape[0] + linear.shape[0] + 1, steps.power.shape[0]
     before = jnp.zeros((samples.taps.shape[0] - 1, len(samples.channels), count))
-    start = (first, (jnp.zeros((moved, states)), jnp.zeros((errors, states)), before), jnp.zeros((size, size)))
+    start = (first, (jnp.zeros((tangent_count, states)), jnp.zeros((errors, states)), before), jnp.zeros((size, size)))
     # Reverse derivatives compute each segment again and keep only the states between the segments.
     parts = jnp.arange(samples.readings.shape[0]), samples.readings, samples.weights
     (_, _, total), _ = jax.lax.scan(jax.checkpoint(segment), start, parts)
@@ -417,7 +417,7 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
 @cached
 def model_readings(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, linear: Array) -> Array:
     """Return the readings (N n, C) of the model with its offsets, without the filter."""
-    steps = _built(unknowns, samples, scene, x)
+    steps = _build_steps(unknowns, samples, scene, x)
     return _all_readings(steps, samples, scene, x, linear) + _split(steps, linear)[2][None]
 
 
@@ -425,7 +425,7 @@ def model_readings(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array,
 def linear_steps(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> tuple[Array, Array]:
     """Return the matrices of a step of the free motion (ns, ns) and of the readings (C, ns), for states whose displacements are
     in m and velocities in m/s."""
-    steps, nd = _built(unknowns, samples, scene, x), len(scene.machine.structure().coordinates)
+    steps, nd = _build_steps(unknowns, samples, scene, x), len(scene.machine.structure().coordinates)
     unit = jnp.where(jnp.arange(steps.power.shape[0]) < nd, steps.scale, 1.0)
     return steps.power * unit[None] / unit[:, None], steps.outputs * unit[None]
 
@@ -433,7 +433,7 @@ def linear_steps(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -
 @cached
 def model_states(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, linear: Array) -> Array:
     """Return the displacements and velocities (N n, 2 nd) of the coordinates."""
-    steps, nd = _built(unknowns, samples, scene, x), len(scene.machine.structure().coordinates)
+    steps, nd = _build_steps(unknowns, samples, scene, x), len(scene.machine.structure().coordinates)
     outputs = jnp.eye(2 * nd, steps.power.shape[0]) / jnp.where(jnp.arange(2 * nd) < nd, steps.scale, 1.0)[:, None]
     through = jnp.zeros((2 * nd, *steps.through.shape[1:]))
     return _all_readings(steps._replace(outputs=outputs, through=through), samples, scene, x, linear)
@@ -452,6 +452,7 @@ def _all_readings(steps: _Steps, samples: Samples, scene: Scene, x: Array, linea
 
 
 def _split(steps: _Steps, linear: Array) -> tuple[Array, Array, Array]:
+    """Return the state (ns,) at the first sample, the unbalances (E, 2) and the offsets (C,)."""
     ns, exciters = steps.power.shape[0], steps.inputs.shape[2]
     ends = ns + 2 * exciters
     return linear[:ns], linear[ns:ends].reshape(exciters, 2), linear[ends:]

@@ -23,7 +23,7 @@ from jaxvib.units import Number, number
 _MAX_READING = 1e100
 """Largest absolute reading, SI units. Squares of larger readings overflow."""
 
-_FULL = 0.999
+_CLIPPED_SHARE = 0.999
 """Share of the range of a sensor above which a reading counts as clipped."""
 
 
@@ -163,7 +163,8 @@ class MeasuredRun(Readable):
 
     @property
     def rotor_channel(self) -> Channel | None:
-        """Channel of the rotor: pulses, else an angle or a speed; None without such a channel."""
+        """Channel of the rotor: its pulses if they are recorded, otherwise its angle, otherwise its speed; None without any of
+        them."""
         return min(self.of_kind(*ROTOR_KINDS), key=lambda channel: ROTOR_KINDS.index(channel.kind), default=None)
 
     @validated
@@ -176,10 +177,10 @@ class MeasuredRun(Readable):
         return 1.0 / float(np.median(np.diff(self.times[name])))
 
     def rotor_speed(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return times, s, and the rotor speed, rad/s, from pulses, else from angle or speed; None without such a
-        channel.
+        """Return times, s, and the rotor speed, rad/s, from the `rotor_channel`; None without such a channel.
 
-        The speed from pulses is the derivative of a smooth angle, fitted to the pulses, at the middle between two pulses.
+        For pulses, the speed is the derivative of a smooth angle that is fitted to them. The times are the middles between
+        two pulses.
         """
         channel = self.rotor_channel
         if channel is None:
@@ -290,7 +291,7 @@ def _read_channel(
     notes = turn_notes + notes + spike_notes
     low, high = (-np.inf, np.inf) if channel.kind in ("speed", "angle") else clipped_at(value)
     if channel.range is not None:
-        low, high = max(low, -_FULL * channel.range), min(high, _FULL * channel.range)
+        low, high = max(low, -_CLIPPED_SHARE * channel.range), min(high, _CLIPPED_SHARE * channel.range)
     clipped = (value <= low) | (value >= high)
     if np.any(clipped):
         count, first = int(np.count_nonzero(clipped)), time[np.argmax(clipped)]

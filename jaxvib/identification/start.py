@@ -21,7 +21,7 @@ from jaxvib.identification.response import Samples, Unknowns, sensor_rows
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 
-_WINDOWS = 128
+_MAX_SEGMENTS = 128
 """Largest number of segments of a run. A segment has whole turns and gives one amplitude of each channel."""
 
 _PRIOR_WEIGHT = 0.05
@@ -31,19 +31,21 @@ _PRIOR_WEIGHT = 0.05
 def amplitudes(
     readings: np.ndarray, mask: np.ndarray, angle: np.ndarray, step: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the speeds (W,), rad/s, in W segments, the amplitudes (W, C) of the vibrations of C channels at the
-    rotor speed, and their weights (W, C) between 0 and 1.
+    """Return, for N segments of a run, the rotor speeds (N,), rad/s, the amplitudes (N, C) of the vibrations of C channels at
+    the rotor speed, and the weights (N, C) of these amplitudes, between 0 and 1.
 
-    The readings of each segment of whole turns are fitted by c + a cos(angle) + b sin(angle). The weight is small if the
-    amplitude is not above its standard error.
+    The readings of each segment of whole turns are fitted by c + a cos(angle) + b sin(angle). The weight of an amplitude is
+    small if the amplitude is not above its standard error.
+
+    **Arguments**: `readings` (n, C); `mask` (n, C): True for readings that count; `angle` (n,) of the rotor, rad; `step`, s.
 
     >>> angle = np.linspace(0.0, 300.0, 20000)
     >>> speed, size, weight = amplitudes(2.0 * np.cos(angle)[:, None], np.ones((20000, 1), bool), angle, 1e-3)
-    >>> bool(np.allclose(size, 2.0)), bool(np.all(weight > 0.99)), len(speed) == _WINDOWS
+    >>> bool(np.allclose(size, 2.0)), bool(np.all(weight > 0.99)), len(speed) == _MAX_SEGMENTS
     (True, True, False)
     """
     turns = np.abs(angle - angle[0]) / (2.0 * np.pi)
-    turns_of_segment = max(1.0, np.ceil(turns[-1] / _WINDOWS))
+    turns_of_segment = max(1.0, np.ceil(turns[-1] / _MAX_SEGMENTS))
     cuts = np.searchsorted(turns, np.arange(0.0, turns[-1], turns_of_segment))
     speeds, sizes, weights = [], [], []
     for begin, end in itertools.pairwise(cuts):
@@ -67,8 +69,8 @@ def amplitudes(
     return np.abs(np.array(speeds)), np.array(sizes), np.array(weights)
 
 
-def _steady(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, speeds: Array) -> Array:
-    """Return the amplitudes (W, C) of the steady readings per unit of the unbalance."""
+def _steady_amplitudes(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, speeds: Array) -> Array:
+    """Return the amplitudes (N, C) of the steady readings at the rotor `speeds` (N,), per unit of the unbalance."""
     scene_of_run = samples.scene(unknowns.scene(scene, x))
     model = linear_model(scene_of_run)
     mount, exciter = model.mounts[0], scene_of_run.exciters[0]
@@ -76,23 +78,29 @@ def _steady(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, speeds
     rows = sensor_rows(scene_of_run, model.carrier, samples.channels)
 
     def at(w: Array) -> Array:
-        moved = jnp.linalg.solve(model.dynamic_stiffness(w), w**2 * direction)
-        return jnp.abs((rows[:, 0] + 1j * w * rows[:, 1] - w**2 * rows[:, 2]) @ moved)
+        displacement = jnp.linalg.solve(model.dynamic_stiffness(w), w**2 * direction)
+        return jnp.abs((rows[:, 0] + 1j * w * rows[:, 1] - w**2 * rows[:, 2]) @ displacement)
 
     return jax.vmap(at)(speeds)
 
 
 @cached
-def _track(unknowns: Unknowns, runs: tuple[Samples, ...], scene: Scene, data: tuple[tuple[Array, Array, Array], ...]) -> Array:
-    """Return the unknowns (p,) with which the steady amplitudes over speed fit those of the runs best. A common factor of all
-    amplitudes of a run is free."""
+def _fit_amplitudes(
+    unknowns: Unknowns, runs: tuple[Samples, ...], scene: Scene, data: tuple[tuple[Array, Array, Array], ...]
+) -> Array:
+    """Return the unknowns (p,) for which the steady amplitudes over speed agree best with those of the runs. A common factor of
+    all amplitudes of a run is free.
+
+    **Arguments**: `data`: for each run, speeds, amplitudes and weights, see `amplitudes`.
+    """
 
     def residual(x: Array, _: None) -> Array:
         parts = [_PRIOR_WEIGHT * x]
         for samples, (speeds, sizes, weights) in zip(runs, data, strict=True):
-            away = jnp.log(jnp.maximum(sizes, 1e-300)) - jnp.log(_steady(unknowns, samples, scene, x, speeds))
-            mean = jnp.sum(weights * away) / jnp.sum(weights)
-            parts.append((jnp.sqrt(weights) * jnp.where(weights > 0.0, away - mean, 0.0)).ravel())
+            steady = _steady_amplitudes(unknowns, samples, scene, x, speeds)
+            log_ratio = jnp.log(jnp.maximum(sizes, 1e-300)) - jnp.log(steady)
+            mean = jnp.sum(weights * log_ratio) / jnp.sum(weights)
+            parts.append((jnp.sqrt(weights) * jnp.where(weights > 0.0, log_ratio - mean, 0.0)).ravel())
         return jnp.concatenate(parts)
 
     solver = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-4)
@@ -100,8 +108,8 @@ def _track(unknowns: Unknowns, runs: tuple[Samples, ...], scene: Scene, data: tu
     return optx.least_squares(residual, solver, start, options={"jac": "fwd"}, max_steps=64, throw=False).value
 
 
-def track_orders(problem: Problem) -> np.ndarray:
-    """Return the values x (p,) of the unknowns that follow from the amplitudes of the runs, as the start of a fit.
+def fit_amplitudes(problem: Problem) -> np.ndarray:
+    """Fit the steady amplitudes of the machine to those of the runs, and return x (p,), from which a fit can begin.
 
     In four cases x is 0, that is, the unknowns have the values of the scene: for several unbalances, without unknown parameters
     of the scene, for runs with too few turns, and if the fit fails.
@@ -122,5 +130,5 @@ def track_orders(problem: Problem) -> np.ndarray:
                 for each, pad in ((speeds, speeds[-1:]), (sizes, sizes[-1:]), (weights, 0.0 * weights[-1:]))
             )
         )
-    found = np.asarray(_track(problem.unknowns, problem.runs, problem.scene, tuple(data)))
+    found = np.asarray(_fit_amplitudes(problem.unknowns, problem.runs, problem.scene, tuple(data)))
     return np.clip(found, -2.0, 2.0) if np.all(np.isfinite(found)) else zero

@@ -68,8 +68,9 @@ the rotor."""
 _FINE_ANGLE = 0.2
 """Largest angle, rad, between the times at which the torque of the vibration is computed."""
 
-_ACCURACY = 1e-5
-"""Error of the predicted angle, rad: smallest noise of the rotor's angle in the fit, even if the pulses scatter less."""
+_ANGLE_ACCURACY = 1e-5
+"""Error of the predicted angle, rad. The noise of the rotor's angle in the fit is at least this error, even if the pulses
+scatter less."""
 
 _JOINT_PASSES = 2
 """Number of fits of vibrations and rotor together: with the scatter of the pulses, then with the noise of the first fit.
@@ -79,19 +80,26 @@ drift, and with it the information on the motor."""
 
 @cached
 def _deviations(
-    unknowns: Unknowns, samples: Samples, rotor: RotorSamples, scene: Scene, x: Array, part: Array, rotor_unknowns: Array
+    unknowns: Unknowns,
+    samples: Samples,
+    rotor: RotorSamples,
+    scene: Scene,
+    x: Array,
+    motion_unknowns: Array,
+    rotor_unknowns: Array,
 ) -> tuple[Array, Array]:
-    """Return the deviations (n,) of the predicted rotor from its samples, in units of their spread, and their derivatives.
+    """Return the deviations (n,) of the predicted angle or speed of the rotor from its samples, in units of their spread, and
+    the derivatives of these deviations.
 
-    **Arguments**: `samples` of the accelerations of the rotor; `x`: see `Unknowns`; `part`: state at the first sample and
-    components of the unbalance; `rotor_unknowns`: first angle, first speed, common delay of the pulses in standard errors,
-    offsets of the marks.
+    **Arguments**: `samples` of the accelerations of the rotor; `x`: see `Unknowns`; `motion_unknowns`: state at the first
+    sample and components of the unbalance; `rotor_unknowns`: first angle, first speed, common delay of the pulses in standard
+    errors, offsets of the marks.
     """
     nonlinear_count = x.shape[0] - unknowns.errors
     delay_error = rotor.scatter if rotor.kind == "pulses" else 0.0
 
     def deviations(free: Array) -> Array:
-        values, linear, first = jnp.split(free, [nonlinear_count, nonlinear_count + part.shape[0]])
+        values, linear, first = jnp.split(free, [nonlinear_count, nonlinear_count + motion_unknowns.shape[0]])
         now = x.at[:nonlinear_count].set(values)
         at, angle, speed, _ = _predicted(unknowns, samples, scene, now, linear, first[:2])
         width = at[1] - at[0]
@@ -107,24 +115,27 @@ def _deviations(
             predicted = angle[k] + u * (begin + u * (quadratic + u * cubic)) + offsets[rotor.marks]
         return (predicted - rotor.value) / rotor.spread
 
-    free = jnp.concatenate([x[:nonlinear_count], part, rotor_unknowns])
+    free = jnp.concatenate([x[:nonlinear_count], motion_unknowns, rotor_unknowns])
     return deviations(free), jax.jacfwd(deviations)(free)
 
 
 @cached
 def _predicted(
-    unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, part: Array, first: Array
+    unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, motion_unknowns: Array, first: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return times (K,), and the predicted angles, speeds and accelerations (K,) of the rotor."""
-    accelerations = model_readings(unknowns, samples, scene, x, jnp.concatenate([part, jnp.zeros(2)]))
+    """Return times (K,), s, and the predicted angles, speeds and accelerations (K,) of the rotor.
+
+    **Arguments**: `first` (2,): angle and speed at the first sample; for the others see `_deviations`.
+    """
+    accelerations = model_readings(unknowns, samples, scene, x, jnp.concatenate([motion_unknowns, jnp.zeros(2)]))
     exciter = samples.scene(unknowns.scene(scene, x)).exciters[0]
     times = samples.begin + samples.step * jnp.arange(accelerations.shape[0])
-    turned = jax.vmap(lambda t: samples.drives[0].rotor_angle(t, None))(jnp.minimum(times, samples.end))
+    rotor_angle = jax.vmap(lambda t: samples.drives[0].rotor_angle(t, None))(jnp.minimum(times, samples.end))
     turn = 0.0 if samples.turn is None else x[unknowns.first.shape[0] + len(unknowns.gains) + samples.turn]
-    turning = 1j * exciter.direction
-    unbalance = (part[-2] + 1j * part[-1]) * jnp.exp(1j * turn + turning * turned)
-    weight = total_gravity((*scene.effects, *exciter.effects)).get(1, 0.0)
-    braking = jnp.real(jnp.conj(turning * unbalance) * (accelerations[:, 0] + 1j * (accelerations[:, 1] + weight)))
+    quarter_turn = 1j * exciter.direction
+    unbalance = (motion_unknowns[-2] + 1j * motion_unknowns[-1]) * jnp.exp(1j * turn + quarter_turn * rotor_angle)
+    gravity = total_gravity((*scene.effects, *exciter.effects)).get(1, 0.0)
+    braking = jnp.real(jnp.conj(quarter_turn * unbalance) * (accelerations[:, 0] + 1j * (accelerations[:, 1] + gravity)))
 
     def rates(t: Array, speed: Array, brake: Array) -> Array:
         motor = exciter.drive.torque_and_inertia(t, speed)
@@ -167,7 +178,7 @@ class _Run(NamedTuple):
 
     **Attributes**: `samples` with smaller steps; `rotor`: samples of the rotor; `indices` (f,) of the run's unknowns
     among all unknowns; `rotor_count`: number of unknowns of this run's rotor (first angle, first speed, delay, offsets of all
-    marks but the first); `noise` of the rotor.
+    marks but the first); `noise` of the rotor's samples.
     """
 
     samples: Samples
@@ -186,7 +197,7 @@ class _Trial(NamedTuple):
 
 
 def fit_with_torques(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
-    """Return the fit of a problem from the unknowns `starts`.
+    """Fit a problem from each of the `starts` (values of x), and return the fit with the lowest cost.
 
     If a parameter of a motor is unknown, the vibrations and the rotor speed are fitted together. The fit is then repeated
     with the predicted angle of the rotor, which contains its ripple within each turn.
@@ -206,7 +217,7 @@ def fit_with_torques(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
 
 
 def _with_torque_balance(fitted: Fitted, motor: list[int]) -> tuple[Fitted, list[RecordedDrive]]:
-    """Return the fit of vibrations and rotors together, and the predicted angle of the rotor in each run.
+    """Return the fit of vibrations and rotors together, and the drive that follows the predicted angle in each run.
 
     **Arguments**: `fitted` to the vibrations alone; indices of the parameters of the `motor` in x.
     """
@@ -247,7 +258,7 @@ def _runs(fitted: Fitted) -> tuple[list[_Run], np.ndarray]:
             step=samples.step / factor, channels=_AXES, errors=(0, 0),
         )  # fmt: skip
         used = (rotor.time >= samples.begin) & (rotor.time <= samples.end)
-        scatter = jnp.asarray(max(rotor.scatter, _ACCURACY / float(np.max(rotor.spread))))
+        scatter = jnp.asarray(max(rotor.scatter, _ANGLE_ACCURACY / float(np.max(rotor.spread))))
         sampled = {name: jnp.asarray(getattr(rotor, name)[used]) for name in ("time", "value", "marks", "spread")}
         rotor = rotor._replace(**sampled, scatter=scatter)
         of_rotor = [drive.angle_at(samples.begin), drive.speed_at(samples.begin), *np.zeros(1 + int(np.max(rotor.marks)))]
@@ -275,15 +286,15 @@ def _deviations_of(problem: Problem, run: _Run, y: np.ndarray) -> list[np.ndarra
 
 def _predicted_drive(problem: Problem, run: _Run, rotor: RotorAngle, y: np.ndarray) -> RecordedDrive:
     """Return the drive that follows the predicted angle of a run, with the errors of the recorded angle."""
-    x, part, of_rotor = _parts(problem, run, y)
-    time, *found = map(np.asarray, _predicted(problem.unknowns, run.samples, problem.scene, x, part, of_rotor[:2]))
+    x, motion_unknowns, of_rotor = _parts(problem, run, y)
+    time, *found = map(np.asarray, _predicted(problem.unknowns, run.samples, problem.scene, x, motion_unknowns, of_rotor[:2]))
     return recorded_drive(time, [np.column_stack([each, rotor.spline(time, k)[:, 1:]]) for k, each in enumerate(found)])
 
 
 def _noise(run: _Run, deviations: np.ndarray) -> Noise:
     """Return the noise of the samples of a rotor, at least the accuracy of the prediction."""
     noise = noise_of(deviations)
-    return noise._replace(deviation=max(noise.deviation, _ACCURACY / float(np.max(run.rotor.spread))))
+    return noise._replace(deviation=max(noise.deviation, _ANGLE_ACCURACY / float(np.max(run.rotor.spread))))
 
 
 def _minimum(problem: Problem, runs: list[_Run], y: np.ndarray, free: np.ndarray) -> tuple[_Trial, bool]:

@@ -10,7 +10,7 @@ import jaxvib as jv
 from jaxvib.identification.fit import Fitted
 from jaxvib.identification.further_runs import predict
 from jaxvib.identification.further_runs.predict import PredictionStatus, RunPrediction
-from jaxvib.identification.identify import _estimate, _gains, _near_first_values, _with_ends, fitted_scene, propagate
+from jaxvib.identification.identify import _estimate, _gains, _refit_near_first_values, _with_ends, fitted_scene, propagate
 from jaxvib.identification.problem import Known
 from jaxvib.identification.response import Unknowns
 from jaxvib.machine.numbers.named import find_number
@@ -175,21 +175,21 @@ def test_undetermined_combinations_return_to_the_first_values(monkeypatch):
 
     monkeypatch.setattr(sys.modules[propagate.__module__], "fit_with_torques", fit_with_torques)
     monkeypatch.setattr(sys.modules[propagate.__module__], "information_of", information_of)
-    found = _near_first_values(scene_of(2), problem, fitted_at(0.3, 0.5))
+    found = _refit_near_first_values(scene_of(2), problem, fitted_at(0.3, 0.5))
     np.testing.assert_allclose(starts[0], [0.3 - 0.4])
     np.testing.assert_allclose(starts[1], [-0.1 - 0.5 * (-0.1 + 0.5)])
     assert len(starts) == 2 and found.x[0] == starts[1][0]
     starts.clear()
     lost = fitted_at(0.3, 0.5, converged=False)
-    assert _near_first_values(scene_of(2), problem, lost) is lost and starts == []
+    assert _refit_near_first_values(scene_of(2), problem, lost) is lost and starts == []
     monkeypatch.setattr(sys.modules[propagate.__module__], "fit_with_torques", lambda *_: lost)
     good = fitted_at(0.3, 0.5)
-    assert _near_first_values(scene_of(2), problem, good) is good
+    assert _refit_near_first_values(scene_of(2), problem, good) is good
     worse = fitted_at(-0.1, 0.0, noise=1.02e-3)
     monkeypatch.setattr(sys.modules[propagate.__module__], "fit_with_torques", lambda *_: worse)
-    assert _near_first_values(scene_of(2), problem, good) is good
+    assert _refit_near_first_values(scene_of(2), problem, good) is good
     axes = np.zeros((2, 0))
-    assert _near_first_values(scene_of(2), problem, good) is good
+    assert _refit_near_first_values(scene_of(2), problem, good) is good
 
 
 def test_prediction_in_words():

@@ -5,7 +5,7 @@ import pytest
 from run_ups_by_scipy import ending_ramp, pulse_times
 
 import jaxvib as jv
-from jaxvib.identification.angle import _measured
+from jaxvib.identification.angle import _angle_of_channel
 
 RATE = 4.0
 """Acceleration of the ramps, rad/s^2; they begin at 10 rad/s."""
@@ -18,7 +18,9 @@ def angle_at(t):
 def measured(kind, times, values, **options):
     channel = jv.Channel("rotor", kind, **options)
     none = np.zeros(times.size, bool)
-    return _measured(jv.MeasuredRun((channel,), {"rotor": times}, {"rotor": values}, {"rotor": none}, {}, (), "run"), channel)
+    return _angle_of_channel(
+        jv.MeasuredRun((channel,), {"rotor": times}, {"rotor": values}, {"rotor": none}, {}, (), "run"), channel
+    )
 
 
 def pulses(per_turn, until=20.0):

@@ -18,7 +18,7 @@ from jaxvib.identification.fit import minimize, project
 from jaxvib.identification.problem import Problem, channel_sizes, with_noise
 from jaxvib.identification.records.agreement import OTHER_UNITS
 from jaxvib.identification.records.channel import UNITS, Channel
-from jaxvib.identification.start import track_orders
+from jaxvib.identification.start import fit_amplitudes
 from jaxvib.numerics.noise import Noise
 from jaxvib.units.columns import unit_factor
 
@@ -103,7 +103,7 @@ def _weighted(problem: Problem) -> Problem:
 
 
 def _starts(problem: Problem) -> list[np.ndarray]:
-    return [np.zeros(problem.unknowns.count), track_orders(problem)]
+    return [np.zeros(problem.unknowns.count), fit_amplitudes(problem)]
 
 
 def _first_cost(problem: Problem) -> float:

@@ -33,7 +33,7 @@ from jaxvib.equations.state import State
 from jaxvib.identification.angle import RecordedDrive
 from jaxvib.identification.problem import DELAY_MARGIN
 from jaxvib.identification.response import Samples, Unknowns, sensor_rows
-from jaxvib.identification.supports.contact import pressing, side_count, switched_step, with_fixed_contact, with_pressing
+from jaxvib.identification.supports.contact import contacts_at, side_count, switched_step, with_contacts, with_fixed_contact
 from jaxvib.machine.drives.drive import Drive, IdealDrive
 from jaxvib.machine.scene import Scene
 from jaxvib.ode.dopri8_loop import LoopDopri8
@@ -122,20 +122,20 @@ def _segment(
     def rates(t: Array, y: Array, _: Array, dynamics: Dynamics) -> Array:
         return _rates(samples, t, y, equations._replace(dynamics=dynamics))[0]
 
-    def pressing_at(y: Array) -> Array:
+    def contacts(y: Array) -> Array:
         nd = equations.rows.shape[2]
-        return pressing(equations.dynamics, y[:nd], y[nd : 2 * nd]) if has_stops else jnp.zeros(0, bool)
+        return contacts_at(equations.dynamics, y[:nd], y[nd : 2 * nd]) if has_stops else jnp.zeros(0, bool)
 
     recorded, used = _recorded(samples)
 
     def sample(state: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         (y, presses), t, h = state, samples.begin + samples.step * (begin + k), samples.step / per_sample
-        now = equations._replace(dynamics=with_pressing(equations.dynamics, presses)) if has_stops else equations
+        now = equations._replace(dynamics=with_contacts(equations.dynamics, presses)) if has_stops else equations
         readings = equations.gains * _rates(samples, t, y, now)[1]
         if samples.guide is not None:
-            away = jnp.where(used[begin + k], recorded[begin + k] - readings, 0.0)
-            y = y + jnp.where(jnp.any(presses), 0.0, samples.guide @ away)
-            presses = pressing_at(y)
+            difference = jnp.where(used[begin + k], recorded[begin + k] - readings, 0.0)
+            y = y + jnp.where(jnp.any(presses), 0.0, samples.guide @ difference)
+            presses = contacts(y)
 
         def advance(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             if has_stops:
@@ -144,7 +144,7 @@ def _segment(
 
         return jax.lax.fori_loop(0, per_sample, advance, (y, presses)), (readings, y)
 
-    (end, _), (readings, states) = jax.lax.scan(sample, (start, pressing_at(start)), jnp.arange(length))
+    (end, _), (readings, states) = jax.lax.scan(sample, (start, contacts(start)), jnp.arange(length))
     return readings, states, end
 
 
@@ -181,8 +181,8 @@ def segments(
 def _slopes(
     unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, pair: Array, starts: Array
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return readings and last states as `segments`, and their derivatives (..., p + 2 + ns) with respect to x, pair and first
-    state."""
+    """Return the readings and last states of `segments`, and their derivatives (..., p + 2 + ns) with respect to x, `pair` and
+    the first state."""
     length, p = samples.segments[1], x.shape[0]
 
     def motion(free: Array, begin: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:

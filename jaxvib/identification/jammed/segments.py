@@ -18,13 +18,14 @@ record are integrated at once, each from its own initial state (multiple shootin
 phase error within a segment must be less than a radian."""
 
 _STEPS_PER_RADIAN = 1.0
-"""Number of steps of order 8 per radian of the fastest motion, with errors of about 2e-7 in a turn."""
+"""Number of steps of order 8 per radian of the fastest motion; the errors are about 2e-7 in a turn."""
 
 _STEPS_PER_WIDTH = 0.4
-"""Number of steps in which a velocity that changes at the largest acceleration passes the width of a friction. With friction
-forces of 3 to 30 N at a mass of 95 kg the accelerations then have relative errors of 1e-7."""
+"""Number of steps in which a velocity changes by the width of a friction at the largest acceleration. With friction forces of
+3 to 30 N at a mass of 95 kg, the relative errors of the accelerations are then 1e-7."""
 
-_ORDERS = {"acceleration": 0, "velocity": 1, "displacement": 2}
+_DERIVATIVES_TO_ACCELERATION = {"acceleration": 0, "velocity": 1, "displacement": 2}
+"""Number of time derivatives from a kind of motion to the acceleration."""
 
 
 def divide(scene: Scene, count: int, step: float, readings: Mapping[str, float]) -> tuple[int, int, int]:
@@ -34,7 +35,8 @@ def divide(scene: Scene, count: int, step: float, readings: Mapping[str, float])
     in SI.
     """
     fastest, slowest = (float(each) for each in frequency_bounds(scene))
-    acceleration = max((value * fastest ** _ORDERS[kind] for kind, value in readings.items() if kind in _ORDERS), default=0.0)
+    orders = _DERIVATIVES_TO_ACCELERATION
+    acceleration = max((value * fastest ** orders[kind] for kind, value in readings.items() if kind in orders), default=0.0)
     frequency, decay = _rates_with_stops(scene)
     fastest, decay = max(fastest, frequency), max(float(machine_decay(scene)), decay)
     longest, is_stiff = equal_step_length(fastest, decay, _STEPS_PER_RADIAN)

@@ -55,10 +55,9 @@ _MIN_TURNS = 8
 """Smallest number of turns of jammed loads in a record."""
 
 _COINCIDENT_SPREAD, _FREE_SPREAD = 1e-3, 0.2
-"""Assumed scatter of the loads of a run at the first sample: the first number is that of equal loads at one station, the second
-that of all other loads. It is the standard deviation of the angles from their mean, rad, and of the speeds from the mean
-speed, relative to this speed. Equal loads at one station gather in a jam, and a small difference of their angles changes no
-reading."""
+"""Assumed scatter of the loads of a run at the first sample, for equal loads at one station and for all other loads. The
+scatter is the standard deviation of the angles, rad, and that of the speeds relative to the mean speed. Equal loads at one
+station gather in a jam, and a small difference of their angles changes no reading."""
 
 _GAP_SIZE = 0.01
 """Gap between two segments, relative to the size of each state (angles: rad), that costs as much as a reading whose residual
@@ -104,8 +103,8 @@ class _Trial(NamedTuple):
 
 
 def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
-    """Return the problem of a motion with loads, in which the first values of the linear unknowns are set, and the first values
-    of the other unknowns, x.
+    """Return the problem of a motion with loads with first values of the linear unknowns, and the first values x of the other
+    unknowns.
 
     If the motion with the first values of the scene does not resemble the records, it is computed again with other stiffnesses,
     see `_stiffnesses_of_jam`.
@@ -144,7 +143,7 @@ def _stiffnesses_of_jam(problem: Problem, jams: Sequence[_Jam]) -> np.ndarray | 
 
 
 def _first_fit(problem: Problem, jams: Sequence[_Jam], x: np.ndarray) -> tuple[_Trial, np.ndarray]:
-    """Return the motion of all runs that results from the first values x, and the information of `load_spread_of`."""
+    """Return the motion of all runs that is fitted from the first values x, and the information of `load_spread_of`."""
     x, linear = x.copy(), np.zeros(unknown_count(problem) - problem.unknowns.count)
     starts, pairs = [], []
     for r, (jam, indices) in enumerate(zip(jams, linear_indices(problem), strict=True)):
@@ -162,7 +161,7 @@ def _first_fit(problem: Problem, jams: Sequence[_Jam], x: np.ndarray) -> tuple[_
 
 
 def _loads_of(scene: Scene) -> CircularLoads:
-    """Return the loads of a scene that `build_problem` has accepted."""
+    """Return the loads of a scene; `build_problem` accepts loads on a circle only."""
     loads = scene.exciters[0].loads
     assert isinstance(loads, CircularLoads)
     return loads
@@ -283,8 +282,8 @@ def _linear_motion(problem: Problem, r: int, jam: _Jam, x: np.ndarray) -> tuple[
 
 
 def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.ndarray]) -> _Trial:
-    """Return a motion near the best one, from the first values `x`, `linear` and `starts`, which leave gaps between the
-    segments; see `_REDUCTION_PER_READING`."""
+    """Return a motion near the best one, from the first values `x` and `linear`, and from the first states `starts` of the
+    segments, between which there are gaps; see `_REDUCTION_PER_READING`."""
     p, size, indices_of_runs = x.size, x.size + linear.size, linear_indices(problem)
     whole = np.concatenate(starts)
     scale = np.maximum(np.sqrt(np.mean(whole**2, axis=0)), 1e-9 * np.max(np.abs(whole)))

@@ -41,7 +41,7 @@ Step = Callable[[Array, Array, Array, Dynamics], Array]
 
 
 class FixedContactStop(Effect):
-    """Stop of which each side is treated as in contact, or as free, whatever the displacement. Its force is therefore smooth.
+    """Stop with a fixed contact of each side: in contact or free at any displacement. Its force is therefore smooth.
 
     **Attributes**: `stop`; `presses` (s,): 1 for each of the s `sides` that is treated as in contact, otherwise 0.
     """
@@ -102,13 +102,13 @@ def penetrations(dynamics: Dynamics, q: Array, v: Array) -> tuple[Array, Array, 
     return depths, rates, switches
 
 
-def pressing(dynamics: Dynamics, q: Array, v: Array) -> Array:
+def contacts_at(dynamics: Dynamics, q: Array, v: Array) -> Array:
     """Return True (s,) for each side of a stop that is in contact."""
     return penetrations(dynamics, q, v)[2] > 0.0
 
 
-def with_pressing(dynamics: Dynamics, presses: Array) -> Dynamics:
-    """Return the equations in which the sides `presses` (s,) are in contact."""
+def with_contacts(dynamics: Dynamics, presses: Array) -> Dynamics:
+    """Return the equations in which the sides with `presses` (s,) True are in contact."""
     sizes = [len(stop.sides) for stop in _effects(dynamics)]
     ends = [sum(sizes[: k + 1]) for k in range(len(sizes))]
     parts = [presses[end - size : end].astype(float) for end, size in zip(ends, sizes, strict=True)]
@@ -123,42 +123,42 @@ def with_pressing(dynamics: Dynamics, presses: Array) -> Dynamics:
 def switched_step(
     step: Step, rates: Step, dynamics: Dynamics, t: Array, y: Array, presses: Array, h: Array
 ) -> tuple[Array, Array]:
-    """Return the state after the time `h`, and the sides of stops that are in contact then.
+    """Return the state after the time `h`, and True (s,) for the sides of stops that are in contact then.
 
     **Arguments**: `step`; `rates`: function of the same arguments, which returns the rates of the state; the time `t`; the
-    state `y`, whose first entries are displacements and velocities; the sides `presses` (s,) that are in contact.
+    state `y`, whose first entries are displacements and velocities; `presses` (s,): True for sides in contact at the time `t`.
     """
     nd = dynamics.stiffness_per_mass.shape[0]
 
-    def wrong(y: Array, presses: Array, dynamics: Dynamics) -> Array:
-        """Return the switching functions (s,), with signs such that a value is positive if the state and the equations differ
-        about the contact of the side."""
+    def switching(y: Array, presses: Array, dynamics: Dynamics) -> Array:
+        """Return the switching functions (s,), with signs such that a value is positive after a switch: when the state and
+        `presses` disagree about the contact of the side."""
         return jnp.where(presses, -1.0, 1.0) * penetrations(dynamics, y[:nd], y[nd : 2 * nd])[2]
 
-    def go_on(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def advance(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         done, y, presses, count = state
-        now, begin, rest = with_pressing(dynamics, presses), t + done, h - done
+        now, begin, rest = with_contacts(dynamics, presses), t + done, h - done
         fixed = lax.stop_gradient((begin, y, rest, now))
-        change = _first_change(step, rates, lambda y: wrong(y, presses, fixed[3]), presses, *fixed)
-        is_switch = change.is_found & (count < _MAX_SWITCHES)
-        taken = jnp.where(is_switch, change.length, rest)
-        new = step(begin, y, taken, now)
-        values = wrong(new, presses, now)
-        which = jnp.argmax(lax.stop_gradient(values))
-        slope = rates(*lax.stop_gradient((begin + taken, new, taken, now)))
-        rate = jax.jvp(lambda y: wrong(y, presses, fixed[3]), (lax.stop_gradient(new),), (slope,))[1][which]
-        # The correction has the value 0, but the derivative of the time of the switch.
-        correction = (lax.stop_gradient(values) - values)[which] * jnp.where(is_switch, 1.0 / rate, 0.0)
-        presses = presses ^ (is_switch & (jnp.arange(presses.size) == which))
-        done = jnp.where(is_switch, done + taken + correction, h)
+        search = _first_switch(step, rates, lambda y: switching(y, presses, fixed[3]), presses, *fixed)
+        is_switch = search.is_found & (count < _MAX_SWITCHES)
+        length = jnp.where(is_switch, search.length, rest)
+        new = step(begin, y, length, now)
+        values = switching(new, presses, now)
+        side = jnp.argmax(lax.stop_gradient(values))
+        slope = rates(*lax.stop_gradient((begin + length, new, length, now)))
+        rate = jax.jvp(lambda y: switching(y, presses, fixed[3]), (lax.stop_gradient(new),), (slope,))[1][side]
+        # The value of the correction is 0; its derivative is that of the time of the switch.
+        correction = (lax.stop_gradient(values) - values)[side] * jnp.where(is_switch, 1.0 / rate, 0.0)
+        presses = presses ^ (is_switch & (jnp.arange(presses.size) == side))
+        done = jnp.where(is_switch, done + length + correction, h)
         return done, new + correction * slope, presses, count + 1
 
     start = jnp.zeros_like(h), y, presses, jnp.asarray(0)
-    _, y, presses, _ = lax.while_loop(lambda state: state[0] < h, go_on, start)
+    _, y, presses, _ = lax.while_loop(lambda state: state[0] < h, advance, start)
     return y, presses
 
 
-def _turning(start: tuple[Array, Array], last: Array, presses: Array, h: Array) -> Array:
+def _time_of_turn(start: tuple[Array, Array], last: Array, presses: Array, h: Array) -> Array:
     """Return the time from the beginning of a step to the moment at which the machine is nearest to a free side of a stop, if a
     contact is possible at this moment, see `_NEAR_TURN`; otherwise 0.
 
@@ -171,12 +171,13 @@ def _turning(start: tuple[Array, Array], last: Array, presses: Array, h: Array) 
     return jnp.min(jnp.where(is_near, share, 1.0)) * h * jnp.any(is_near)
 
 
-class _Change(NamedTuple):
-    """State of the search for the first switch within a step, by Newton's method between bounds.
+class _SwitchSearch(NamedTuple):
+    """State of the search for the first switch within a step, by Newton's method between bounds. Without a switch the search
+    ends after the trials at the end of the step and at `_time_of_turn`.
 
     **Attributes**: `low` and `high`: bounds of the time from the beginning of the step to the switch; `length`: the next trial
-    of this time; `is_final`: True if the search has ended; `is_found`: True if a trial was after a switch; without a switch the
-    search ends after the trials at the end of the step and at the moment of `_turning`; `trials`: number of trials.
+    of this time; `is_final`: True if the search has ended; `is_found`: True if a trial was after a switch; `trials`: number of
+    trials.
     """
 
     low: Array
@@ -187,34 +188,35 @@ class _Change(NamedTuple):
     trials: Array
 
 
-def _first_change(
+def _first_switch(
     step: Step,
     rates: Step,
-    wrong: Callable[[Array], Array],
+    switching: Callable[[Array], Array],
     presses: Array,
     t: Array,
     y: Array,
     h: Array,
     dynamics: Dynamics,
-) -> _Change:
-    """Return the search for the first switch within the time `h`; `wrong`: function of a state, positive after a switch."""
+) -> _SwitchSearch:
+    """Return the completed search for the first switch within the time `h`; `switching`: function of a state, positive after a
+    switch."""
     nd = dynamics.stiffness_per_mass.shape[0]
     start = penetrations(dynamics, y[:nd], y[nd : 2 * nd])[:2]
 
-    def trial(at: _Change) -> _Change:
+    def trial(at: _SwitchSearch) -> _SwitchSearch:
         new = step(t, y, at.length, dynamics)
-        values, slopes = jax.jvp(wrong, (new,), (rates(t + at.length, new, at.length, dynamics),))
-        which = jnp.argmax(values)
-        is_late = values[which] > 0.0
+        values, slopes = jax.jvp(switching, (new,), (rates(t + at.length, new, at.length, dynamics),))
+        side = jnp.argmax(values)
+        is_late = values[side] > 0.0
         # The end of the step is tried first, and then the moment at which the machine is nearest to a free side of a stop.
-        turn = _turning(start, penetrations(dynamics, new[:nd], new[nd : 2 * nd])[1], presses, h)
+        turn = _time_of_turn(start, penetrations(dynamics, new[:nd], new[nd : 2 * nd])[1], presses, h)
         is_turn = (at.trials == 0) & ~is_late & (turn > 0.0)
         is_found = at.is_found | is_late
         low, high = jnp.where(is_late | is_turn, at.low, at.length), jnp.where(is_late, at.length, at.high)
-        better = at.length - values[which] / slopes[which]
+        better = at.length - values[side] / slopes[side]
         better = jnp.where((better > low) & (better < high), better, 0.5 * (low + high))
         is_final = ~is_found | (jnp.abs(better - at.length) < _ACCURACY * h) | (at.trials > _MAX_TRIALS)
-        return _Change(low, high, jnp.where(is_turn, turn, better), is_final & ~is_turn, is_found, at.trials + 1)
+        return _SwitchSearch(low, high, jnp.where(is_turn, turn, better), is_final & ~is_turn, is_found, at.trials + 1)
 
     no = jnp.asarray(False)
-    return lax.while_loop(lambda at: ~at.is_final, trial, _Change(0.0 * h, h, h, no, no, jnp.asarray(0)))
+    return lax.while_loop(lambda at: ~at.is_final, trial, _SwitchSearch(0.0 * h, h, h, no, no, jnp.asarray(0)))

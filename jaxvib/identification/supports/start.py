@@ -37,13 +37,12 @@ _OPEN_GAP = 1.1
 """First value of a gap that is not touched, relative to the largest displacement."""
 
 _SAME_COST = 1.1
-"""Cost of a motion without contacts, relative to that of a motion with contacts, below which the motion without contacts is
-chosen."""
+"""The motion without contacts is chosen if its cost is below this multiple of the cost of the motion with contacts."""
 
 
 def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
-    """Return the problem of a motion on nonlinear supports, in which the first values of the linear unknowns are set, and the
-    first values of the other unknowns, x.
+    """Return the problem of a motion on nonlinear supports with first values of the linear unknowns, and the first values x
+    of the other unknowns.
 
     The linear response to the first record gives the size of the unbalance. The linear responses to the beginnings of all
     records (their first segments, see `Samples`) give the first states. If a fit of the linear machine explains the records as
@@ -58,24 +57,25 @@ def with_guided_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
     guides = [jnp.asarray(_guide(weighted, r, x, linear)) for r in range(len(problem.runs))]
     runs = tuple(dataclasses.replace(samples, guide=guide) for samples, guide in zip(weighted.runs, guides, strict=True))
 
-    def begun(chosen: slice, unbalance: np.ndarray) -> Problem:
+    def guided_problem(chosen: slice, unbalance: np.ndarray) -> Problem:
         linear = linear_at(weighted._replace(runs=begins[chosen]), x, unbalance)
         guided = weighted._replace(runs=runs[chosen])
         return guided._replace(linear=with_first_states(guided, x, linear))
 
-    costs = np.array([[project(begun(slice(r, r + 1), each), x).cost for each in unbalances] for r in range(len(runs))])
+    alone = [slice(r, r + 1) for r in range(len(runs))]
+    costs = np.array([[project(guided_problem(run, each), x).cost for each in unbalances] for run in alone])
     turns = [samples.turn for samples in runs]
     best_index = int(np.argmin(np.sum(costs[[turn is None for turn in turns]], axis=0)))
     for turn, cost in zip(turns, costs, strict=True):
         if turn is not None:
             index = problem.unknowns.first.shape[0] + len(problem.unknowns.gains) + turn
             x[index] = angles[np.argmin(cost)] - angles[best_index]
-    first = begun(slice(None), unbalances[best_index])
-    trial, free = minimize(first, x)[0], minimize(weighted, x)[0]
-    trial = minimize(weighted._replace(linear=trial.linear), trial.x)[0]
-    of_free = weighted._replace(linear=with_first_states(weighted, free.x, free.linear))
-    free = project(of_free, _with_open_stops(weighted, free.x, free.linear))
-    best = free if free.cost < _SAME_COST * trial.cost else trial
+    first = guided_problem(slice(None), unbalances[best_index])
+    touching, free = minimize(first, x)[0], minimize(weighted, x)[0]
+    touching = minimize(weighted._replace(linear=touching.linear), touching.x)[0]
+    problem_of_free = weighted._replace(linear=with_first_states(weighted, free.x, free.linear))
+    free = project(problem_of_free, _with_open_stops(weighted, free.x, free.linear))
+    best = free if free.cost < _SAME_COST * touching.cost else touching
     return problem._replace(linear=best.linear), best.x
 
 
@@ -124,9 +124,9 @@ def _with_open_stops(problem: Problem, x: np.ndarray, linear: np.ndarray) -> np.
     stops = [effect for effect in problem.unknowns.scene(problem.scene, x).effects if isinstance(effect, Stop)]
     for k, stop in enumerate(stops):
         if (name := f"effects.stop[{k}].gap") in names and float(stop.gap) > 0.0:
-            moved = jnp.concatenate(paths) @ stop.rows(problem.scene.machine).T
-            reach = float(stop.gap + jnp.max(jax.vmap(lambda at, stop=stop: stop.penetration(at)[0])(moved)))
-            x[names.index(name)] += max(math.log(_OPEN_GAP * reach / float(stop.gap)), 0.0) if reach > 0.0 else 0.0
+            path = jnp.concatenate(paths) @ stop.rows(problem.scene.machine).T
+            largest = float(stop.gap + jnp.max(jax.vmap(lambda at, stop=stop: stop.penetration(at)[0])(path)))
+            x[names.index(name)] += max(math.log(_OPEN_GAP * largest / float(stop.gap)), 0.0) if largest > 0.0 else 0.0
     return x
 
 
@@ -139,5 +139,5 @@ def untouched_stops(fitted: Fitted) -> Iterator[str]:
         if own and not np.any(influence[own] > 0.0):
             yield (
                 f"effects.stop[{k}] is not touched in the runs, which therefore do not determine its parameters: record a run "
-                "with larger vibrations, or leave them out of `unknown`"
+                "with larger vibrations, or leave these parameters out of `unknown`"
             )

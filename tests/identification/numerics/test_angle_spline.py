@@ -6,7 +6,14 @@ import pytest
 from scipy.interpolate import BSpline
 
 import jaxvib as jv
-from jaxvib.identification.angle import RecordedDrive, RotorAngle, _measured, drive_of_spline, recorded_drive, rotor_angles
+from jaxvib.identification.angle import (
+    RecordedDrive,
+    RotorAngle,
+    _angle_of_channel,
+    drive_of_spline,
+    recorded_drive,
+    rotor_angles,
+)
 from jaxvib.identification.records.spline import _breaks, _data, _fit_knots, _mark_offsets, fit_spline
 
 T = np.sort(np.random.default_rng(1).uniform(0.0, 3.0, 150))
@@ -231,7 +238,9 @@ def test_two_rotors_need_prescribed_drives():
 
 def measured(kind, times, values, **options):
     channel, none = jv.Channel("rotor", kind, **options), np.zeros(times.size, bool)
-    return _measured(jv.MeasuredRun((channel,), {"rotor": times}, {"rotor": values}, {"rotor": none}, {}, (), "run"), channel)
+    return _angle_of_channel(
+        jv.MeasuredRun((channel,), {"rotor": times}, {"rotor": values}, {"rotor": none}, {}, (), "run"), channel
+    )
 
 
 def test_error_of_many_unknowns_is_left_out():

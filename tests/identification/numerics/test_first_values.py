@@ -10,7 +10,7 @@ import jaxvib as jv
 from jaxvib.identification import start
 from jaxvib.identification.problem import build_problem
 from jaxvib.identification.response import Samples, Unknowns
-from jaxvib.identification.start import _steady, amplitudes, track_orders
+from jaxvib.identification.start import _steady_amplitudes, amplitudes, fit_amplitudes
 from jaxvib.machine.numbers.named import find_number
 
 
@@ -87,7 +87,7 @@ def test_steady_amplitudes_against_complex_stiffness():
         changed=(find_number(scene, "machine.inertia", "change"),), actions=("add",), turn=None,
     )  # fmt: skip
     speeds = np.array([20.0, 45.0, 90.0])
-    found = _steady(unknowns, samples, scene, jnp.array([0.1]), jnp.asarray(speeds))
+    found = _steady_amplitudes(unknowns, samples, scene, jnp.array([0.1]), jnp.asarray(speeds))
 
     def point(x, y):
         return np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
@@ -118,10 +118,10 @@ def test_tracked_orders_agree_with_the_steady_machine():
     channel = jv.Channel("frame", "velocity", at=1)
     run = jv.MeasuredRun.from_arrays([channel], t, {"frame": steady * np.cos(0.5 * t**2)})
     problem = build_problem(scene, [run], ["machine.stiffness", "machine.damping"], {})
-    found = track_orders(problem)
+    found = fit_amplitudes(problem)
     np.testing.assert_allclose([5e4 * np.exp(found[0]), 300.0 * np.exp(found[1])], [4e4, 200.0], rtol=0.03)
-    assert not np.any(track_orders(problem._replace(unbalances=(None, None))))
-    assert not np.any(track_orders(problem._replace(masks=(np.arange(12001)[:, None] < 1900,))))  # 9.5 s are 7.2 turns
+    assert not np.any(fit_amplitudes(problem._replace(unbalances=(None, None))))
+    assert not np.any(fit_amplitudes(problem._replace(masks=(np.arange(12001)[:, None] < 1900,))))  # 9.5 s are 7.2 turns
 
 
 def test_tracked_values_are_finite_and_near(monkeypatch):
@@ -131,5 +131,5 @@ def test_tracked_values_are_finite_and_near(monkeypatch):
         angles=[np.linspace(0.0, 300.0, 2001)[:, None]],
     )  # fmt: skip
     for values, expected in (([5.0, -9.0], [2.0, -2.0]), ([np.nan, 1.0], [0.0, 0.0])):
-        monkeypatch.setattr(start, "_track", lambda *_, values=values: np.array(values))
-        assert track_orders(problem).tolist() == expected
+        monkeypatch.setattr(start, "_fit_amplitudes", lambda *_, values=values: np.array(values))
+        assert fit_amplitudes(problem).tolist() == expected
