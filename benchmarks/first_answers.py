@@ -1,4 +1,5 @@
-"""Time of first results: in a new process with an empty cache of programs, in a new process with a full cache, and repeated.
+"""Times until a call returns: in a new process with an empty cache of programs, in a new process with a warm cache, and
+repeated in the same process. The table is that of `docs/speed.md`.
 
     python benchmarks/first_answers.py [--only NAME ...]
 
@@ -33,7 +34,7 @@ def stiffer(k):
 K = scene.machine.stiffness
 """
 
-QUESTIONS = {
+CALLS = {
     "jam_modes": "call = lambda: jv.jam_modes(scene)",
     "jam_modes, gradient": (
         "call = lambda: jax.grad(lambda k: jv.jam_modes(stiffer(k)).select(3, throw=False).foundation_force)(K)"
@@ -90,14 +91,14 @@ print("TIMES", first, min(again))
 """
 
 
-def asked(name: str, cache: str) -> tuple[float, float]:
-    """Return the times, s, of the first and of a later call in a new process."""
-    printed = process([sys.executable, "-c", PRELUDE + QUESTIONS[name] + MEASURE], cache)
+def time_call(name: str, cache: str) -> tuple[float, float]:
+    """Return the times, s, of the first and of a repeated call in a new process."""
+    printed = process([sys.executable, "-c", PRELUDE + CALLS[name] + MEASURE], cache)
     first, again = next(line for line in printed.splitlines() if line.startswith("TIMES")).split()[1:]
     return float(first), float(again)
 
 
-def commanded(name: str, cache: str) -> float:
+def time_command(name: str, cache: str) -> float:
     """Return the time of a command, s."""
     begun = time.perf_counter()
     process([sys.executable, "-c", "from jaxvib.cli import main; main()", *COMMANDS[name].split()], cache)
@@ -119,19 +120,19 @@ def process(command: list[str], cache: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="*", choices=[*QUESTIONS, *COMMANDS], default=[*QUESTIONS, *COMMANDS])
+    parser.add_argument("--only", nargs="*", choices=[*CALLS, *COMMANDS], default=[*CALLS, *COMMANDS])
     options = parser.parse_args()
     print(machine_line())
-    print(f"{'question':32s} {'empty cache, s':>15s} {'warm cache, s':>15s} {'again, ms':>12s}")
+    print("| call | empty cache, s | warm cache, s | repeated call, ms |\n|---|---|---|---|")
     for name in options.only:
         with tempfile.TemporaryDirectory() as cache:
-            if name in QUESTIONS:
-                empty, _ = asked(name, cache)
-                warm, again = asked(name, cache)
-                print(f"{name:32s} {empty:15.1f} {warm:15.1f} {1e3 * again:12.2f}", flush=True)
+            if name in CALLS:
+                empty, _ = time_call(name, cache)
+                warm, again = time_call(name, cache)
+                print(f"| {name} | {empty:.1f} | {warm:.1f} | {1e3 * again:.2f} |", flush=True)
             else:
-                empty, warm = (commanded(name, cache) for _ in range(2))
-                print(f"{name:32s} {empty:15.1f} {warm:15.1f}", flush=True)
+                empty, warm = (time_command(name, cache) for _ in range(2))
+                print(f"| command `{name}` | {empty:.1f} | {warm:.1f} |  |", flush=True)
 
 
 if __name__ == "__main__":

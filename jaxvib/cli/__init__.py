@@ -13,7 +13,7 @@ import warnings
 from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 
-_LATER = 0.05
+_REPEAT_DELAY = 0.05
 """Time, s, after which an interrupt is repeated if it could not be handled."""
 
 
@@ -64,7 +64,8 @@ def _raise_interrupts(interrupts: list[int]) -> None:
 
 
 def _is_loading_extension(frame: FrameType | None) -> bool:
-    """Return True while an extension module is imported: XLA's, for example, crashes if its start raises an exception."""
+    """Return True while an extension module is imported. Some of them, such as that of XLA, crash if an exception is raised
+    during their import."""
     while frame is not None:
         if isinstance(frame.f_locals.get("self"), ExtensionFileLoader):
             return True
@@ -84,9 +85,9 @@ def _repeat_lost_interrupt(lost: sys.UnraisableHookArgs) -> None:
 
 
 def _interrupt_later() -> None:
-    later = threading.Timer(_LATER, _interrupt_main_thread)
-    later.daemon = True
-    later.start()
+    timer = threading.Timer(_REPEAT_DELAY, _interrupt_main_thread)
+    timer.daemon = True
+    timer.start()
 
 
 def _interrupt_main_thread() -> None:

@@ -254,7 +254,7 @@ _ARGUMENTS = {
 """Descriptions of the arguments of commands, for messages about missing arguments."""
 
 
-class _Lazy(click.Group):
+class _LazyGroup(click.Group):
     """Group of commands whose modules are imported when a command is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -299,7 +299,9 @@ def _is_command(decorator: ast.expr, name: str) -> bool:
     return isinstance(decorator, ast.Call) and name in [x.value for x in decorator.args if isinstance(x, ast.Constant)]
 
 
-@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"], "show_default": True}, no_args_is_help=True)
+@click.group(
+    cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "show_default": True}, no_args_is_help=True
+)
 @click.version_option(package_name="jaxvib")
 def app() -> None:
     """Simulate and design vibration machines that work on the Sommerfeld effect.
@@ -375,9 +377,9 @@ def run(arguments: list[str]) -> int:
     except InputError as error:
         error = _with_option_names(arguments, error)
         message = f"{error}{_remedy_hint(arguments, error)}"
-        return _failed(wants_json, 2, {"kind": "input", "field": error.field, "message": message})
+        return _report_error(wants_json, 2, {"kind": "input", "field": error.field, "message": message})
     except ComputationError as error:
-        return _failed(wants_json, 1, {"kind": "computation", "status": error.status, "message": str(error)})
+        return _report_error(wants_json, 1, {"kind": "computation", "status": error.status, "message": str(error)})
     except _NO_ARGUMENTS as error:
         click.echo(error.format_message())
         return 0
@@ -387,7 +389,7 @@ def run(arguments: list[str]) -> int:
     except OSError as error:
         name = str(error.filename or "a file")
         message = f"{name} cannot be written or read ({error.strerror}); give another folder with --out"
-        return _failed(wants_json, 2, {"kind": "input", "field": name, "message": message})
+        return _report_error(wants_json, 2, {"kind": "input", "field": name, "message": message})
     except click.UsageError as error:
         field = error.ctx.command.name if error.ctx else "jaxvib"
         hint = f" (see: {error.ctx.command_path} --help)" if error.ctx else ""
@@ -399,15 +401,15 @@ def run(arguments: list[str]) -> int:
             description = getattr(error.param, "help", None) or _ARGUMENTS.get(error.param.name or "", "")
             message = f"{message.rstrip('.')}: {description.rstrip('.')}" if description else message
         message += _repeat_hint(arguments, error) + hint
-        return _failed(wants_json, 2, {"kind": "input", "field": field, "message": message})
+        return _report_error(wants_json, 2, {"kind": "input", "field": field, "message": message})
     except click.exceptions.Exit as stop:
         return stop.exit_code
     except (click.Abort, KeyboardInterrupt):
-        return _failed(wants_json, 1, {"kind": "computation", "status": "interrupted", "message": "interrupted"})
+        return _report_error(wants_json, 1, {"kind": "computation", "status": "interrupted", "message": "interrupted"})
 
 
 def _repeat_hint(arguments: list[str], error: click.UsageError) -> str:
-    """Return a hint for surplus values of a repeatable option, which click takes for arguments; "" for other errors."""
+    """Return a hint for surplus values of a repeatable option, which click reads as arguments; "" for other errors."""
     options = error.ctx.command.params if error.ctx and "unexpected extra" in error.format_message() else []
     names = [option.opts[-1] for option in options if isinstance(option, click.Option) and option.multiple]
     used = [name for name in names if name in arguments]
@@ -440,7 +442,8 @@ def _remedy_hint(arguments: list[str], error: InputError) -> str:
     return " (--speed gives one)" if table == "drive" and name in ("", "kind") and "speed" in options else ""
 
 
-def _failed(wants_json: bool, code: int, error: dict[str, str | None]) -> int:
+def _report_error(wants_json: bool, code: int, error: dict[str, str | None]) -> int:
+    """Print an error on stderr, with --json also on stdout, and return the exit `code`."""
     note(legible(f"jaxvib: {error['message']}"))
     if wants_json:
         click.echo(json.dumps({"error": error}, indent=2))

@@ -88,7 +88,7 @@ def simulate(
         raise InputError("--csv", "needs a trajectory, which --window does not save; leave one of them out")
     loaded = loaded_scene(scene)
     require_deck_options(loaded)
-    meter = ProgressBar() if sys.stderr.isatty() and _long(loaded, options["until"]) else None
+    meter = ProgressBar() if sys.stderr.isatty() and _is_long(loaded, options["until"]) else None
     if meter is not None:
         output.end_waiting()
     run = jv.simulate(
@@ -105,9 +105,9 @@ def simulate(
     output.done(run_document(run, measures), lambda: run_text(run, measures), "simulate", run)
 
 
-def _long(scene: jv.Scene, until: str) -> bool:
-    """Return True for a run that is so long that a progress bar is useful. Short runs have none, because a program with a
-    progress bar cannot be stored."""
+def _is_long(scene: jv.Scene, until: str) -> bool:
+    """Return True for a run that is so long that a progress bar is useful. Short runs have no bar, because a compiled program
+    with a progress bar cannot be stored."""
     from jaxvib.units import number
 
     return bool(number(until, "s", "until") * scene.drive.speed > 1e6)

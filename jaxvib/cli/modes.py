@@ -131,7 +131,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
             ends = (modes_found.folds.omega, modes_found.folds.rotor_speed)
             pairs = [[f"{scale * end[k]:.5g}" for end in ends] for k in folds]
             lines.append(table("folds: two jams merge", [f"loads, {unit}", f"rotor, {unit}"], pairs))
-        return "\n".join([*lines, *_drag_lines(scene, limits), *_left_out(scene)])
+        return "\n".join([*lines, *_drag_lines(scene, limits), *_imbalance_lines(scene)])
 
     output.done(document, text, "modes", modes_found)
 
@@ -146,7 +146,7 @@ def _is_balance_stable(scene: jv.Scene) -> bool | None:
 
 
 def _reached_lines(scene: jv.Scene, output: Output, jams: list[str], balanced: bool | None) -> list[str]:
-    """Return lines about several motions that are stable at the speed of the scene, one of which the loads reach.
+    """Return lines about the stable motions at the speed of the scene, if there are several, or only balanced loads.
 
     **Arguments**: `jams`: names of the stable jams; `balanced`: see `_is_balance_stable`.
     """
@@ -197,7 +197,7 @@ def _mode_document(jam: jv.Jam, growth: float) -> dict[str, Any]:
     return {**beginning, "growth_of_free_loads": growth, "status": jam.message, **end}
 
 
-def _left_out(scene: jv.Scene) -> list[str]:
+def _imbalance_lines(scene: jv.Scene) -> list[str]:
     """Return lines about the imbalances that a table of jams of light loads ignores; an empty list for a balanced rotor."""
     from jaxvib.machine.effects.base import has_term
     from jaxvib.machine.effects.terms import RotorImbalance
@@ -267,7 +267,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
         ]
         drags = _drag_lines(scene, limits, points=True)
         rows_of_force = [table(title, head, rows), *_force_lines(scene)]
-        return "\n".join([conclusion, *reached, *rows_of_force, *measure_texts, *drags, *_left_out(scene)])
+        return "\n".join([conclusion, *reached, *rows_of_force, *measure_texts, *drags, *_imbalance_lines(scene)])
 
     output.done(document, text, "modes", result)
 

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from optimize import Demand, Design, Quantity, Synthesis, ToleranceRange
 
 
-_MOST_MACHINES = 0.95
-"""Share of machines that should meet a demand; a smaller share is named."""
+_MIN_SHARE_OF_MACHINES = 0.95
+"""Share of the machines within tolerances that should meet a demand. A text states a smaller share."""
 
 
 @command("optimize", "design")
@@ -123,7 +123,7 @@ def _few_machines_texts(ranges: Sequence[ToleranceRange], demands: Sequence[Dema
     return [
         f"only {100.0 * each.share:.3g} % of these machines meet this demand: {each.words}"
         for each in ranges[len(ranges) - len(demands) :]
-        if each.share < _MOST_MACHINES
+        if each.share < _MIN_SHARE_OF_MACHINES
     ]
 
 

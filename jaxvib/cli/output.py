@@ -106,9 +106,9 @@ class Output:
         if report is not None:
             if report.suffix.lower() not in (".html", ".htm"):
                 raise InputError("--report", f"is {quoted(str(report))}; give a file name that ends in .html")
-            self._make(report.parent, "--report")
+            self._make_folder(report.parent, "--report")
         if folder is not None:
-            self._make(folder, "--out")
+            self._make_folder(folder, "--out")
 
     @contextlib.contextmanager
     def waiting(self) -> Iterator[None]:
@@ -159,8 +159,9 @@ class Output:
             click.echo(f"\r\x1b[Kcomputing, {seconds:.0f} s (new programs are compiled once, then stored)", nl=False, err=True)
 
     @staticmethod
-    def _make(folder: Path, option: str) -> None:
-        """Create a folder before the computation, because a result that cannot be written would be lost."""
+    def _make_folder(folder: Path, option: str) -> None:
+        """Create a folder. For --out and --report this is done before the computation, because a result that cannot be written
+        would be lost."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -203,7 +204,7 @@ class Output:
             return
         from jaxvib.results.csv import write_csv  # slow import, which --help does not need
 
-        self._make(path.parent, "--csv")
+        self._make_folder(path.parent, "--csv")
         write_csv(result, axis, path, display=True, decimal_comma=click.get_current_context().meta.get(_COMMA, False))
         self.files.append(str(path))
 

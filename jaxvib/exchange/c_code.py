@@ -47,7 +47,7 @@ _RULES: Mapping[str, str] = {
     "copy_p": "{0}",
     **{name: f"{name}({{0}})" for name in _CALLS},
 }
-"""C expressions of operations, by their names in JAX."""
+"""C expressions of the operations of JAX, by their names; {0} and {1} are the operands."""
 
 _BRANCHES = {"lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 """Comparisons that select one of two expressions, such as contact or no contact."""
@@ -86,8 +86,8 @@ def write_program(
     """Write a scalar program as C.
 
     **Arguments**: `inputs`: the C expression of each argument; `parameters`: number of leading arguments that change only at
-    events; `outputs`: the C expression to which each result is assigned; `has_events`: True to assign the difference of the two
-    compared values to an event indicator, for each comparison of real numbers in `body` that is not the choice of a pivot.
+    events; `outputs`: the C expression to which each result is assigned; `has_events`: True for event indicators. Each
+    comparison of real numbers in `body`, except choices of pivots, then assigns the difference of both numbers to an indicator.
 
     **Raises** `InputError` for an operation without a rule; the message names the operation.
     """
@@ -164,7 +164,7 @@ class _Writer:
         return [_RULES[name].format(*values)]
 
     def _select_larger(self, x: str, y: str, than: str, real: bool) -> str:
-        """Return the larger or the smaller of two numbers as C text; the result is NaN if one of them is NaN."""
+        """Return the C expression of the larger (`than` is ">") or smaller ("<") of two numbers; NaN if one of them is NaN."""
         test = f"{x} {than} {y} || {x} != {x}"
         return f"{self._branch(test, x, y) if real else f'({test})'} ? {x} : {y}"
 

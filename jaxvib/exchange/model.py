@@ -29,6 +29,7 @@ DriveBy = Literal["scene", "input"]
 
 
 _RATES = ("", "/s", "/s^2")
+"""Endings of the units of a coordinate, its velocity and its acceleration."""
 
 
 class Signal(NamedTuple):
@@ -157,9 +158,9 @@ class Equations(NamedTuple):
     """Equations of a scene for another tool.
 
     **Attributes**: `rates`: a function (scene, time, states, inputs) -> (rates of the states, outputs); `states` and `inputs`:
-    their initial values; `state_signals`, `rate_signals`, `input_signals` and `output_signals`: a `Signal` for each entry, in
-    the order of the arrays of the tree (leaves of `jax.tree`). In `rate_signals` only the rates of velocities have a signal;
-    the other entries are None. `by_input`: True if inputs replace the drives.
+    their initial values; `state_signals`, `rate_signals`, `input_signals` and `output_signals`: a `Signal` for each number of
+    these trees, in the order of their leaves (`jax.tree`). In `rate_signals` only the accelerations of the coordinates have a
+    signal; the other entries are None. `by_input`: True if inputs replace the drives.
     """
 
     rates: Callable[[Scene, Array, States, Inputs], tuple[States, Outputs]]

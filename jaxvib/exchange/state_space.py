@@ -270,22 +270,22 @@ def _jam_matrices(
         return Amplitudes(jax.lax.complex(y[0][:nd], y[0][nd:]), jax.lax.complex(y[1][:nd], y[1][nd:]), rate, relative)
 
     def flow(x: Array, speed: Array) -> Array:
-        moving = amplitudes(x)
-        change = averaged_field(eqx.tree_at(lambda s: s.drive.speed, scene, speed))(jnp.zeros_like(omega), moving)
-        # The averaged amplitudes refer to the mean angle of the loads; here they are referred to the first load.
-        turn = 1j * change.phase[0]
-        rates = [change.displacement - turn * moving.displacement, change.velocity - turn * moving.velocity]
+        state = amplitudes(x)
+        change = averaged_field(eqx.tree_at(lambda s: s.drive.speed, scene, speed))(jnp.zeros_like(omega), state)
+        # The phases of the averaged amplitudes are relative to the mean angle of the loads; here, to that of the first load.
+        rotation = 1j * change.phase[0]
+        rates = [change.displacement - rotation * state.displacement, change.velocity - rotation * state.velocity]
         parts = [part for rate in rates for part in (rate.real, rate.imag)]
         return jnp.concatenate([*parts, change.rate, change.phase[1:] - change.phase[0]])
 
     def outputs(x: Array, speed: Array) -> Array:
-        moving = amplitudes(x)
-        force = omit_unknown_force(scene.machine, carrier.foundation_force(moving.displacement, moving.velocity))
-        return jnp.concatenate([jnp.mean(moving.rate)[None], magnitude(moving.displacement), magnitude(force)])
+        state = amplitudes(x)
+        force = omit_unknown_force(scene.machine, carrier.foundation_force(state.displacement, state.velocity))
+        return jnp.concatenate([jnp.mean(state.rate)[None], magnitude(state.displacement), magnitude(force)])
 
-    turned = displacement * jnp.exp(-1j * phase[0])
-    velocity = 1j * omega * turned
-    x = [turned.real, turned.imag, velocity.real, velocity.imag, jnp.full_like(phase, omega), phase[1:] - phase[0]]
+    rotated = displacement * jnp.exp(-1j * phase[0])
+    velocity = 1j * omega * rotated
+    x = [rotated.real, rotated.imag, velocity.real, velocity.imag, jnp.full_like(phase, omega), phase[1:] - phase[0]]
     x, speed = jnp.concatenate(x), scene.drive.speed
     (a, b), (c, d) = jax.jacfwd(flow, (0, 1))(x, speed), jax.jacfwd(outputs, (0, 1))(x, speed)
     field = averaged_field(scene)

@@ -37,13 +37,17 @@ _EXPONENTS = {8: (1, 0), 11: (1, 0), 12: (1, 0), 9: (0, 1), 13: (0, 1), 15: (-2,
 """Exponents of length and force in the unit of a quantity, by its specific data type."""
 
 _LINES = 2048
+"""Default number of frequencies."""
+
 _HIGHEST_FREQUENCY_RATIO = 1.5
 """Highest default frequency, relative to the highest natural frequency."""
 
 _DIGITS = 5
-"""Number of significant digits of the default spacing, which is less than that of the abscissa in a file."""
+"""Number of significant digits of the default spacing of frequencies. Numbers of the abscissa have 6 digits in a file."""
 
 _MAX_UNEVEN = 1e-6
+"""Largest difference of two steps of even frequencies or times, relative to the largest of the frequencies or times."""
+
 _MAX_BYTES = 2**28
 _TAIL = 200
 """Number of bytes at the end of a file that are examined for the end of its last dataset."""
@@ -260,7 +264,7 @@ def _responses(scene: Scene, quantity: str, frequencies: Numbers | None, rotor_s
 
 
 def _even_frequencies(scene: Scene, frequencies: Numbers | None) -> np.ndarray:
-    """Return frequencies in Hz. **Raises** `InputError` if they are not evenly spaced."""
+    """Return the given or the default frequencies, Hz. **Raises** `InputError` if they are not evenly spaced."""
     if frequencies is None:
         highest = float(np.max(np.asarray(estimated_frequencies(scene))))
         if highest == 0.0:

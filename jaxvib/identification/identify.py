@@ -330,14 +330,12 @@ def _interpret(scene: Scene, first: Problem, fitted: Fitted) -> MachineFit:
         i = information.names.index(name)
         estimates[i] = _with_ends(estimates[i], information.scale[i], bool(information.logarithmic[i]), low, high)
         if not information.vanished[i]:
-            notes.append(
-                f"the interval of {name} follows from its profile likelihood, because the cost is not quadratic about it"
-            )
+            reason = "because the cost is not quadratic near its fitted value"
+            notes.append(f"the interval of {name} follows from its profile likelihood, {reason}")
     for i in np.flatnonzero(information.vanished & information.determined):
-        unit = find_number(scene, information.names[i], "unknown").unit
-        notes.append(
-            f"{information.names[i]} is not distinguishable from 0; it is at most {estimates[i].high:.3g} {unit}".rstrip()
-        )
+        name, limit = information.names[i], estimates[i].high
+        unit = find_number(scene, name, "unknown").unit
+        notes.append(f"{name} is not distinguishable from 0; it is at most {limit:.3g} {unit}".rstrip())
     return MachineFit(
         status=status,
         notes=(*problem.notes, *notes, *untouched_stops(fitted), *coverage_notes(fitted, *damped_modes(fit_scene))),

@@ -8,7 +8,7 @@ import numpy as np
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.cli.modes import _drag_lines, _left_out
+from jaxvib.cli.modes import _drag_lines, _imbalance_lines
 from jaxvib.machine.files import TEMPLATES
 
 
@@ -125,7 +125,7 @@ def test_modes_note_that_an_imbalance_is_left_out(typed, tmp_path):
     assert said not in typed("modes", "machine.toml")[1]
     assert said in typed("modes", "shaken.toml", "--phases")[1]
     text = TEMPLATES["rotor"].replace("# moment_imbalance", "moment_imbalance")
-    assert "the static imbalance and moment imbalance add a vibration" in _left_out(jv.scene_from_toml(text))[1]
+    assert "the static imbalance and moment imbalance add a vibration" in _imbalance_lines(jv.scene_from_toml(text))[1]
     code, _, err = typed("modes", "shaken.toml", "--exact")
     assert code == 2 and "effects.static_imbalance excites the machine at the rotor speed as well" in err
     assert typed("modes", "shaken.toml", "--exact", "--without", "static_imbalance")[0] == 0

@@ -15,8 +15,8 @@ from jaxvib.errors import InputError
 @command("plan", "identification")
 @click.option("--fit", type=click.Path(path_type=Path), help="File fit.npz of `jaxvib identify`, in place of a new fit.")
 def plan(identification: Path, fit: Path | None, output: Output) -> None:
-    """Rank the candidate runs of an IDENTIFICATION file by how much they reduce the expected errors of the unknown parameters
-    per minute of test.
+    """Rank the candidate runs of an IDENTIFICATION file by the reduction of the expected errors of the unknown parameters per
+    minute of the run.
 
     The file names the runs recorded so far, as for `identify`, and has a table [[candidate]] for each run that could be
     recorded next: a run-up, a run at constant speed or a coast-down, other places of sensors, or changed parameters of the

@@ -47,7 +47,7 @@ _SI_UNITS = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "f
 
 
 def read_channels(path: Path, rate: float | None) -> list[Recorded]:
-    """Return the channels of a file. The extension of the file's name determines the format.
+    """Return the channels of a file. The extension of the file's name determines the format; other extensions are read as text.
 
     **Arguments**: `rate`, Hz, replaces the times of the file.
 

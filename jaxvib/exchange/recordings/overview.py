@@ -56,7 +56,7 @@ class ChannelOverview(NamedTuple):
 
 
 def overview_of(recorded: Recorded) -> ChannelOverview:
-    """Return the overview of a channel; its notes contain the reasons for which a fit would refuse the channel.
+    """Return the overview of a channel. If a fit would refuse the channel, the only note is the reason.
 
     >>> t = np.arange(0.0, 2.0, 0.01)
     >>> found = overview_of(Recorded("frame", "g", t, np.clip(np.sin(9.0 * t), -1.0, 0.8)))
@@ -145,23 +145,19 @@ def speed_of(recorded: Sequence[Recorded], pulses: str | None, speed: str | None
     name = pulses or speed or next((each.name for each in recorded if each.unit.lower() in ("rpm", "1/min", "rad/s")), None)
     if name is None:
         return None
-    channel_found = next((each for each in recorded if each.name.lower() == name.lower()), None)
-    if channel_found is None:
+    rotor = next((each for each in recorded if each.name.lower() == name.lower()), None)
+    if rotor is None:
         raise InputError("pulses" if pulses else "speed", f"is {quoted(name)}; the channels are {_names(recorded)}")
-    if pulses is None and unit_factor(channel_found.unit or "rad/s", "rad/s") is None:
-        raise InputError(
-            "speed", f"is {quoted(name)}, which is in {quoted(channel_found.unit)}; give a channel in rpm, rad/s or Hz"
-        )
-    kind, unit = ("pulses", None) if pulses else ("speed", channel_found.unit or None)
-    channel = Channel(channel_found.name, kind, unit=unit, per_turn=per_turn)
-    if channel_found.time is None:
+    if pulses is None and unit_factor(rotor.unit or "rad/s", "rad/s") is None:
+        raise InputError("speed", f"is {quoted(name)}, which is in {quoted(rotor.unit)}; give a channel in rpm, rad/s or Hz")
+    kind, unit = ("pulses", None) if pulses else ("speed", rotor.unit or None)
+    channel = Channel(rotor.name, kind, unit=unit, per_turn=per_turn)
+    if rotor.time is None:
         raise InputError(
             "pulses" if pulses else "speed",
             f"is {quoted(name)}, which has no times in the file; give the sampling rate, `rate`",
         )
-    return MeasuredRun.from_arrays(
-        [channel], {channel_found.name: channel_found.time}, {channel_found.name: channel_found.values}, source="recording"
-    )
+    return MeasuredRun.from_arrays([channel], {rotor.name: rotor.time}, {rotor.name: rotor.values}, source="recording")
 
 
 def _names(recorded: Sequence[Recorded]) -> str:

@@ -28,7 +28,7 @@ _CLEARLY = 6.0
 """Distance of a drift from 0, in standard errors, above which a note states it."""
 
 _LESS_NOISE = 0.5
-"""Residuals with the drifts, relative to those without, below which a note states them even if other residuals remain."""
+"""Residuals with the drifts, relative to those without, below which a note states the drifts even if not only noise remains."""
 
 
 def clock_notes(fitted: Fitted) -> list[str]:
@@ -39,7 +39,7 @@ def clock_notes(fitted: Fitted) -> list[str]:
     """
     problem = fitted.problem
     measured = all(rotor.samples is not None for rotors in problem.rotors for rotor in rotors)
-    if not measured or not resembles(fitted) or fitted.misfits or _share(fitted) < _MIN_SHARE:
+    if not measured or not resembles(fitted) or fitted.misfits or _explained_share(fitted) < _MIN_SHARE:
         return []
     first = fitted.x.size - problem.unknowns.errors
     rotors = tuple(tuple(_with_drift(rotor) for rotor in each) for each in problem.rotors)
@@ -67,12 +67,13 @@ def clock_notes(fitted: Fitted) -> list[str]:
             notes.append(
                 f"in run {k + 1} the clock of the sensors is {which} against that of the tachometer, by "
                 f"{1e3 * abs(drift) * duration:.3g} ms over the record ({1e6 * abs(drift):.0f} ppm): with this drift the "
-                f"residuals are {ratio:.2g} times these; record both by one device, or correct the times of one of them"
+                f"residuals are {ratio:.2g} times those without it; record both signals by one device, or correct the times of "
+                "one signal"
             )
     return notes
 
 
-def _share(fitted: Fitted) -> float:
+def _explained_share(fitted: Fitted) -> float:
     """Return the largest share of the variance of a channel's residuals that a drift and a delay of the model explain."""
     shares, problem = [0.0], fitted.problem
     for time, raw, mask, left in zip(problem.times, problem.raw, problem.masks, fitted.differences, strict=True):

@@ -23,9 +23,9 @@ from jaxvib.numerics.noise import Noise
 from jaxvib.units.columns import unit_factor
 
 _MAX_COST, _MAX_COST_OF_UNIT, _MAX_COST_OF_MOTION = 0.5, 0.05, 0.25
-"""Largest cost with another direction or place, and with another unit, relative to that with the given description, and largest
-cost relative to that without any motion, at which the description is named. The limit for units is low: readings with a wrong
-gain also fit better with a unit near it."""
+"""Largest costs at which another description is named: with another direction or place, and with another unit, relative to the
+cost with the given description; and relative to the cost of a model without motion. The limit for units is low, because
+readings of a sensor with a wrong gain also fit better with a unit near this gain."""
 
 _EQUAL_COST = 1e-3
 """Relative difference of the costs of two descriptions up to which the records do not distinguish them."""
@@ -49,7 +49,7 @@ def description_notes(problem: Problem) -> list[str]:
     if problem.linear is not None:
         return []
     given, others = _weighted(problem), list(_descriptions(problem))
-    changed = [_weighted(_changed(problem, each)) for each in others]
+    changed = [_weighted(_with_description(problem, each)) for each in others]
     costs = np.array([_first_cost(each) for each in changed])
     if not others or np.min(costs) >= _first_cost(given):
         return []
@@ -85,7 +85,7 @@ def _names(channels: Sequence[Channel]) -> str:
     return f"channel{'s' if len(channels) > 1 else ''} {' and '.join(quoted(each.name) for each in channels)}"
 
 
-def _changed(problem: Problem, description: _Description) -> Problem:
+def _with_description(problem: Problem, description: _Description) -> Problem:
     """Return the problem with the readings of another description."""
     raw, masks = [], []
     for samples, values, mask in zip(problem.runs, problem.raw, problem.masks, strict=True):

@@ -50,8 +50,8 @@ _TORQUE_SHARE = 0.02
 """First value of the torque of another law, relative to that of the drag."""
 
 _RELATIVE_RADIUS = 0.1
-"""Radius of a ball, or diameter of a bearing, relative to the radius of the circle, for loads without one. Only its product
-with, or ratio to, the coefficient of friction has an influence."""
+"""Radius of a ball, or diameter of a bearing, relative to the radius of the circle, for loads that do not state this size.
+Only the ratio of the coefficient to the radius, or the product of the coefficient and the diameter, has an influence."""
 
 
 class AirDrag(Effect):
@@ -106,7 +106,7 @@ def law_notes(
     best = min(residuals for _, residuals in better)
     named = [law for law, residuals in better if residuals <= _SAME_NOISE * best]
     words, remedies = ", or with ".join(law.words for law in named), "; or ".join(law.remedy for law in named)
-    return [f"the model fits clearly better with {words}: the residuals are {best:.2g} times these; {remedies}"]
+    return [f"the model fits clearly better with {words}: the residuals are {best:.2g} times those of this fit; {remedies}"]
 
 
 def _noise_ratio(before: Fitted, after: Fitted) -> float:

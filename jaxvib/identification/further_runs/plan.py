@@ -89,8 +89,7 @@ class RunPlan(Result):
 
 @validated
 def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping[str, Number] | None = None) -> RunPlan:
-    """Return the errors that the fitted parameters would have after each candidate run, computed before any of them is
-    recorded.
+    """Return the errors that the fitted parameters would have after each candidate run, before a candidate is recorded.
 
         errors^2 = diagonal of (F_so_far + F_candidate)^-1,       F = J^T J / noise^2,       J = d readings / d unknowns
 

@@ -102,7 +102,7 @@ class Expected(NamedTuple):
     **Attributes**
 
     - `fitted`: the run as a fit without iterations
-    - `indices_in_run` (k,): the positions, among the unknowns of the run, of the k unknowns that it has in common with the fit
+    - `indices_in_run` (k,): the positions, among the unknowns of the run, of the k unknowns that run and fit have in common
     - `indices_in_fit` (k,): the positions of the same unknowns in the information of the fit
     """
 
@@ -133,7 +133,8 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
         there = f"channel {quoted(channel.name)}"
         if (kind := kinds.get(channel.name, channel.kind)) != channel.kind:
             problem = (
-                f"is of kind {channel.kind}, but {kind} in the fit, whose noise and gain it would have; give it another name"
+                f"is of kind {channel.kind}, but {kind} in the fit; channels with the same name have the same noise and gain: "
+                "give the channel another name"
             )
             raise InputError(f"candidates: {planned.name}: {there}", problem)
         if channel.name not in noises:

@@ -28,13 +28,13 @@ _NOISE_RATIO = 1.5
 """Ratio of the residuals to the noise of the fit above which a note says that they are too large, and the status is
 `patterned`."""
 
-_NUMBER_ERROR = 1e-6
+_PARAMETER_ERROR = 1e-6
 """Relative standard error that fixes the parameters while the initial state of a nonlinear motion is fitted."""
 
 
 _MIN_FILTERED = 64
-"""Smallest number of residuals that remain after the filter that reduces their sampling rate. If this number limits the
-reduction, the residuals are assumed to be white noise in the rest of the reduction."""
+"""Smallest number of residuals that remain after the filter that reduces their sampling rate. If this number limits the factor
+of the filter, the remaining reduction assumes that the residuals are white noise."""
 
 
 class PredictionStatus(eqx.Enumeration):
@@ -46,8 +46,8 @@ class PredictionStatus(eqx.Enumeration):
         "the model lacks a part; see the notes"
     )
     contradicted = (
-        "the run contradicts the fit: it is of another machine, the machine has changed, or a change stated for the run is "
-        "wrong; see the notes, and do not fit both runs together"
+        "the run contradicts the fit: the run is of another machine, the machine has changed, or a change stated for the run "
+        "is wrong; see the notes, and do not fit this run together with those of the fit"
     )
 
 
@@ -83,7 +83,7 @@ class RunPrediction(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the readings with the prediction, and the residuals, onto two axes `ax` if given."""
+        """Plot the readings with the prediction, and the residuals, onto two axes: `ax`, or those of a new figure."""
         from jaxvib.draw.record import fit_chart  # slow import
 
         return fit_chart(self.time, self.readings, self.predicted, self.noise, self.channels, ax=ax)
@@ -159,14 +159,16 @@ def _noise_ratio(fit: MachineFit, name: str, time: np.ndarray, residuals: np.nda
     if not runs:
         return math.nan
     r, k = runs[-1], fit.channels[runs[-1]].index(name)
-    own, others = time[1] - time[0], fit.time[r][1] - fit.time[r][0]
-    of_fit = (
-        float(fit.noise[r][k]) if own < 1.5 * others else _reduced(fit.readings[r][:, k] - fit.fitted[r][:, k], own / others)
-    )
-    return (float(np.nanstd(residuals)) if others < 1.5 * own else _reduced(residuals, others / own)) / of_fit
+    step, step_of_fit = time[1] - time[0], fit.time[r][1] - fit.time[r][0]
+    noise_of_fit, noise = float(fit.noise[r][k]), float(np.nanstd(residuals))
+    if step >= 1.5 * step_of_fit:
+        noise_of_fit = _noise_at_lower_rate(fit.readings[r][:, k] - fit.fitted[r][:, k], step / step_of_fit)
+    if step_of_fit >= 1.5 * step:
+        noise = _noise_at_lower_rate(residuals, step_of_fit / step)
+    return noise / noise_of_fit
 
 
-def _reduced(residuals: np.ndarray, ratio: float) -> float:
+def _noise_at_lower_rate(residuals: np.ndarray, ratio: float) -> float:
     """Return the standard deviation of residuals (n,) at a sampling rate that is lower by the `ratio`."""
     factor = max(min(round(ratio), residuals.size // _MIN_FILTERED), 1)
     if factor > 1:
@@ -202,9 +204,9 @@ def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
         if name in fit.gain_names:
             x[first + k] = math.log(fit.gains[fit.gain_names.index(name)].value)
     fixed, means, precisions = pairs if has_mark or len(sizes) > 1 else None, problem.means, problem.precisions
-    if is_nonlinear(fit.scene):  # the initial state has a nonlinear effect; the parameters are held by their priors
-        held = problem._replace(means=x, precisions=np.full(x.size, _NUMBER_ERROR**-2))
-        problem = (with_guided_motion if has_nonlinear_supports(fit.scene) else with_first_motion)(held)[0]
+    if is_nonlinear(fit.scene):  # the initial state has a nonlinear effect; small prior errors fix the parameters
+        with_fixed = problem._replace(means=x, precisions=np.full(x.size, _PARAMETER_ERROR**-2))
+        problem = (with_guided_motion if has_nonlinear_supports(fit.scene) else with_first_motion)(with_fixed)[0]
 
     def with_filters(
         problem: Problem, noise: list[Noise], differences: list[np.ndarray] | None
@@ -218,19 +220,19 @@ def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
         return filtered, linear, differences_of(filtered, x, linear)[0]
 
     first_noise = [Noise(np.ones(1), float(np.std(each))) for each in problem.raw[0].T]
-    filtered, _, left = with_filters(problem, first_noise, None)
+    filtered, _, residuals = with_filters(problem, first_noise, None)
     mask = problem.masks[0]
-    noise = [noise_of(each) for each in np.where(mask, left, np.nan).T]
-    filtered, linear, left = with_filters(filtered, noise, [left])
+    noise = [noise_of(each) for each in np.where(mask, residuals, np.nan).T]
+    filtered, linear, residuals = with_filters(filtered, noise, [residuals])
     filtered = filtered._replace(means=means, precisions=precisions)
-    return _Predicted(filtered, x, linear, np.where(mask, left, np.nan), [each.taps for each in noise], has_mark)
+    return _Predicted(filtered, x, linear, np.where(mask, residuals, np.nan), [each.taps for each in noise], has_mark)
 
 
 def _deviation(fit: MachineFit, at: _Predicted) -> Disagreement:
     """Return the deviation of a run from the fit."""
     problem, p, size = at.problem, at.x.size, len(fit.information)
-    equations, turn = run_equations(problem, at.x, at.linear)[0], polar_unbalances(problem, at.linear)[0]
-    matrix, slope = turn.T @ equations[:-1, :-1] @ turn, turn.T @ equations[:-1, -1]
+    equations, jacobian = run_equations(problem, at.x, at.linear)[0], polar_unbalances(problem, at.linear)[0]
+    matrix, slope = jacobian.T @ equations[:-1, :-1] @ jacobian, jacobian.T @ equations[:-1, -1]
     matrix[np.arange(p), np.arange(p)] += own_precisions(fit, problem)
     if problem.load_spread is not None:
         matrix[p:, p:] += problem.load_spread

@@ -227,7 +227,7 @@ def _fits(one: _Signal, place: _Signal, other: _Signal) -> bool:
 def _factor(one: _Signal, other: _Signal) -> complex | None:
     """Return the median of Y / ((i w)^d X) of two motions X, Y over the coherent frequencies, or None without such frequencies.
 
-    It is 1 if the channels agree. If their directions are opposite, its sign is reversed.
+    The median is 1 if the channels agree; opposite directions of the channels are taken into account.
     """
     step = max(float(np.median(np.diff(each.time))) for each in (one, other))
     start, end = max(one.time[0], other.time[0]), min(one.time[-1], other.time[-1])

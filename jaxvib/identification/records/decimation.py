@@ -38,7 +38,7 @@ _PASSES, _OUTLIER_DISTANCE, _RIPPLE = 4, 6.0, 1e-3
 signal is at least 6 standard deviations of the distances of all readings, and at least 1e-3 of the standard deviation of the
 signal, which is above the error of the filter."""
 
-_NEIGHBORS = 2
+_NEIGHBOURS = 2
 """Number of readings on each side of an outlier with which it is compared."""
 
 _PIECE = 2**18
@@ -48,7 +48,7 @@ _KINDS = ("acceleration", "velocity", "displacement", "force", "angle", "speed")
 
 
 def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
-    """Return a run with a lower sampling rate, and a note about both rates. A short or coarse run is returned unchanged.
+    """Return a run with a lower sampling rate, and a note about both rates. A short or slowly sampled run is not changed.
 
     The rate is reduced if the run has at least 2^14 samples, and at least 40 of them in a period of the `highest` frequency
     (rad/s) of the machine and its rotors.
@@ -115,7 +115,7 @@ def filter_readings(value: np.ndarray, factor: int) -> tuple[np.ndarray, int]:
         spread = 1.4826 * float(np.median(present)) if present.size else 0.0
         limit = max(_OUTLIER_DISTANCE * spread, _RIPPLE * float(np.std(value)))
         far_indices = np.flatnonzero(np.abs(deviation[inside]) > limit) + half
-        local_median = np.median(deviation[far_indices[:, None] + np.arange(-_NEIGHBORS, _NEIGHBORS + 1)], axis=1)
+        local_median = np.median(deviation[far_indices[:, None] + np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)], axis=1)
         # An outlier also moves the filtered signal around it; the comparison with the local median excludes these readings.
         is_bad[far_indices[np.abs(deviation[far_indices] - local_median) > limit]] = True
         if not np.any(is_bad):

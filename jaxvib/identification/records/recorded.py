@@ -59,7 +59,7 @@ def described_channels(
     """Return the times (s, from `low` to `high`) and the values of channels, and the units that the file states.
 
     The values are in SI units. If the channel has a `unit`, they are the values of the file, unchanged, in this unit. If a
-    channel of pulses has no times in the file, its recorded values are the times of the pulses; it then has no values.
+    channel of pulses has no times in the file, its recorded values are returned as the times of the pulses, without values.
 
     **Raises** `InputError` for a channel that the file does not have or has more than once, a wrong unit, and times and values
     of different length.

@@ -25,7 +25,7 @@ _MIN_DROPOUT, _MIN_RATIO = 20, 10
 """A segment of equal readings is a dropout if it has at least the first number of readings, and at least the second number
 times the length that 99 % of all segments do not exceed."""
 
-_BINS, _SPIKE, _MIN_CLIPPED = (0.001, 0.003, 0.01), 3.0, 10
+_BINS, _PEAK_RATIO, _MIN_CLIPPED = (0.001, 0.003, 0.01), 3.0, 10
 """Limits for clipped readings in a histogram: widths of its last bin, relative to the range of the values; smallest ratio of
 the number of readings in this bin to the number in the next four bins; smallest number of readings in this bin. For a smooth
 signal the ratio is below 2."""
@@ -202,9 +202,9 @@ def dropouts(value: np.ndarray) -> np.ndarray:
 def without_spikes(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, list[str]]:
     """Return the readings with NaN in place of spikes, and a note about them.
 
-    Spikes are at most 9 readings at each end of the range that exceed all other readings by more than three times the range of
-    the others. They are searched for in a channel of at least 100 readings. A fit by least squares begins with all readings,
-    and one such spike is enough to hide the motion.
+    At most 9 readings at each end of the range count as spikes. A spike is outside the range of the other readings by more than
+    three times this range. Channels of fewer than 100 readings are returned unchanged. A fit by least squares begins with all
+    readings, and one spike can hide the motion.
 
     >>> value = np.sin(0.1 * np.arange(400.0))
     >>> value[7] = 500.0
@@ -238,6 +238,7 @@ def clipped_at(value: np.ndarray) -> tuple[float, float]:
 
 
 def _clipped_above(value: np.ndarray) -> float:
+    """Return the level above which readings are clipped; infinite if the histogram has no peak at its upper end."""
     count = max(1, min(_MIN_CLIPPED, value.size // 4))  # fewer readings beyond all others are spikes
     ends = np.partition(value, (count - 1, value.size - count))
     top, size = float(np.max(value)), float(ends[value.size - count] - ends[count - 1])
@@ -252,6 +253,6 @@ def _clipped_above(value: np.ndarray) -> float:
         is_top = value > top - width
         in_last_bin, in_next_bins = np.count_nonzero(is_top), np.count_nonzero((value > top - 5.0 * width) & ~is_top)
         in_triples = np.count_nonzero(is_top[2:] & is_top[1:-1] & is_top[:-2])
-        if in_last_bin >= _MIN_CLIPPED and in_last_bin > _SPIKE * in_next_bins and in_triples >= _MIN_CLIPPED // 2:
+        if in_last_bin >= _MIN_CLIPPED and in_last_bin > _PEAK_RATIO * in_next_bins and in_triples >= _MIN_CLIPPED // 2:
             level = top - 2.0 * width  # noise on the clipped readings may exceed one bin
     return level

@@ -112,7 +112,7 @@ class _Data(NamedTuple):
     gram: np.ndarray
 
     def thinned(self, step: int) -> _Data:
-        """Return every value with an index that is a multiple of `step`."""
+        """Return the data with only those values whose index is a multiple of `step`."""
         part = slice(None, None, step)
         marks = np.unique(self.marks[part], return_inverse=True)[1]
         columns, gram = _mark_offsets(marks, self.weights[part])
@@ -240,10 +240,10 @@ def _value_count(time: np.ndarray, begin: float, end: float) -> int:
     return int(np.searchsorted(time, end) - np.searchsorted(time, begin))
 
 
-def _best_fit(data: _Data, jumps: Sequence[float], most: int) -> _KnotsFit:
-    """Return the fit with up to `most` intervals whose criterion is smallest."""
+def _best_fit(data: _Data, jumps: Sequence[float], max_intervals: int) -> _KnotsFit:
+    """Return the fit with the smallest criterion, among fits with up to `max_intervals` intervals."""
     fits, intervals = [], 1
-    while intervals <= min(most, data.time.size // 4):
+    while intervals <= min(max_intervals, data.time.size // 4):
         fits.append(_fit_knots(data, intervals, jumps))
         intervals = max(intervals + 1, int(1.4 * intervals))
     return min(fits, key=lambda each: each.criterion)
