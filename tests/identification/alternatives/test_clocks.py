@@ -12,14 +12,14 @@ from jaxvib.identification.alternatives.clocks import _DELAY, _DRIFT, _with_drif
 from jaxvib.identification.angle import rotor_angles
 
 
-def run_of(drift):
+def run_of(drift, accelerations):
     """Return a record whose sensors have a clock that is fast by `drift` against that of the tachometer."""
-    run = record(TIMES, run_up(False)[0], NOISE, np.random.default_rng(0))
+    run = record(TIMES, accelerations, NOISE, np.random.default_rng(0))
     return dataclasses.replace(run, times=run.times | {"tacho": (1.0 - drift) * run.times["tacho"]})
 
 
 def test_angle_of_a_drifting_clock():
-    (rotor,) = rotor_angles(scene_of(TRUTH), run_of(0.0))
+    (rotor,) = rotor_angles(scene_of(TRUTH), run_of(0.0, np.zeros((TIMES.size, 2))))
     drive, begin = _with_drift(rotor).drive, rotor.span[0]
     errors = np.zeros(drive.table.shape[2] - 1)
     errors[:2] = 1e-3 / _DRIFT, 2e-3 / _DELAY
@@ -34,7 +34,7 @@ def test_angle_of_a_drifting_clock():
 @pytest.mark.parametrize("drift", [1e-3, -3e-4, 1e-4])
 def test_drift_of_the_clock_of_the_sensors_is_noted(drift):
     scene = scene_of({name: value * (1.02 if "stiffness" in name else 1.0) for name, value in TRUTH.items()})
-    fit = jv.identify(scene, run_of(drift), unknown=NAMES)
+    fit = jv.identify(scene, run_of(drift, run_up(False)[0]), unknown=NAMES)
     assert fit.status_name == "patterned"
     (note,) = [note for note in fit.notes if "against that of the tachometer" in note]
     assert f"is {'fast' if drift > 0.0 else 'slow'} against" in note

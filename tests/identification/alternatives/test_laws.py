@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from repeated_records.fits import JAMMED_NOISE, NAMES, NOISE
-from repeated_records.jammed import RADIUS, TRUTH, jammed_record, scene_of
+from repeated_records.jammed import RADIUS, TIMES, TRUTH, jammed_record, scene_of, turning
 from repeated_records.supports import motion, support_record, truth
 from run_ups_by_scipy import TRUTH as MACHINE
+from run_ups_by_scipy import record
 from run_ups_by_scipy import scene_of as linear_scene_of
 from scipy.signal import lsim
 
@@ -105,7 +106,6 @@ def test_friction_of_loads_can_be_unknown(kind):
     else:
         loads, effect = jv.pendulums(count=2, mass=0.8, radius=RADIUS, drag=1.5), jv.DryFriction(0.002, diameter=0.01)
     name = f"effects.{effect.kind}.coefficient"
-    problem = build_problem(
-        scene.replace(loads=loads, effects=effect), [jammed_record(0.2, np.random.default_rng(0))], ["loads.drag", name], {}
-    )
+    still = record(TIMES, np.zeros((TIMES.size, 2)), 0.2, np.random.default_rng(0), turning=turning)
+    problem = build_problem(scene.replace(loads=loads, effects=effect), [still], ["loads.drag", name], {})
     assert [number.name for number in problem.unknowns.numbers] == ["loads.drag", name]

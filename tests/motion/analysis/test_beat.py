@@ -14,7 +14,7 @@ def run_of(speed=60.0, drag=0.3, until=6.0, imbalance="5 g m"):
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
     loads = jv.balls(count=1, mass=0.5, radius=0.1, drag=drag)
     scene = jv.Scene(machine, loads, jv.ConstantSpeed(speed), (jv.StaticImbalance(imbalance),))
-    return jv.simulate(scene, until, start="jam", mode=1)
+    return jv.simulate(scene, until, start="jam", mode=1, samples=2000, estimate=False)  # one program serves all runs
 
 
 @pytest.mark.parametrize(
