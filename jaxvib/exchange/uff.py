@@ -19,6 +19,8 @@ from jaxvib.equations.linear import estimated_frequencies, linear_model
 from jaxvib.errors import InputError, open_regular, optional_module, quoted, require_one_of, require_writable, written
 from jaxvib.exchange.state_space import state_space
 from jaxvib.machine.carrier import Place, on_body
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import SupportForce
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory
@@ -114,6 +116,9 @@ def export_uff(
     - Histories of a `Run`: the motion of every node and the force on the foundation (node 0; not of a machine from matrices
       without a foundation), and the amplitude spectra at the end of the run
 
+    Modes and responses are those of small vibrations: of nonlinear supports they include the linear parts only, which the
+    description of the machine in the file states.
+
     Header, units (SI), nodes and lines come first, because programs for modal analysis reject functions without them. Numbers
     have 12 digits; those of the abscissa and of mode shapes have 6 digits, as the format prescribes.
 
@@ -150,10 +155,11 @@ def export_uff(
         if quantity == "acceleration":
             raise InputError("quantity", "is 'acceleration', which a run does not save; use 'displacement' or 'velocity'")
         scene, content = source.scene, _histories(source, quantity)
+    head = _head(scene, path, is_linearized=isinstance(source, Scene) and has_term(scene.all_effects, SupportForce))
     pyuff = optional_module("pyuff", "uff")
     with written(path) as part:
         part.touch()  # raises an error that pyuff would hide
-        pyuff.UFF(str(part)).write_sets([*_head(scene, path), *content], mode="overwrite")
+        pyuff.UFF(str(part)).write_sets([*head, *content], mode="overwrite")
     return path
 
 
@@ -196,12 +202,13 @@ def _directions(scene: Scene) -> list[int]:
     return [2 + axis for axis in scene.machine.mounting(scene.exciters[0].place).axes]
 
 
-def _head(scene: Scene, path: Path) -> list[dict[str, Any]]:
-    """Return header, units, nodes and the line through them."""
+def _head(scene: Scene, path: Path, *, is_linearized: bool) -> list[dict[str, Any]]:
+    """Return header, units, nodes and the line through them; `is_linearized`: the header names nonlinear supports."""
     nodes = _nodes(scene)
     name = "".join(letter if letter.isprintable() and letter.isascii() else "_" for letter in path.stem)[:80]
+    kind = scene.machine.kind + ", linear parts of its nonlinear supports" * is_linearized
     return [
-        {"type": 151, "model_name": name, "description": scene.machine.kind, "db_app": "jaxvib", "program": "jaxvib"},
+        {"type": 151, "model_name": name, "description": kind, "db_app": "jaxvib", "program": "jaxvib"},
         {"type": 164, "units_code": 1, "units_description": "SI", "temp_mode": 1}
         | {"length": 1.0, "force": 1.0, "temp": 1.0, "temp_offset": 273.15},
         {"type": 15, "node_nums": [node.number for node in nodes]}

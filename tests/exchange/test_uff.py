@@ -317,3 +317,12 @@ def test_missing_packages_are_named(package, tmp_path, monkeypatch):
     }
     with pytest.raises(jv.InputError, match=r"is not installed; install it with: pip install '\.\["):
         calls[package]()
+
+
+@pytest.mark.parametrize("effects", [(), (jv.CubicSupport(1e9),)])
+def test_header_states_that_nonlinear_supports_are_linearized(home, effects):
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0), effects)
+    path = jv.export_uff(scene, home / "supports.unv", frequencies=[1.0, 2.0])
+    (header,) = [each for each in pyuff.UFF(str(path)).read_sets() if each["type"] == 151]
+    assert ("linear parts of its nonlinear supports" in header["description"]) == bool(effects)

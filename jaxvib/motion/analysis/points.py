@@ -161,8 +161,8 @@ def absent_vibration(machine: Machine, time: Array, measured: AbstractMeasured, 
     if has_vibration(share):
         return ""
     return (
-        f"{100.0 * float(share):.2g} % of the amplitude is at the mean speed of the exciters, {speed}; their speed changes, "
-        "the motion is a free vibration, or the vibration is smaller than the error of the run"
+        f"{100.0 * float(share):.2g} % of the amplitude is at the mean speed of the exciters, {speed}; their speeds change or "
+        "differ, the motion is a free vibration, or the vibration is smaller than the error of the run"
     )
 
 
