@@ -2,6 +2,7 @@
 
     python benchmarks/trials/hostile_calls.py --out out
     python benchmarks/trials/hostile_calls.py --only simulate --list
+    python benchmarks/trials/hostile_calls.py --numbers
 
 Every public function, every constructor that users call and every method of results is called once for each parameter and each
 hostile value, with valid other arguments, and once for each number and scene that JAX traces. A call ends
@@ -16,6 +17,9 @@ hostile value, with valid other arguments, and once for each number and scene th
 Each raw, hanging or silent call is printed as a line of Python that repeats it; the exit code is 1 if there is one. With
 `--out`, every finished function adds a line to `hostile_calls.jsonl` in that folder, and another call of the program continues
 after the last line.
+
+With `--numbers`, each number of a scene, state or argument of `FUNCTIONS` in turn is replaced by each of `EXTREMES`; a result
+is then silent if its status is a success, but one of its numbers is NaN.
 """
 
 from __future__ import annotations
@@ -52,6 +56,7 @@ from valid_calls import FOLDER, Call, calls
 import jaxvib as jv
 import optimize as op
 from jaxvib.errors import quoted
+from jaxvib.results.status import status_names
 
 PATIENCE = 20.0
 """CPU seconds that no call may take, without those of other programs."""
@@ -61,6 +66,15 @@ MEMORY = 8 * 2**30
 
 LONG = ("prepare_cpu", "use_cache")
 """Functions of which only refusals are looked at: a valid call runs for minutes or changes the process."""
+
+FUNCTIONS = ("response", "criterion", "whirl", "balanced_states", "phase_jams", "jam_orbit", "energy", "power")
+EXTREMES = (1e308, 1e300, 1e154, 1e-154, 1e-300, 5e-324)
+
+SUCCESSES = ("done", "found", "decided")
+"""Statuses of results whose numbers must not be NaN."""
+
+ABSENT = ("directivity", "balancing", "gathering", "undamped_balancing", "undamped_gathering")
+"""Fields in which NaN means that there is no such number, although the result was computed."""
 
 
 ALL = (
@@ -337,6 +351,56 @@ def asked_of(made: Callable[[], Call], share: float, seed: int, show_all: bool) 
     return {"counts": counts, "bad": bad, "seconds": round(time.process_time() - began, 1)}
 
 
+def variants(call: Call) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the arguments of a call with one number replaced, with the name of this number and its value."""
+    leaves, structure = jax.tree_util.tree_flatten_with_path(call.arguments)
+    for k, (path, leaf) in enumerate(leaves):
+        if np.asarray(leaf).dtype.kind != "f":
+            continue
+        for index in np.ndindex(np.shape(leaf)):
+            for value in EXTREMES:
+                changed = np.array(leaf)
+                changed[index] = value
+                values = [(changed if np.ndim(leaf) else value) if j == k else other for j, (_, other) in enumerate(leaves)]
+                name = f"{jax.tree_util.keystr(path)}{list(index) if index else ''} = {value:g}"
+                yield name, jax.tree.unflatten(structure, values)
+
+
+def nan_fields(result: jv.Result) -> list[str]:
+    """Return the names of the fields that contain NaN where the status is a success."""
+    success = np.isin(status_names(result.status), SUCCESSES)
+    fields = {name: np.asarray(getattr(result, name)) for name in result.__dataclass_fields__ if name not in ABSENT}
+    numbers = {name: values for name, values in fields.items() if values.dtype.kind == "f"}
+    of_points = {name for name, values in numbers.items() if values.shape[: success.ndim] == success.shape}
+    return [name for name, values in numbers.items() if np.any(np.isnan(values[success] if name in of_points else values))]
+
+
+def with_extreme_numbers(only: str) -> int:
+    """Call `FUNCTIONS` with extreme numbers, print what is not as it must be, and return the number of these calls."""
+    wrong = 0
+    for made in calls():
+        named = made.named  # pyright: ignore[reportFunctionMemberAccess]
+        if named not in FUNCTIONS or only not in ("", named):
+            continue
+        call, counts = made(), collections.Counter[str]()
+        for name, arguments in variants(call):
+            answers: list[Any] = []
+
+            def ask(arguments: dict[str, Any] = arguments, answers: list[Any] = answers, call: Call = call) -> Any:
+                answers.append(call.function(**arguments))
+                return answers[0]
+
+            kind, said = judged(ask)
+            if kind == "answered" and isinstance(answers[0], jv.Result) and (fields := nan_fields(answers[0])):
+                kind, said = "silent", f"is {answers[0].message}, but NaN: {', '.join(fields)}"
+            counts[kind] += 1
+            if kind in ("raw", "hang", "silent"):
+                wrong += 1
+                print(f"{kind}: {named} with {name}: {said}", flush=True)
+        print(f"{named}: {sum(counts.values())} calls, {dict(counts)}", flush=True)
+    return wrong
+
+
 def main() -> int:
     """Run the trial and print what is not as it must be."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
@@ -344,10 +408,13 @@ def main() -> int:
     parser.add_argument("--share", type=float, default=1.0, help="share of the hostile values, drawn by --seed")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--list", action="store_true", help="print every call")
+    parser.add_argument("--numbers", action="store_true", help="extreme numbers in place of hostile values")
     parser.add_argument("--out", type=pathlib.Path, help="folder of the counts, a line of JSON for each function")
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    if asked.numbers:
+        return int(with_extreme_numbers(asked.only) > 0)
     ends: dict[int, dict[str, Any]] = {}
     file = None
     if asked.out is not None:

@@ -475,7 +475,8 @@ def _block_diagonal(blocks: Sequence[Array]) -> Array:
 
 def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: Array, neutral: Array | int = 1) -> Array:
     """Return the growth rate of small disturbances of rotating masses that turn at one speed, 1/s: the `largest_growth` of the
-    averaged equations, linearized about the motion; NaN if the motion is not finite.
+    averaged equations, linearized about the motion; NaN if the motion is not finite, and if rounding errors of the fastest rate
+    of a rotating mass, such as that of a motor of 1e20 N m, exceed `omega`.
 
     **Arguments**: `omega` rad/s; `phase` (count,) rad; `displacement` (nd,) complex, m, as in `Amplitudes`; `neutral`: 1 for a
     common shift of all phases, and one more for each free parameter of a continuous family of motions.
@@ -493,7 +494,9 @@ def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: A
 
     y = jnp.concatenate([displacement, 1j * omega * displacement])
     matrix = jax.jacfwd(flow)(jnp.concatenate([y.real, y.imag, jnp.full_like(phase[free], omega), phase]))
-    return largest_growth(matrix, neutral)
+    rates = jnp.arange(4 * nd, 4 * nd + free.size)
+    rounding = jnp.finfo(omega.dtype).eps * jnp.max(jnp.abs(matrix[rates, rates]), initial=0.0)
+    return jnp.where(rounding < omega, largest_growth(matrix, neutral), jnp.nan)
 
 
 def decays(growth: Array, omega: Array) -> Array:

@@ -14,6 +14,8 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import PyTree
 from numpy.typing import NDArray
 
+from jaxvib.errors import ComputationError
+
 T = TypeVar("T")
 
 _MAX_UNROLLED_EQUATIONS = 8
@@ -125,10 +127,17 @@ def hermitian_error(pencil: tuple[Array, Array], values: Array, shapes: Array) -
 def poles_of(
     mass: Array | np.ndarray, damping: Array | np.ndarray, stiffness: Array | np.ndarray
 ) -> NDArray[np.complexfloating]:
-    """Return the roots s (2 n,) of det(s^2 M + s C + K) = 0, in NumPy's arithmetic."""
-    flow = -np.linalg.solve(mass, np.concatenate([stiffness, damping], axis=1))
-    n = len(flow)
-    return np.linalg.eigvals(np.concatenate([np.eye(n, 2 * n, n), flow])).astype(complex)
+    """Return the roots s (2 n,) of det(s^2 M + s C + K) = 0, in NumPy's arithmetic.
+
+    **Raises** `ComputationError` with the status "lost_digits" if M is singular within rounding, or M^-1 K or M^-1 C overflow.
+    """
+    try:
+        flow = -np.linalg.solve(mass, np.concatenate([stiffness, damping], axis=1))
+        n = len(flow)
+        return np.linalg.eigvals(np.concatenate([np.eye(n, 2 * n, n), flow])).astype(complex)
+    except np.linalg.LinAlgError as error:
+        problem = "the free vibrations of the machine are lost in rounding errors; check its largest and its smallest numbers"
+        raise ComputationError("lost_digits", problem) from error
 
 
 @jax.custom_jvp

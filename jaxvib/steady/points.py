@@ -27,7 +27,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, known_number, number, numbers
-from jaxvib.units.known import require_if_known, when_known
+from jaxvib.units.known import require_finite, require_if_known, when_known
 from jaxvib.units.reading import STANDARD_GRAVITY
 
 
@@ -269,9 +269,18 @@ class PathsOfPoints(eqx.Module):
 
         **Arguments**: `about`: the fixed point to which the moment refers, see `jaxvib.foundation_moment`.
 
-        **Raises** `InputError` for a machine that is not a body in a plane.
+        **Raises** `InputError` for a machine that is not a body in a plane; `ComputationError` with the status "overflow" if
+        the moment of a finite motion is not finite.
         """
-        return _moment(self.harmonic(), numbers(about, "m", "about", 2))
+        motion = self.harmonic()
+        moment = _moment(motion, numbers(about, "m", "about", 2))
+        when_known(_require_finite_moment, motion.amplitude, moment)
+        return moment
+
+
+def _require_finite_moment(amplitude: np.ndarray, moment: np.ndarray) -> None:
+    if np.all(np.isfinite(amplitude)):
+        require_finite("parts of the foundation moment", moment)
 
 
 def rows_in_plane(machine: Machine, place: Place, name: str = "at") -> Array:

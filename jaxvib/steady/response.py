@@ -26,6 +26,7 @@ from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.readable import Readable
 from jaxvib.results.result import Result
+from jaxvib.results.status import status_names
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Pieces, branch_pieces, branch_root, grid_near_poles, resampled_grid, scanned_speed
 from jaxvib.steady.measures import Vibration, acceleration_of, rms_velocity_of
@@ -264,7 +265,8 @@ def response(
     `lands_at`, which have none. An undamped resonance has the status `unbounded` and infinite values.
 
     **Raises** `InputError` for exciters with loads, for effects that this function does not include, for ideal drives of
-    different speeds, and for several motors whose torques have the sum 0 at several speeds.
+    different speeds, and for several motors whose torques have the sum 0 at several speeds; `ComputationError` with the status
+    "overflow" if a value exceeds the range of floating-point numbers.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -291,7 +293,16 @@ def response(
     else:
         w = jnp.atleast_1d(numbers(speeds, "rad/s", "speeds", None, low=0.0))
     require_finite("speeds of the response", w)
-    return outcome(_response(scene, w, angles), scene)
+    found = outcome(_response(scene, w, angles), scene)
+    when_known(lambda *_: _require_no_overflow(found), found.exciter_force)
+    return found
+
+
+def _require_no_overflow(found: Response) -> None:
+    """**Raises** `ComputationError` for values that are not finite, except for the infinite values at an undamped resonance."""
+    done = status_names(found.status) == "done"
+    values = (found.amplitude, found.foundation_force, found.torque)
+    require_finite("values of the response", found.exciter_force, *(np.asarray(each)[done] for each in values))
 
 
 def require_unbalances(scene: Scene) -> None:

@@ -237,7 +237,7 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
             turns & (_sense(model.mount, chosen_shapes) > 0.0) & ~straight,
             straight,
             jnp.where(turns, _directivity(model.mount, chosen_shapes), jnp.nan),
-            error[nearest][chosen] > MAX_EIGENVALUE_ERROR,
+            ~(error[nearest][chosen] <= MAX_EIGENVALUE_ERROR),  # True for NaN
         )
 
     speed, decay, forward, straight, directivity, lost = jax.vmap(at)(speeds)

@@ -117,6 +117,12 @@ class Known(PathsOfPoints):
         return Harmonic(SCREEN, jnp.asarray(SPEED), self.amplitude)
 
 
+def test_moment_about_a_point_too_far_away_has_a_status():
+    with pytest.raises(jv.ComputationError, match=r"^overflow: parts of the foundation moment are not finite"):
+        Known(jnp.array([3e-3 + 0j, 3e-3, 0.0])).foundation_moment(about=(1e308, 0.0))
+    assert np.isnan(Known(jnp.array([jnp.nan + 0j, 3e-3, 0.0])).foundation_moment())  # without a motion
+
+
 def test_deck_of_a_translation_has_no_spread():
     deck = Known(jnp.array([3e-3 + 0j, 3e-3, 0.0])).deck([(-1.0, 0.2), (0.0, 0.2), (1.0, 0.2)])
     np.testing.assert_allclose(deck.motion_spread, 0.0, atol=1e-15)

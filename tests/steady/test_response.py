@@ -436,6 +436,12 @@ def test_speeds_that_overflow_have_a_status():
         jv.response(jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), exciters=[exciter]))
 
 
+def test_torques_that_overflow_have_a_status():
+    exciter = jv.Exciter(drive=jv.DCMotor(100.0, stall_torque=60.0, inertia=0.05), unbalance=1e154)
+    with pytest.raises(jv.ComputationError, match=r"^overflow: values of the response are not finite"):
+        jv.response(jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), exciters=[exciter]))
+
+
 def test_scenes_with_loads_are_refused():
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))

@@ -229,3 +229,9 @@ def test_stiffnesses_that_overflow_have_a_status():
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
     with pytest.raises(jv.ComputationError, match=r"^overflow: stiffnesses of the machine are not finite"):
         jv.whirl(scene, [0.0])
+
+
+def test_whirls_that_are_not_finite_count_as_lost():
+    scene = eqx.tree_at(lambda s: s.machine.stations, published_rotor(), jnp.asarray(1e300))
+    found = jv.whirl(scene, (100.0, 200.0))
+    assert found.status_name == "lost_digits" and np.all(np.isnan(found.speed) == np.isnan(found.decay))

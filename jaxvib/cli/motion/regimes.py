@@ -152,10 +152,11 @@ def _row(regime: jv.SynchronousRegime, scale: float) -> list[str]:
     from jaxvib.results.status import status_name  # slow imports, which --help does not need
     from jaxvib.steady.jams.phases import degrees
 
+    name = status_name(regime.status)
     return [
         f"{scale * float(regime.speed):.6g}",
-        "stable" if regime.stable else "unstable",
-        {"degenerate": "family", "no_vibration": "no vibration"}.get(status_name(regime.status), ""),
+        "stable" if regime.stable else "unknown" if name == "undecided" else "unstable",
+        {"degenerate": "family", "no_vibration": "no vibration"}.get(name, ""),
         " ".join(f"{degrees(float(a)):.4g}" for a in regime.phases),
         f"{float(regime.margin):.4g}",
         " ".join(f"{float(p):.4g}" for p in regime.power),

@@ -13,6 +13,7 @@ from jax import Array
 
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.torque_balance import TorqueBalance, influence_of, torques_at
+from jaxvib.errors import ComputationError
 from jaxvib.numerics.linalg import magnitude, poles_of
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
@@ -256,7 +257,10 @@ def _newton_round(row: Array, phase: Array, balance: TorqueBalance, at: SearchDa
 
 
 def load_speeds(balance: TorqueBalance) -> np.ndarray:
-    """Return load speeds below the rotor speed, dense near the carrier's resonances at this rotor speed."""
+    """Return load speeds below the rotor speed, dense near the carrier's resonances at this rotor speed.
+
+    **Raises** `ComputationError` with the status "lost_digits" if no floating-point number lies between 0 and the rotor speed.
+    """
     model, speed = balance.model, float(balance.speed)
     matrices = model.mass, model.damping(balance.speed), model.carrier.stiffness
     poles = poles_of(*matrices) if model.modal is None else np.asarray(model.modal.poles)
@@ -266,7 +270,10 @@ def load_speeds(balance: TorqueBalance) -> np.ndarray:
     crowd = [w * (1.0 + side * offsets) for w in centres for side in (-1.0, 1.0)]
     top = speed * (1.0 - np.geomspace(1e-6, 0.1, 12))
     speeds = np.unique(np.concatenate([np.linspace(0.02, 0.98, LOAD_SPEEDS) * speed, top, *crowd]))
-    return speeds[(speeds > 1e-3 * speed) & (speeds < speed)]
+    inside = speeds[(speeds > 1e-3 * speed) & (speeds < speed)]
+    if not inside.size:
+        raise ComputationError("lost_digits", f"no number is a load speed below the rotor speed, {speed:.3g} rad/s")
+    return inside
 
 
 def _regular_phases(balance: TorqueBalance) -> np.ndarray:

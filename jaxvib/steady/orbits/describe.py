@@ -19,14 +19,9 @@ from jaxvib.results.fields import in_unit, names_along
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.orbits.solve import Harmonics, Parameter, PeriodicSolution, branch_tangent, harmonics_of, periodic_motion
-from jaxvib.steady.orbits.stability import Floquet, decay_error, floquet, multiplier_error
+from jaxvib.steady.orbits.stability import MAX_INTEGRATION_STEPS, Floquet, decay_error, floquet, multiplier_error
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.units import count, known_number
-
-_MAX_INTEGRATION_STEPS = 2**17
-"""Maximum number of integration steps over the span of the collocation grid (a period, or half a period with half-turn
-symmetry); beyond it no multipliers are computed. The fastest motion of the carrier is then 1.5e4 to 4e4 times as fast as the
-loads, and an orbit would take seconds to hours."""
 
 
 class OrbitStatus(eqx.Enumeration):
@@ -269,7 +264,7 @@ def orbits(
     grid = grid_of(points, model.half_turn)
     motion, harmonics, measured = _solve_each(model, grid, given, (value, start, deviation))
     # Steps of twice the length that `steps_for` chooses have errors of 1e-8.
-    resolved = jnp.asarray(steps) <= (_MAX_INTEGRATION_STEPS if max_steps is None else 2 * max_steps)
+    resolved = jnp.asarray(steps) <= (MAX_INTEGRATION_STEPS if max_steps is None else 2 * max_steps)
     limited = jnp.where(resolved, steps if max_steps is None else jnp.minimum(steps, max_steps), 1)
     growth = floquet(model, grid, motion, harmonics, limited, implicit=implicit, max_steps=max_steps)
     multipliers, trivial, largest = _multipliers_of(growth, grid)

@@ -38,6 +38,11 @@ power of the phase."""
 _ROUNDING_ERRORS = 1e3
 """Lower bound of the error of multipliers that is reported, in multiples of the machine epsilon."""
 
+MAX_INTEGRATION_STEPS = 2**17
+"""Maximum number of integration steps over the span of the collocation grid (a period, or half a period with half-turn
+symmetry); beyond it no multipliers are computed. The fastest motion of the carrier is then 1.5e4 to 4e4 times as fast as the
+loads, and an orbit would take seconds to hours."""
+
 _STIFF_DECAY_RATIO = 3.0
 """Ratio of decay rate and fastest oscillation above which the implicit method is used. Explicit steps would have to resolve
 the decay, and diverge above a ratio of about 7."""

@@ -71,6 +71,10 @@ class SynchronousStatus(eqx.Enumeration):
     )
     different_speeds = "ideal drives turn unbalances at different speeds, so that no motion repeats"
     under_resolved = "the periodic motion needs more harmonics for the requested accuracy; give more points"
+    unresolved = (
+        "the motion was found, but not its stability: the fastest vibration of the machine is too fast "
+        "compared with the exciters"
+    )
     at_fold = "the motion is at a fold or belongs to a continuous family of motions: it has no gradient"
     refused = REFUSED
 
@@ -398,6 +402,7 @@ def _solve_program(
     for k in forcing:
         has_one_speed = has_one_speed & (jnp.abs(scene.exciters[k].drive.speed / speed - 1.0) < 64.0 * eps)
     status = SynchronousStatus.where(error <= accuracy, SynchronousStatus.found, SynchronousStatus.under_resolved)
+    status = SynchronousStatus.where(jnp.isnan(largest), SynchronousStatus.unresolved, status)
     nearest = jnp.min(jnp.abs(multipliers - 1.0))
     status = SynchronousStatus.where(nearest < eps**0.4, SynchronousStatus.at_fold, status)
     status = SynchronousStatus.where(is_met, status, SynchronousStatus.not_converged)

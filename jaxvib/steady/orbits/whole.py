@@ -27,7 +27,7 @@ from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of, resampling
 from jaxvib.numerics.linalg import eigenvalues, small_solve, solve_in_turn
 from jaxvib.steady.orbits.solve import Linearized, newton
-from jaxvib.steady.orbits.stability import deflate, multiplier_error
+from jaxvib.steady.orbits.stability import MAX_INTEGRATION_STEPS, deflate, multiplier_error
 
 
 def body_counts(scene: Scene) -> tuple[int, ...]:
@@ -308,7 +308,8 @@ def multipliers_of(
     scene: PeriodicScene, grid: Grid, motion: WholeMotion, max_steps: int | None, *, forced: bool
 ) -> tuple[Array, Array, Array]:
     """Return the Floquet multipliers of the full state about a periodic motion without the trivial one of a shift in time, the
-    trivial one (NaN with forcing), and the error of their moduli.
+    trivial one (NaN with forcing), and the error of their moduli. Multipliers that need more than `MAX_INTEGRATION_STEPS` are
+    NaN.
 
     `max_steps`: limit of the steps of `radau.flow`, without which there are no derivatives in reverse mode.
     """
@@ -323,15 +324,23 @@ def multipliers_of(
 
     radians = _radians(*jax.lax.stop_gradient((scene, omega)))
     steps = radau.steps_for(radians)
-    steps = steps if max_steps is None else jnp.clip(steps, 1, max_steps)
+    resolved = jnp.asarray(True) if max_steps is not None else steps <= MAX_INTEGRATION_STEPS
+    steps = jnp.where(resolved, steps, 1) if max_steps is None else jnp.clip(steps, 1, max_steps)
     whole = radau.flow(slopes, n, 2.0 * np.pi, steps, x.dtype, max_steps)
     decay_error = radau.decay_error(radians / steps, steps)
     if forced:
-        return eigenvalues(whole), jnp.full_like(omega, jnp.nan), multiplier_error(jnp.ones_like(omega), decay_error)
+        return _multipliers(whole, resolved), jnp.full_like(omega, jnp.nan), multiplier_error(jnp.ones_like(omega), decay_error)
     rate, second = _rates(grid, x)
     along = jnp.concatenate([rate[:, 0].at[scene.coordinates :].add(1.0), second[:, 0]])
     trivial, rest = deflate(whole, along)
-    return eigenvalues(rest), trivial, multiplier_error(trivial, decay_error)
+    return _multipliers(rest, resolved), trivial, multiplier_error(trivial, decay_error)
+
+
+def _multipliers(matrix: Array, resolved: Array) -> Array:
+    """Return the eigenvalues of a transition matrix; NaN if it is not `resolved` or not finite."""
+    # The library routine for eigenvalues does not terminate for a matrix that is not finite.
+    valid = resolved & jnp.all(jnp.isfinite(matrix))
+    return jnp.where(valid, eigenvalues(jnp.where(valid, matrix, 0.0)), jnp.nan)
 
 
 def _radians(scene: PeriodicScene, omega: Array) -> Array:

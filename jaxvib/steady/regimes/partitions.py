@@ -217,7 +217,7 @@ def _can_share(scene: Scene, owners: np.ndarray) -> bool:
 def _regimes_of_group(scene: Scene, subset: tuple[int, ...], *, stable: bool) -> list[SynchronousRegime]:
     """Return the regimes of a group of masses."""
     found: SynchronousRegimes = synchronous_regimes(scene, masses=subset)
-    finite = np.isfinite(np.asarray(found.growth))
+    finite = np.isfinite(np.asarray(found.speed))
     wanted = np.flatnonzero(finite & np.asarray(found.stable) if stable else finite)
     numpy = jax.tree.map(np.asarray, eqx.filter(found, eqx.is_array))
     found = eqx.combine(numpy, found)
@@ -246,7 +246,7 @@ def _motion(parts: list[_Group], count: int) -> tuple:
         masses = list(subset)
         group[masses], family[masses] = number, status_name(regime.status) == "degenerate"
         speed[masses], phases[masses], torque[masses] = regime.speed, regime.phases, regime.torque
-    growth = max(float(regime.growth) for _, regime in parts)
+    growth = float(np.max([regime.growth for _, regime in parts]))  # NaN if one of them is unknown
     return group, speed, phases, torque, family, growth, all(bool(regime.stable) for _, regime in parts)
 
 

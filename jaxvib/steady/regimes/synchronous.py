@@ -85,6 +85,10 @@ class RegimeStatus(eqx.Enumeration):
         "synchronous_regimes lists the unstable regimes, run_up shows the motion from rest"
     )
     unbounded = "the masses turn at an undamped resonance: the vibration grows without bounds"
+    undecided = (
+        "the rotating masses can turn at one speed in this way, but the growth of small disturbances is lost in rounding; "
+        "check the largest numbers of the motors and the drag"
+    )
     refused = REFUSED
 
 
@@ -175,8 +179,10 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
         if not np.isfinite(self.speed):
             return self.message
         phases = ", ".join(f"{degrees(float(a)):.4g}" for a in self.phases)
+        name = status_name(self.status)
         stable = f"{'stable' if bool(self.stable) else 'unstable'} ({float(self.growth):.3g} 1/s)"
-        special = {"degenerate": ", one of a family", "no_vibration": ", no vibration"}.get(status_name(self.status), "")
+        stable = "stability lost in rounding errors" if name == "undecided" else stable
+        special = {"degenerate": ", one of a family", "no_vibration": ", no vibration"}.get(name, "")
         return f"Omega {speed_text(self.speed, 6)}, {stable}, margin {float(self.margin):.3g}{special}: {phases} deg"
 
     @validated
@@ -462,6 +468,7 @@ def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: A
 
     speed, at = jax.lax.stop_gradient((jnp.where(exists, w, jnp.nan), angles))
     growth = regime_growth(frozen, speed, at, neutral) if growth is None else jnp.where(exists, growth, jnp.nan)
+    status = RegimeStatus.where(exists & jnp.isnan(growth), RegimeStatus.undecided, status)
     numbers = {
         "speed": w,
         "phases": angles,

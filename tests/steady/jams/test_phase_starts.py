@@ -43,6 +43,12 @@ def test_load_speeds_crowd_about_the_resonance():
     assert np.max(np.diff(speeds[speeds < 0.98 * 460.0])) < 0.005 * 460.0
 
 
+def test_rotor_speed_without_smaller_numbers_has_a_status():
+    scene = jv.Scene(MACHINE, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(5e-324))
+    with pytest.raises(jv.ComputationError, match=r"^lost_digits: no number is a load speed below"):
+        load_speeds(assemble_torque_balance(scene))
+
+
 def test_regular_phases_are_every_split_into_two():
     splits = _regular_phases(parts(count=3))
     assert {tuple(np.round(row / np.pi).astype(int)) for row in splits} == {(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)}

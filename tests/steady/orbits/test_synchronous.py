@@ -303,6 +303,14 @@ def test_ideal_drives_at_different_speeds_have_a_status():
     assert jv.synchronous_orbit(scene, throw=False).status_name == "different_speeds"
 
 
+def test_stability_with_very_fast_vibrations_is_unresolved():
+    machine = jv.one_mass(mass=50.0, stiffness=4e40, damping=30.0)
+    exciter = jv.Exciter(drive=jv.ConstantSpeed(60.0), unbalance=0.05)
+    found = jv.synchronous_orbit(jv.Scene(machine, exciters=[exciter]), points=9, throw=False)
+    assert found.status_name == "unresolved" and np.isnan(found.multiplier) and "stability unknown" in found.summary()
+    np.testing.assert_allclose(found.foundation_force, 0.05 * 60.0**2, rtol=1e-9)
+
+
 def test_wrong_input_ends_in_one_sentence(general):
     machine, loads = body(), jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
     with pytest.raises(jv.InputError, match="speed is missing"):

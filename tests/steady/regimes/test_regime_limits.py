@@ -166,10 +166,15 @@ def test_torques_that_overflow_end_in_a_status(where):
         jv.synchronous_regimes(eqx.tree_at(where, scene_of(PAIR, (1, 1)), jnp.asarray(1e160)))
 
 
-def test_motors_whose_squared_torques_overflow_hold_their_speed():
-    found = jv.synchronous_regimes(scene_of(PAIR, (1, -1), [jv.DCMotor(100.0, stall_torque=1e300, inertia=0.05)] * 2))
+@pytest.mark.parametrize("stall_torque", [1e150, 1e300])
+def test_stability_with_very_strong_motors_is_undecided(stall_torque):
+    """The speed is held, but the growth of small disturbances is smaller than rounding errors of the motors' rates."""
+    found = jv.synchronous_regimes(scene_of(PAIR, (1, -1), [jv.DCMotor(100.0, stall_torque=stall_torque, inertia=0.05)] * 2))
     assert found.speed.size > 0
     np.testing.assert_allclose(found.speed, 100.0, rtol=1e-9)
+    regime = found.select(0)
+    assert regime.status_name == "undecided" and np.isnan(regime.growth) and not regime.stable
+    assert "stability lost in rounding errors" in regime.summary()
 
 
 def test_margin_is_infinite_for_equal_drives():
