@@ -140,7 +140,7 @@ def require_path(value: object, field: str) -> Path:
 
 
 def with_ending(path: str | Path, ending: str) -> Path:
-    """Return the path of a file to be written, with the `ending` of its name if it is missing.
+    """Return the path of a file to be written; `ending` is appended to its name if it is missing.
 
     **Raises** `InputError` for a path without the name of a file.
 

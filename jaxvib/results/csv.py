@@ -64,7 +64,8 @@ def write_table(
 
 def main_axis(result: eqx.Module) -> str:
     """Return the name of the most frequent first axis of the arrays of a result; "" if no array has an axis. If this axis has
-    only one point (segments of a single spectrum), return that of the longest axis with coordinates (frequencies)."""
+    only one point (the segment of a single spectrum), return the name of the longest axis whose points are a field of the
+    same name (frequencies)."""
     arrays = [(name, axes, values) for name, axes, values, _ in columns(result) if axes and values.ndim == len(axes)]
     counts = collections.Counter(axes[0] for _, axes, _ in arrays)
     main = max(counts, key=lambda axis: counts[axis], default="")
@@ -75,7 +76,8 @@ def main_axis(result: eqx.Module) -> str:
 def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict[str, np.ndarray]:
     """Return the columns of the table of `write_csv` by their headers. **Raises** `InputError` for an unknown axis.
 
-    The first columns are the labels of the axis, if it has labels, and the units of coordinates whose units differ.
+    The first columns are the labels of the axis, if it has labels. A table along the coordinates also has a column of
+    their units if these differ.
     """
     labels = labels_of(result)
     units = labels.get("unit", ())

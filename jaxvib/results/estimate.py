@@ -71,8 +71,8 @@ def estimate_share(flags: Any) -> Share:
 
 
 def interval(value: float, error: float, quantile: float, instrument: float) -> Estimate:
-    """Return an estimate with the interval value +- sqrt((quantile error)^2 + (instrument value)^2). `error`: standard error
-    from noise; `quantile` of its distribution, such as 1.96; `instrument`: relative error of the instruments."""
+    """Return an estimate with the interval value +- sqrt((quantile * error)^2 + (instrument * value)^2). `error`: standard
+    error from noise; `quantile` of its distribution, such as 1.96; `instrument`: relative error of the instruments."""
     half = float(np.hypot(quantile * error, instrument * value))
     return Estimate(value, error, value - half, value + half)
 

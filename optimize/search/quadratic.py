@@ -104,7 +104,7 @@ def _with_slacks(
     identity = np.broadcast_to(np.eye(d), (s, d, d))
 
     def row(of_p: np.ndarray, k: int, count: int) -> np.ndarray:
-        """Return rows with the coefficients `of_p`, and -1 for the violation of each constraint from number `k`."""
+        """Return rows with the coefficients `of_p` of p; row j < `count` also has the coefficient -1 of violation `k` + j."""
         rows = np.zeros((s, of_p.shape[1], n))
         rows[:, :, :d] = of_p
         rows[:, np.arange(count), d + k + np.arange(count)] = -1.0

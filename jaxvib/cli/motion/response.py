@@ -36,7 +36,7 @@ def response(
     needs; --out adds a figure.
 
     The operating points are the speeds at which the torque of the motor is equal to the torque that the vibration needs.
-    Several exciters turn as if gears connected them: with fixed phases, and the sum of their torques. Motors without gears
+    Several exciters turn as if gears connected them: their phases are fixed, and their torques are added. Motors without gears
     choose other phases at other speeds (`jaxvib regimes`)."""
     import jax  # slow imports, which --help does not need
     import numpy as np
