@@ -55,7 +55,7 @@ _COLLECTED_CONDITIONS: contextvars.ContextVar[list[Array] | None] = contextvars.
 
 @contextlib.contextmanager
 def conditions_of_traced_values() -> Iterator[list[Array]]:
-    """Collect in the yielded list a Boolean for each traced value, True if it is allowed, while parts of a scene are built."""
+    """Yield a list. In the `with` block, each check of a traced value appends a Boolean to it: True if the value is allowed."""
     conditions: list[Array] = []
     token = _COLLECTED_CONDITIONS.set(conditions)
     try:
@@ -113,8 +113,8 @@ def number(
 
 
 def known_number(value: Number, unit: str, field: str, *, low: float = -math.inf, open_low: bool = False) -> Any:
-    """Return one number as `number` does, but as a NumPy array unless it is a JAX array: a compiled program copies it to the
-    device ten times as fast as a separate copy before the call."""
+    """Return one number as `number` does, but as a NumPy array unless it is a JAX array. A compiled program to which a NumPy
+    array is passed copies it to the device itself, ten times as fast as a separate copy before the call."""
     return _number(value, unit, field, Bounds(low, open_low))
 
 
@@ -185,7 +185,7 @@ def _needed(length: int, unit: str) -> str:
 
 
 def _hint_of_parts(unit: str) -> str:
-    """Return the notation of equal parts side by side, for a list where one number is needed, if their values are added."""
+    """Return a hint for a list in place of one number: the notation of equal parts side by side, if values in `unit` add."""
     return f"; equal parts side by side are written as '2 x 100 {unit}'" if unit in ADDED else ""
 
 

@@ -71,8 +71,8 @@ def require_within(planned: PlannedRun, limits: Limits) -> None:
 
 
 def optimized_profile(fit: MachineFit, planned: PlannedRun, expected: Expected, limits: Limits) -> SpeedProfile:
-    """Return the speed profile, linear between evenly spaced times, at the local minimum of the expected errors near the speed
-    of a planned run.
+    """Return the speed profile with the smallest expected errors within the limits. It is a local minimum: the search starts
+    from the speed of the planned run. The profile is linear between evenly spaced times.
 
     The objective is half the sum of the logarithms of the variances of the unknown parameters, with the prior standard error 1
     of each.

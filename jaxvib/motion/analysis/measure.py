@@ -277,8 +277,9 @@ def _spans_of_kinked_force(model: Model, field: Field, times: Array, states: Sta
 
 
 def _kinked_extrema(outputs: Callable[[Array, Array], Array], field: Field, times: Array, states: State) -> Array:
-    """Return extrema (2, 3, n) of `outputs` (n,), a function of displacement and velocity that is not smooth, ordered as those
-    of `locate_extrema`, for arguments as in `measure`.
+    """Return the extrema (2, 3, n) of n outputs that are not smooth, in the order of `locate_extrema`.
+
+    `outputs` is their function of displacement and velocity; the other arguments are those of `measure`.
 
     Between two samples, the outputs are computed from interpolated displacements and velocities. The search for the extrema is
     not differentiated; their values are.
@@ -370,8 +371,8 @@ def locate_peaks(model: Model, field: Field, times: Array, states: State) -> Pea
 
 
 class Extrema(NamedTuple):
-    """Extrema `low`, `high` (..., outputs) of displacements and foundation forces with kinks and jumps, from all steps of a run
-    or of several parts of it, and the largest `square` (...), N^2, of the magnitude of the foundation force."""
+    """Extrema `low`, `high` (..., outputs) of displacements and of foundation forces with kinks and jumps, and the largest
+    `square` (...), N^2, of the magnitude of the foundation force. A leading axis, if any, counts parts of a run."""
 
     low: Array
     high: Array

@@ -1,5 +1,5 @@
-"""Initial values of the search for jams at unequal phases: load speeds, and phases at which the torque balance of all loads
-requires the same multiple of their drag."""
+"""Initial values of the search for jams at unequal phases: load speeds, and phases at which the torques of all loads would be
+balanced if the drag of each load were multiplied by the same factor."""
 
 from __future__ import annotations
 
@@ -51,9 +51,10 @@ def search_clusters(balance: TorqueBalance, number: int, rng: np.random.Generato
 
     T_j is the mean torque of the vibration on load j, S_j the unbalance and a_j the phase of the load, w the load speed, and H
     are the influence coefficients (`influence_of`). F_j is the same for all equal loads. Equal loads also need the same torque;
-    Im(e^{-i a_j} F_j) is therefore equal for them, and at most two phases a_j are possible. For this reason no jam is missed by
-    a search over all divisions of the equal loads into two clusters, with one load in place of each cluster. The unknowns are
-    two phases for each group of equal loads, for any number of its loads. The same solution may occur several times.
+    Im(e^{-i a_j} F_j) is therefore equal for them, and at most two phases a_j are possible. In every jam, each group of equal
+    loads thus consists of one or two clusters, which are computed as one load each. The search covers all divisions of each
+    group into two clusters, with two unknown phases per group, for any number of its loads. The same solution may occur several
+    times.
     """
     divisions = _divisions(equal_loads(balance))
     each = max(number // len(divisions), min(number, _STARTS_OF_CLUSTERS))
@@ -186,8 +187,9 @@ def search_phases(
 
 
 def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return indices of the first occurrence of each distinct row of integers (n, m), ascending, and for each row the number
-    of its distinct row, (n,). Fast comparison by hashes; the probability that two of 1e5 rows share a hash is 3e-10."""
+    """Return indices of the first occurrence of each distinct row of integers (n, m), ascending, and for each row the position
+    of its distinct row in this list, (n,). Fast comparison by hashes; two of 1e5 rows share a hash with a probability of
+    3e-10."""
     hashes = rows.astype(int) @ np.random.default_rng(0).integers(2**63, size=rows.shape[1])
     order = np.argsort(hashes)
     begins = np.diff(hashes[order], prepend=hashes[order[:1]] - 1) != 0
@@ -234,16 +236,15 @@ def _solve_phases(balance: TorqueBalance, at: SearchData, row: np.ndarray, phase
     """Solve for phases from starts (n, count), each at the load speed with the index `row` (n,), in rounds of Newton steps;
     each round continues with the starts that have not converged.
 
-    **Returns** the drag's multiple (n,), the phases, and True for the phases of a jam.
+    **Returns** the drag's multiple (n,), the phases, and True if they have converged and the multiple is positive.
     """
     factor, phase, residual = np.zeros(row.size), np.array(phase), np.full(row.size, np.inf)
     eps, left = float(np.finfo(phase.dtype).eps), np.arange(row.size)
     for _ in range(_MAX_ROUNDS):
         found = in_chunks(_PHASES_PER_PROGRAM, _newton_round, row[left], phase[left], shared=(balance, at))
         factor[left], phase[left], residual[left] = found
-        # Three quarters of the digits must have converged: near a double solution, a residual with half of the digits is
-        # possible for phases far from both. At the end half of the digits is accepted, because solutions that form a curve
-        # reach no smaller residual.
+        # The residual must be below eps^(3/4): near a double solution, phases far from both solutions can have a residual of
+        # eps^(1/2). At the end eps^(1/2) is accepted, because solutions that form a curve reach no smaller residual.
         left = left[~(residual[left] < eps**0.75)]
         if left.size == 0:
             break
