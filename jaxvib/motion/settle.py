@@ -250,8 +250,8 @@ def _with_final_status(run: Run, name: str) -> Run:
 
 @cached
 def _matrices(scene: Scene, window: Trajectory | None) -> tuple[Array, Array, Array]:
-    """Return the matrices (nd, nd) of mass, damping with gyroscopic terms and, with a `window`, the mean slopes of the
-    resistances of supports in it, and stiffness."""
+    """Return the matrices (nd, nd) of mass, damping and stiffness. The damping contains the gyroscopic terms and, with a
+    `window`, the mean slopes of the resistances of supports in this window."""
     model = linear_model(scene)
     damping = model.damping(mean_speed(scene))
     for term, rows in zip(terms_of(scene.all_effects, SupportForce), assemble(scene).supports, strict=True):

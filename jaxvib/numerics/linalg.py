@@ -263,9 +263,9 @@ def _times(a: Array, b: Array) -> Array:
 def solve_in_turn(a: Array, b: Array) -> Array:
     """Return x of a x = b by the library, without derivatives.
 
-    On a CPU the library is called for one system of a batch after the other. A batched call can deadlock on a CPU: the same
-    threads run such calls and compute their systems, and if all of them wait, none can compute (jaxlib before 0.11.2). For
-    about 20 equations and more, calls one after the other are also faster.
+    On a CPU the library is called for one system of a batch after the other. A batched call can deadlock on a CPU
+    (jaxlib before 0.11.2): a thread that runs such a call waits until threads of the same pool have solved its systems. If all
+    threads wait, none is left to solve a system. For about 20 equations and more, calls one after the other are also faster.
     """
     return jnp.linalg.solve(a, b)
 
@@ -343,7 +343,8 @@ def complex_product(matrix: Array, other: Array) -> Array:
 
 def refine_solution(product: Callable[[Array], Array], inverse: Callable[[Array], Array], b: Array, norm: Array) -> Array:
     """Return x of A x = b, where `product(x)` is A x, `inverse(b)` an approximate solution, and `norm` the row-sum norm of A.
-    The residual corrects the solution, usually 0 and at most 4 times, until only rounding errors are left."""
+    The solution is corrected by its residual until only rounding errors are left, at most 4 times; usually no correction is
+    needed."""
     eps = jnp.finfo(norm.dtype).eps
 
     def residual(x: Array) -> tuple[Array, Array]:

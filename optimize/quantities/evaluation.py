@@ -31,8 +31,8 @@ from jaxvib.steady.regimes.working import working_regime
 from jaxvib.units.known import is_known
 
 _NO_FOLD = 10.0
-"""Rotor speed that stands for a missing fold at the end of a mode toward higher rotor speeds, in multiples of the rotor speed
-of the scene."""
+"""Rotor speed, in multiples of that of the scene, that is returned for a mode without a fold at its end toward higher rotor
+speeds."""
 
 _RUN_UP_SAMPLES = 4000
 """Number of stored states of a run-up."""

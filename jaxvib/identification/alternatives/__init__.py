@@ -1,1 +1,1 @@
-"""Other descriptions of channels, and other laws of friction, with which a machine explains records."""
+"""Search for other descriptions of channels, and other laws of friction, with which the model explains the records."""

@@ -36,8 +36,8 @@ _START_ANGLES = 8
 """Number of initial angles, and of runs, for each motor of `_varied_motors`."""
 
 _LIFTING_SHARE = 0.02
-"""Relative difference between the least torque and the torque that lifts an unbalance up to which they count as equal; the
-least torque has an error of 1 %."""
+"""Relative difference below which the least torque counts as equal to the torque that lifts an unbalance; the least torque
+has an error of 1 %."""
 
 _MIN_SHOWN_ERROR = 0.01
 """Smallest relative error of peaks that the text of a run-up states; that of averaging without gravity is about as large."""
@@ -254,8 +254,10 @@ def _varied_motors(scene: Scene) -> list[int]:
 
 
 def _peaks(run: Envelope) -> tuple[np.ndarray, float]:
-    """Return the largest amplitudes of a run, and the largest magnitude of the force on the foundation, N: within a turn that
-    of the vector Re(F exp(i theta)) is sqrt((sum |F_k|^2 + |sum F_k^2|)/2)."""
+    """Return the largest amplitudes of a run, and the largest magnitude of the force on the foundation, N.
+
+    The largest magnitude of the vector Re(F exp(i theta)) within a turn is sqrt((sum |F_k|^2 + |sum F_k^2|)/2).
+    """
     trajectory, model = run.trajectory, assemble(run.scene)
     assert trajectory is not None
     each = model.carrier.foundation_force(trajectory.displacement.T, trajectory.velocity.T)

@@ -35,8 +35,8 @@ from jaxvib.ode.batching import flat_tangents
 from jaxvib.ode.types import Args, BoolScalarLike, RealScalarLike, StepResult, Tangents, Terms
 
 _MARGIN = 0.05
-"""The forces outside and within a contact are computed shortly before and after its beginning: at this distance from it, as a
-share of the part of the step before or after it."""
+"""Distance from the beginning of a contact at which the forces outside it (before) and within it (after) are computed, as a
+share of the part of the step before or after the beginning."""
 
 
 class Contacts(eqx.Module):

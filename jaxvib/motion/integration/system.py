@@ -229,7 +229,8 @@ def with_first_derivatives(scene: Scene, inputs: T) -> tuple[Scene, T]:
     """Return a scene and the other inputs of a run; second derivatives with respect to them raise `InputError` if the scene has
     forces or torques that are not smooth.
 
-    The derivatives of a step in which a force has a kink can be differentiated, but the result lacks the shift of the kink.
+    Without the error, second derivatives would be wrong for a step in which a force has a kink: they would omit the change of
+    the time of the kink.
     """
     if not scene.not_smooth:
         return scene, inputs

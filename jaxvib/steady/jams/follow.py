@@ -46,7 +46,7 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
 
     omega = _newton(residual, near, target)
     reached, slope = jax.jvp(lambda w: rotor_speed_at(frozen, w), (omega,), (jnp.ones_like(omega),))
-    # A further Newton step does not change the root, but has its derivatives with respect to the model and the rotor speed.
+    # A further Newton step does not change the root; differentiating it gives the derivatives of the root.
     omega = omega - (rotor_speed_at(model, omega) - speed) / slope
     converged = jnp.abs(reached - target) < 1e-9 * (target + jnp.abs(slope) * omega)
     is_valid = converged & (omega > 0.0) & (omega < target) & ((slope > 0.0) == (mode % 2 == 1))

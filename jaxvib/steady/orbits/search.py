@@ -73,7 +73,8 @@ def _ends_before(scene: Scene, low: float, high: float, target: float, refinemen
     """Return True if the exact branch has a fold between two load speeds, at which it turns back before it reaches the rotor
     speed `target`, up to rounding.
 
-    The fold is that of the interpolated cubic in the last of `refinements` intervals, each smaller than the one before.
+    The interval around the fold is made smaller `refinements` times. The fold is that of the interpolated cubic in the last
+    interval.
     """
     omega = np.linspace(low, high, _BRANCH_POINTS)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
