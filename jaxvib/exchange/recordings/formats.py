@@ -135,8 +135,8 @@ def _read_text(path: Path, rate: float | None) -> Iterator[Recorded]:
 
 
 def _commented_heads(table: TextTable) -> list[str]:
-    """Return the names of the columns from a line that begins with #, as NumPy writes it: one name for each column, one of them
-    that of the times. Return an empty list without such a line."""
+    """Return the names of the columns from a line that begins with #, as NumPy writes it. The line must contain a name for
+    each column, and one of the columns must be that of the times. Return an empty list without such a line."""
     for line in reversed(table.remarks):
         cells = [cell.strip().strip('"') for cell in line.split(table.delimiter)]
         if len(cells) == table.width > 1 and _clocks([split_head(cell, "s") for cell in cells]):

@@ -78,8 +78,7 @@ class PeriodicScene(eqx.Module):
     - `length`, m: a typical displacement
     - `phases` alpha (bodies,), rad: approximate phases, so that the deviations psi are small and their derivatives with respect
       to theta lose no digits
-    - `feedback`: d^2 psi/dtheta^2 that an acceleration of the carrier d^2 q/dtheta^2 = `length` causes, largest value of all
-      exciters
+    - `feedback`: largest d^2 psi/dtheta^2 at any exciter that an acceleration d^2 q/dtheta^2 = `length` of the carrier causes
     """
 
     model: Model
