@@ -294,14 +294,15 @@ def response(
         w = jnp.atleast_1d(numbers(speeds, "rad/s", "speeds", None, low=0.0))
     require_finite("speeds of the response", w)
     found = outcome(_response(scene, w, angles), scene)
-    when_known(lambda *_: _require_no_overflow(found), found.exciter_force)
+    when_known(lambda *_: _require_no_overflow(found, scene.machine.has_foundation), found.exciter_force)
     return found
 
 
-def _require_no_overflow(found: Response) -> None:
-    """**Raises** `ComputationError` for values that are not finite, except for the infinite values at an undamped resonance."""
+def _require_no_overflow(found: Response, has_foundation: bool) -> None:
+    """**Raises** `ComputationError` for values that are not finite. Allowed are the infinite values at an undamped resonance
+    and the force on an unknown foundation, NaN."""
     done = status_names(found.status) == "done"
-    values = (found.amplitude, found.foundation_force, found.torque)
+    values = (found.amplitude, found.torque, *((found.foundation_force,) if has_foundation else ()))
     require_finite("values of the response", found.exciter_force, *(np.asarray(each)[done] for each in values))
 
 

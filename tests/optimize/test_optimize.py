@@ -322,7 +322,7 @@ def test_worst_machine_of_a_maximum_has_the_least_value(tmp_path):
         (("mode = 3", 'mode = "three"'), "mode is 'three'"),
         (("starts = 256", "start = 256"), "did you mean 'starts'"),
         (("starts = 256", "starts = 0.5"), "must be a whole number"),
-        (("# rate = 0.05", "rate = 2.0"), "search.rate is 2; it must be less than 1"),
+        (("# rate = 0.05", "rate = 2.0"), "search.rate is 2; it must be greater than 0 and less than 1"),
         (("# rate = 0.05", "rate = 0"), "search.rate is 0; it must be greater than 0"),
         (("# rate = 0.05", 'rate = "fast"'), "search.rate is 'fast'"),
         (("[free]", "[free"), "is not a TOML file"),
