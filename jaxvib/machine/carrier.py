@@ -16,7 +16,7 @@ from jaxvib.boundary import is_whole
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers import Part
 from jaxvib.results.readable import Readable
-from jaxvib.units import Number, count, number, numbers
+from jaxvib.units import Number, conditions_of_traced_values, count, number, numbers
 
 
 class BodyPoint(Readable):
@@ -397,4 +397,5 @@ def _structure(
     def shapes(machine: Machine, position: Array | None) -> tuple[Carrier, Mount]:
         return machine.carrier(), machine.mount(position if platform is None else platform)
 
-    return eqx.filter_eval_shape(shapes, machine, position)
+    with conditions_of_traced_values():  # discards conditions of abstract values, which would leak into an outer trace
+        return eqx.filter_eval_shape(shapes, machine, position)
