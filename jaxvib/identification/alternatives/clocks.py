@@ -11,8 +11,9 @@ import dataclasses
 
 import numpy as np
 
+from jaxvib.identification.alternatives.evidence import MIN_STANDARD_ERRORS, explains_better
 from jaxvib.identification.angle import RotorAngle, recorded_drive
-from jaxvib.identification.checks import FitStatus, resembles, status_of
+from jaxvib.identification.checks import resembles
 from jaxvib.identification.directions import eliminate, information_of
 from jaxvib.identification.fit import Fitted, fit_from
 from jaxvib.identification.problem import with_angle_errors
@@ -23,12 +24,6 @@ _DRIFT, _DELAY = 0.01, 0.1
 _MIN_SHARE = 0.1
 """Smallest share of the variance of the residuals that a drift and a delay explain together in some run, to first order, for
 which the fit is continued."""
-
-_CLEARLY = 6.0
-"""Distance of a drift from 0, in standard errors, above which a note states it."""
-
-_LESS_NOISE = 0.5
-"""Residuals with the drifts, relative to those without, below which a note states the drifts even if not only noise remains."""
 
 
 def clock_notes(fitted: Fitted) -> list[str]:
@@ -51,17 +46,14 @@ def clock_notes(fitted: Fitted) -> list[str]:
         starts.append(np.zeros(first))
     after = fit_from(free, [np.concatenate([start, np.zeros(free.unknowns.errors)]) for start in starts])
     ratio = max(float(np.max(new / old)) for new, old in zip(after.noise, fitted.noise, strict=True))
-    if not resembles(after) or ratio >= 1.0:
-        return []
-    status, _, _ = status_of(after, information_of(after))
-    if ratio > _LESS_NOISE and status not in (FitStatus.found, FitStatus.undetermined):
+    if not explains_better(after, information_of(after), ratio):
         return []
     indices = np.array([samples.errors[0] for samples in free.runs])
     information = eliminate(after.information + after.prior, indices)
     errors = np.sqrt(np.diagonal(np.linalg.inv(information)))
     notes = []
     for k, (index, error) in enumerate(zip(indices, errors, strict=True)):
-        if abs(after.x[index]) > _CLEARLY * error:
+        if abs(after.x[index]) > MIN_STANDARD_ERRORS * error:
             drift, duration = _DRIFT * after.x[index], float(problem.times[k][-1] - problem.times[k][0])
             which = "fast" if drift > 0.0 else "slow"
             notes.append(

@@ -18,8 +18,9 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import quoted
+from jaxvib.identification.alternatives.evidence import MIN_STANDARD_ERRORS, explains_better
 from jaxvib.identification.alternatives.support_friction import likely_friction
-from jaxvib.identification.checks import FitStatus, resembles, status_of
+from jaxvib.identification.checks import resembles
 from jaxvib.identification.directions import information_of
 from jaxvib.identification.fit import Fitted, fit_from
 from jaxvib.identification.problem import MOTIONS, build_problem, is_nonlinear
@@ -35,16 +36,8 @@ from jaxvib.machine.numbers import unit
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number
 
-_CLEARLY = 6.0
-"""Distance of the coefficient of a law from 0, in standard errors, above which the law is named. Twice the logarithm of the
-ratio of the likelihoods is then about 36."""
-
-_LESS_NOISE = 0.5
-"""Residuals with another law, relative to those with the laws of the scene, below which the law is named even if residuals that
-are not noise remain."""
-
-_SAME_NOISE = 1.01
-"""Ratio of the residuals with two laws up to which the records do not distinguish them."""
+_MAX_EQUAL_RATIO = 1.01
+"""Largest ratio of the residuals with two laws at which the records do not distinguish them."""
 
 _TORQUE_SHARE = 0.02
 """First value of the torque of another law, relative to that of the drag."""
@@ -104,7 +97,7 @@ def law_notes(
     if not better:
         return []
     best = min(residuals for _, residuals in better)
-    named = [law for law, residuals in better if residuals <= _SAME_NOISE * best]
+    named = [law for law, residuals in better if residuals <= _MAX_EQUAL_RATIO * best]
     words, remedies = ", or with ".join(law.words for law in named), "; or ".join(law.remedy for law in named)
     return [f"the model fits clearly better with {words}: the residuals are {best:.2g} times those of this fit; {remedies}"]
 
@@ -116,16 +109,16 @@ def _noise_ratio(before: Fitted, after: Fitted) -> float:
 
 
 def _is_clear(after: Fitted, name: str, residuals: float) -> bool:
-    """Return True if the law with the coefficient `name` is needed: the coefficient is clearly above 0, and only noise remains,
-    or the residuals are much smaller."""
-    if not resembles(after) or residuals >= 1.0:
+    """Return True if the law with the coefficient `name` is needed: the coefficient is clearly above 0, and the fit with it is
+    preferred."""
+    if not resembles(after):
         return False
-    known = information_of(after)
-    k = known.names.index(name)
-    if not known.determined[k] or known.vanished[k] or _CLEARLY * math.sqrt(known.covariance[k, k]) > 1.0:
+    information = information_of(after)
+    k = information.names.index(name)
+    is_positive = information.determined[k] and not information.vanished[k]
+    if not is_positive or MIN_STANDARD_ERRORS * math.sqrt(information.covariance[k, k]) > 1.0:
         return False
-    status, _, _ = status_of(after, known)
-    return residuals < _LESS_NOISE or status in (FitStatus.found, FitStatus.undetermined)
+    return explains_better(after, information, residuals)
 
 
 def _laws_of_loads(fitted: Fitted, scene: Scene) -> Iterator[_Law]:
