@@ -148,7 +148,7 @@ def _resolved(kind: Any, names: Mapping[str, Any]) -> Any:
     return Any if isinstance(kind, str) else kind
 
 
-def require_fields(part: Any, place: str) -> None:
+def require_field_types(part: Any, place: str) -> None:
     """Check the fields of a dataclass, and of the dataclasses in it, against their annotations.
 
     Numbers may have any value and shape, and may be traced. **Raises** `InputError` for a field of another type.
@@ -156,34 +156,49 @@ def require_fields(part: Any, place: str) -> None:
     **Arguments**: `part`, an instance of a dataclass; `place`: its name in messages.
 
     >>> import equinox as eqx, jaxvib as jv
-    >>> require_fields(eqx.tree_at(lambda motor: motor.speed, jv.ConstantSpeed(60.0), 1j), "drive")
+    >>> require_field_types(eqx.tree_at(lambda motor: motor.speed, jv.ConstantSpeed(60.0), 1j), "drive")
     Traceback (most recent call last):
         ...
     jaxvib.errors.InputError: drive.speed is 1j, which is not a number; give a number in SI units
     """
-    for name, kind in _kinds_of_fields(type(part)).items():
-        value, field, kinds = getattr(part, name), f"{place}.{name}", _alternatives(kind)
-        if any(map(_is_array, kinds)):
-            if not _is_number(value) and not (value is None and type(None) in kinds):
+    for name, kind, has_array, is_optional, is_tuple in _fields_of(type(part)):
+        value, field = getattr(part, name), f"{place}.{name}"
+        if value is None and is_optional:
+            continue
+        if has_array:
+            if not _is_number(value):
                 raise InputError(field, f"is {quoted(value)}, which is not a number; give a number in SI units")
-        elif any(typing.get_origin(each) is tuple for each in kinds) and isinstance(value, (list, np.ndarray)):
+            continue
+        if is_tuple and isinstance(value, (list, np.ndarray)):
             raise InputError(field, f"is {quoted(value)}; it must be a tuple")
-        else:
-            _require(value, kind, field)
+        _require(value, kind, field)
         entries = {f"{field}[{k}]": each for k, each in enumerate(value)} if isinstance(value, tuple) else {field: value}
         for inner, each in entries.items():
             if dataclasses.is_dataclass(each):
-                require_fields(each, inner)
+                require_field_types(each, inner)
+
+
+class _Field(typing.NamedTuple):
+    """Field of a dataclass: its annotation `kind`, and which alternatives the annotation has."""
+
+    name: str
+    kind: Any
+    has_array: bool
+    is_optional: bool
+    is_tuple: bool
 
 
 @functools.lru_cache(256)
-def _kinds_of_fields(owner: type) -> dict[str, Any]:
-    """Return the annotations of the fields of a dataclass."""
-    kinds = {}
+def _fields_of(owner: type) -> tuple[_Field, ...]:
+    """Return the fields of a dataclass."""
+    fields = []
     for field in dataclasses.fields(owner):
         base = next(each for each in owner.__mro__ if field.name in inspect.get_annotations(each))
-        kinds[field.name] = _resolved(field.type, vars(sys.modules[base.__module__]))
-    return kinds
+        kind = _resolved(field.type, vars(sys.modules[base.__module__]))
+        kinds = _alternatives(kind)
+        is_tuple = any(typing.get_origin(each) is tuple for each in kinds)
+        fields.append(_Field(field.name, kind, any(map(_is_array, kinds)), type(None) in kinds, is_tuple))
+    return tuple(fields)
 
 
 def _is_number(value: Any) -> bool:
@@ -267,7 +282,7 @@ def _require(value: Any, kind: Any, field: str) -> None:
     kinds = _alternatives(kind)
     if any(_is_number_with_unit(each) for each in kinds):
         return
-    if any(set(_alternatives(array_type)) <= set(kinds) for array_type in (np_typing.ArrayLike, jax_typing.ArrayLike)):
+    if _is_array_like(kind):
         problem = _problem_of_array(value)
         if problem is not None and not (value is None and type(None) in kinds):
             raise InputError(field, f"is {quoted(value)}; it must be {problem}")
@@ -293,6 +308,13 @@ def _require(value: Any, kind: Any, field: str) -> None:
     raise InputError(field, f"is {quoted(value)}; it must be {' or '.join(dict.fromkeys(allowed))}{example}")
 
 
+@functools.lru_cache(1024)
+def _is_array_like(kind: Any) -> bool:
+    """Return True for an annotation that includes `ArrayLike` of NumPy or JAX."""
+    return any(set(_alternatives(each)) <= set(_alternatives(kind)) for each in (np_typing.ArrayLike, jax_typing.ArrayLike))
+
+
+@functools.lru_cache(1024)
 def _alternatives(kind: Any) -> tuple[Any, ...]:
     """Return the members of a union; for any other annotation, return the annotation itself.
 

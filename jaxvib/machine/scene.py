@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import is_real, require_fields
+from jaxvib.boundary import is_real, require_field_types
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine, Mount, Place, on_body, read_place, shapes_of
 from jaxvib.machine.drives.drive import Directed, Drive
@@ -246,7 +246,7 @@ class Scene(Part):
         exciters: Sequence[Exciter] | None = None,
     ):
         _require_part("machine", machine, Machine, "two_mass(...)")
-        require_fields(machine, "machine")
+        require_field_types(machine, "machine")
         effects = read_effects(effects)
         shared = tuple(effect for effect in effects if _acts_on_machine(effect))
         rotating = tuple(effect for effect in effects if not _acts_on_machine(effect))
@@ -260,7 +260,7 @@ class Scene(Part):
         else:
             exciters = _read_exciters(exciters, loads, drive, rotating)
         for k, exciter in enumerate(exciters):
-            require_fields(exciter, f"exciters[{k}]")
+            require_field_types(exciter, f"exciters[{k}]")
             require_machine(machine, exciter.place)
         self.machine, self.exciters, self.effects = machine, exciters, shared
         for term in terms_of(self.all_effects, SupportForce):
@@ -385,7 +385,7 @@ def require_parts(scene: Scene) -> None:
     """**Raises** `InputError` for an object of another class in place of a part or a number of the scene, which
     `equinox.tree_at` does not check."""
     try:
-        require_fields(scene, "scene")
+        require_field_types(scene, "scene")
     except InputError as error:
         one = isinstance(scene.exciters, tuple) and len(scene.exciters) == 1
         name = error.field.replace("scene.exciters[0].", "scene.") if one else error.field
