@@ -314,7 +314,6 @@ def _is_array_like(kind: Any) -> bool:
     return any(set(_alternatives(each)) <= set(_alternatives(kind)) for each in (np_typing.ArrayLike, jax_typing.ArrayLike))
 
 
-@functools.lru_cache(1024)
 def _alternatives(kind: Any) -> tuple[Any, ...]:
     """Return the members of a union; for any other annotation, return the annotation itself.
 

@@ -348,16 +348,17 @@ def turning_loads(
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
-    if scene.mounting.turn is not None:
+    mounting, loads, drive, effects = scene.mounting, scene.loads, scene.drive, scene.all_effects
+    if mounting.turn is not None:
         problem = (
             "rotates with the housing of its exciter, which this function does not include: use simulate, settle or ensemble"
         )
         raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}, which {problem}")
-    require_circular(scene.loads, scene.drive)
-    require_terms(scene.all_effects, included)
+    require_circular(loads, drive)
+    require_terms(effects, included)
     if at_one_point:
-        require_one_point(scene)
-    return cast(CircularLoads, scene.loads)
+        require_one_point(mounting)
+    return cast(CircularLoads, loads)
 
 
 def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
@@ -366,9 +367,9 @@ def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor; use a drag greater than 0")
 
 
-def require_one_point(scene: Scene) -> None:
+def require_one_point(mounting: Mount) -> None:
     """**Raises** `InputError` for loads at different stations along the machine's axis."""
-    if not scene.mounting.at_one_point:
+    if not mounting.at_one_point:
         problem = (
             "differ; this function needs loads that run at one point of the machine: use phase_jams for their jams, "
             "balanced_states for their balance (jaxvib balance), or simulate"

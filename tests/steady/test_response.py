@@ -445,7 +445,7 @@ def test_torques_that_overflow_have_a_status():
 def test_scenes_with_loads_are_refused():
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
-    with pytest.raises(jv.InputError, match=r"^loads turn at a speed of their own.*use branches\(scene\)$"):
+    with pytest.raises(jv.InputError, match=r"^loads turn at a speed of their own.*use branches \(command modes\)$"):
         jv.response(scene)
 
 

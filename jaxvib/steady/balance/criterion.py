@@ -169,7 +169,7 @@ def criterion(scene: Scene) -> Criterion:
     Source: Filimonikhin et al. 2022, sections 5.1-5.3, for any carrier.
     """
     scene = validate_scene(scene)
-    require_one_point(scene)
+    require_one_point(scene.mounting)
     if scene.loads.count < 2:
         raise InputError("loads.count", "is 1; the criterion is about the gathering of loads and needs 2 or more")
     require_terms(scene.all_effects, CRITERION_TERMS, "acts|act on each load separately, which the criterion excludes")

@@ -168,7 +168,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     Source: Filimonikhin et al. 2022, equations (12), (32)-(38), (53)-(59) with their misprints corrected, for any carrier.
     """
     scene = validate_scene(scene)
-    require_one_point(scene)
+    require_one_point(scene.mounting)
     speeds, *parts = _characteristic_speeds(scene)
     when_known(partial(_require_mount_that_moves, scene), *parts)
     allowed = allowed_unknowns(scene)

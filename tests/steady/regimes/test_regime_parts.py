@@ -296,11 +296,11 @@ def test_near_touches_are_minima_of_one_sign():
 
 
 def test_related_phases_are_exchanged_mirrored_and_turned():
-    found = search._related(np.array([[0.0, 1.0, 2.0]]), np.zeros(3, bool))
+    found = search._related_sets(np.array([[0.0, 1.0, 2.0]]), np.zeros(3, bool))
     expected = [sign * np.array(order) for order in ((0, 1, 2), (1, 0, 2), (2, 1, 0), (0, 2, 1)) for sign in (1.0, -1.0)]
     expected += [np.array([0.0, 1.0, 2.0]) + np.pi * row for row in np.eye(3)]
     np.testing.assert_allclose(found, expected)
-    fixed = search._related(np.array([[0.0, 1.0, 2.0]]), np.array([True, False, False]))
+    fixed = search._related_sets(np.array([[0.0, 1.0, 2.0]]), np.array([True, False, False]))
     assert np.all(fixed[:, 0] == 0.0) and fixed.shape == (11, 3)
 
 
@@ -407,7 +407,6 @@ def test_partitions_combine_the_regimes_of_their_groups():
     found = [[name for _, name in parts] for parts in partitions._products((0, 1, 2), counted)]
     assert len(found) == 1 * 2 * 1 + 2 * 1 + 1 * 2 + 2 * 1 + 2 and ["(0, 1)1", "(2,)0"] in found
     assert all(sorted(k for parts, _ in each for k in parts) == [0, 1, 2] for each in partitions._products((0, 1, 2), counted))
-    assert [len(each) for each in partitions._no_rows(4)] == [0] * 7 and partitions._no_rows(4).speed.shape == (0, 4)
 
 
 def test_ideal_drives_of_two_speeds_cannot_share():
@@ -549,7 +548,7 @@ def test_partitions_keep_weak_interactions_and_stable_motions(monkeypatch, stabl
     def interaction(speed, group, scene):
         return jnp.where(jnp.max(group, axis=1) == 2, 1.5, 0.25)
 
-    monkeypatch.setattr(partitions, "_members", regimes)
+    monkeypatch.setattr(partitions, "_regimes_of_group", regimes)
     monkeypatch.setattr(
         partitions, "in_chunks", lambda n, f, speed, group, shared: np.asarray(interaction(speed, group, *shared))
     )
