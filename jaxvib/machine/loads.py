@@ -41,7 +41,7 @@ class DrillingSpin(NamedTuple):
     """Dynamics of the drilling spin s of each load: its spin about the normal of its contact, relative to its track.
 
     - `rate` s' (count,) rad/s^2 of a free spin
-    - `force`: generalized forces per s, a (count,) array for each coordinate
+    - `force`: generalized forces divided by the spin s, one (count,) array for each coordinate
     - `inertia`, kg m^2; the energy of the spin is inertia s^2/2
     - `without_rotation` (count,) rad/s: the value of s for a load that does not rotate in space
     """
@@ -161,8 +161,8 @@ class Loads(Part):
     def normal_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> NormalForce | None:
         """Return the force of the loads on their track; None if it is not defined.
 
-        **Arguments**: coordinates `u` and their rates `rate`, (count,) each; `g`: the acceleration of gravity times the unit
-        vector against it, m/s^2, by axis.
+        **Arguments**: coordinates `u` and their rates `rate`, (count,) each; `g`: the vector opposite to the acceleration of
+        gravity, m/s^2, as a mapping from the axis (0 horizontal, 1 up, 2 along the rotor's axis) to the component.
         """
         return None
 

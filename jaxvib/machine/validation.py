@@ -242,8 +242,9 @@ def first_moment(exciter: Exciter) -> Array | None:
 
 
 def weight_accelerations(scene: Scene) -> dict[int, float]:
-    """Return S g / I, rad/s^2, by the numbers, from 0, of the exciters with a motor and an unbalance S. At the speed w the
-    weight changes the speed of the rotor of inertia I within a turn by the share S g / (I w^2)."""
+    """Return S g / I, rad/s^2, for each exciter with a motor and an unbalance S; the keys are the numbers of these exciters,
+    counted from 0. At the speed w the weight changes the speed of the rotor of inertia I within a turn by the share S g / (I
+    w^2)."""
     g = float(np.hypot.reduce([float(each) for each in total_gravity(scene.all_effects).values()] or [0.0]))
     found = {}
     for k, exciter in enumerate(scene.exciters):

@@ -75,8 +75,9 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
     A step of any length costs one Jacobian J by forward mode, one inverse and 6 evaluations, without a Newton iteration. The
     state must be one vector, of at most a few dozen entries unless `linearize` is given.
 
-    **Attribute** `linearize`: function (terms, t, y, args), as those of `terms.vf`, for a Jacobian that is not a dense matrix.
-    It returns the function that maps a shift to the function r -> (shift - J)^-1 r, and df/dt. Default: dense matrices
+    **Attribute** `linearize`: function of (terms, t, y, args) for a Jacobian that is not a dense matrix; t, y and args are the
+    arguments of `terms.vf`. It returns the function that maps a shift to the function r -> (shift - J)^-1 r, and df/dt.
+    Default: dense matrices
 
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, section IV.7.
     """

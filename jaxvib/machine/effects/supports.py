@@ -27,7 +27,8 @@ class _Support(Effect):
     position: eqx.AbstractVar[Array | None]
 
     def rows(self, machine: Machine) -> Array:
-        """Return the row of the platform's coordinate on a `machine`, or the rows of the two directions of the axis.
+        """Return the matrix (1, nd) or (2, nd) that gives the displacement of the platform, or of the point of the axis in its
+        two directions, from the nd coordinates of a `machine`.
 
         **Raises** `InputError` for a place that the machine does not have.
         """
@@ -269,8 +270,8 @@ class FrictionSupport(_Support):
             raise InputError("effects.friction_support.to", problem)
 
     def rows(self, machine: Machine) -> Array:
-        """Return the row of the platform's coordinate, relative to the platform `to`, or the rows of the two directions of the
-        axis.
+        """Return the matrix (1, nd) or (2, nd) that gives the displacement on which the friction acts: that of the platform
+        (relative to the platform `to`, if there is one), or that of the point of the axis in its two directions.
 
         **Raises** `InputError` for a place that the machine does not have.
         """

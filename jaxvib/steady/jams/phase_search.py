@@ -1,4 +1,4 @@
-"""Search for all jams of a scene with any phases, and phase patterns followed over the drag."""
+"""Search for all jams of a scene with any phases, and phase patterns followed over the load speed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ from jaxvib.steady.outcome import entry, require_index
 from jaxvib.units import count, random_numbers
 
 _SHOWN_DRAG_FACTOR = 30.0
-"""Drag range of a figure of all jams: from the scene's drag divided by this factor to the drag times it."""
+"""Factor of the drag range in a figure of all jams: the range begins at the drag of the scene divided by this factor, and ends
+at this drag multiplied by it."""
 
 _SAME_LINE_DIFFERENCE = 5e-3
 """Relative difference of drags below which the lines of two unstable patterns are drawn as one line."""
@@ -148,8 +149,8 @@ def phase_jams(
 
     - `scene` with a drive of prescribed speed and loads with drag; typical: 2 to 4 loads
     - `starts`: number of random sets of phases at each load speed; typical: 16 to 1024 (default 128). A few are enough for
-      stable jams. Many are necessary for unstable jams near a load speed at which two patterns separate. The time is
-      proportional to this number
+      stable jams. Many are necessary for unstable jams near a load speed at which one pattern branches off from another. The
+      time is proportional to this number
     - `seed` of these random phases
     - `near`: (omega, phase), a speed rad/s and the phases (count,) rad of the loads, from which Newton's method finds one jam.
       The function can then be used under `jit`, `vmap` and `grad`. Derivatives follow from the implicit function theorem;
@@ -179,7 +180,8 @@ def phase_jams(
 
 
 def _jams_from_starts(scene: Scene, balance: TorqueBalance, omega: np.ndarray, phase: np.ndarray) -> PhaseJams:
-    """Solve for jams from load speeds (n,) and phases (n, count) of solved balances."""
+    """Return the distinct jams to which Newton's method leads from the load speeds `omega` (n,) and phases (n, count) that the
+    search found."""
     groups = equal_loads(balance)
     starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(balance.speed)))
     places, reached = _distinct_jams(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
