@@ -15,9 +15,9 @@ from jaxvib.identification.records.orders import foreign_vibration
 from jaxvib.identification.torque import MAX_MISFIT
 
 SIGNIFICANCE_LEVEL = 1e-5
-"""p-value below which residuals are not noise, and below which a run deviates from other runs. A channel is tested for
-the angle of the rotor and for that of jammed loads. If its residuals are pure noise, each of these tests causes the status
-`patterned` with this probability."""
+"""p-value below which residuals do not count as noise, and below which a run deviates from other runs. One test of a channel
+searches for vibrations at orders of the rotor speed, a second one at orders of the speed of jammed loads. If the residuals are
+pure noise, each of these tests causes the status `patterned` with this probability."""
 
 _ANGLE_NAMES = ("the rotor's angle", "the angle of the jammed loads")
 
@@ -88,8 +88,9 @@ def status_of(fitted: Fitted, information: Information) -> tuple[FitStatus, floa
     is_inaccurate, has_fit = fitted.is_absorbed, resembles(fitted)
     if fitted.is_absorbed:
         notes.append(
-            "the residuals vibrate at natural frequencies of the machine, and no noise model separates them from its motion; "
-            "the noise is assumed to be white, and the intervals are too narrow: fit runs one by one, or record them again"
+            "the residuals vibrate at natural frequencies of the machine, and no noise model distinguishes such residuals from "
+            "the motion of the machine; the noise is assumed to be white, and the intervals are too narrow: fit runs one by "
+            "one, or record them again"
         )
     for k, misfit in enumerate(fitted.misfits):
         if misfit > MAX_MISFIT:

@@ -72,7 +72,7 @@ class Axis(NamedTuple):
     target: Target
 
     def at(self, fraction: np.ndarray) -> np.ndarray:
-        """Return the values at fractions in [0, 1) of the range."""
+        """Return the values at fractions in [0, 1] of the range."""
         if self.log:
             return self.low * (self.high / self.low) ** fraction
         return self.low + (self.high - self.low) * fraction

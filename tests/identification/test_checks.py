@@ -226,7 +226,7 @@ def outcome(monkeypatch, **changes):
         ),
         ({"shares": (0.0, 0.09)}, "found", 0.3, []),
         ({"misfits": (0.9, 2.1)}, "patterned", 0.3, ["run 2 deviates from the torque balance of its motor by 2.1"]),
-        ({"absorbed": True}, "patterned", 0.3, ["no noise model separates them from its motion; the noise is assumed to"]),
+        ({"absorbed": True}, "patterned", 0.3, ["no noise model distinguishes such residuals from the motion of the machine"]),
         ({"outliers": (0.02, 0.0)}, "found", 0.3, ["2.0% of the readings of channel 'a' in run 1 are outliers"]),
     ],
 )

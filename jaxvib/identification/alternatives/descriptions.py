@@ -23,17 +23,21 @@ from jaxvib.numerics.noise import Noise
 from jaxvib.units.columns import unit_factor
 
 _MAX_COST, _MAX_COST_OF_UNIT, _MAX_COST_OF_MOTION = 0.5, 0.05, 0.25
-"""Largest costs at which another description is named: with another direction or place, and with another unit, relative to the
-cost with the given description; and relative to the cost of a model without motion. The limit for units is low, because
-readings of a sensor with a wrong gain also fit better with a unit near this gain."""
+"""Largest costs at which another description is named. The first two are relative to the cost with the given description: for
+another direction or place, and for another unit. The third is relative to the cost of a model without motion. The limit for
+units is low, because readings of a sensor with a wrong gain also fit better with a unit near this gain."""
 
 _EQUAL_COST = 1e-3
 """Relative difference of the costs of two descriptions up to which the records do not distinguish them."""
 
 
 class _Description(NamedTuple):
-    """Other description of channels: its `words`, and for each of these channels the name of the channel that contains its
-    readings, and the factor of the readings; `limit`: largest cost at which it is named, relative to the given description."""
+    """Other description of channels.
+
+    **Attributes**: `words` of the description; `readings`: for the name of each changed channel, the name of the channel that
+    contains its readings, and their factor; `limit`: largest cost at which the description is named, relative to the cost with
+    the given one.
+    """
 
     words: str
     readings: Mapping[str, tuple[str, float]]
@@ -41,8 +45,9 @@ class _Description(NamedTuple):
 
 
 def description_notes(problem: Problem) -> list[str]:
-    """Return a sentence about the description of channels with which a machine fits the records much better than with the given
-    one; an empty list without such a description, and for a nonlinear motion.
+    """Return a list with a sentence that names the descriptions of channels with which a machine fits the records much better.
+
+    The list is empty if there is no such description, and for a motion with loads or on nonlinear supports.
 
     **Arguments**: the `problem` of a fit that does not explain the records.
     """

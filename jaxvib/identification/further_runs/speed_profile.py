@@ -29,7 +29,7 @@ _SEGMENTS = 8
 _MAX_ITERATIONS = 30
 
 _SLACK = 1e-6
-"""Relative amount by which rounding errors may exceed a limit."""
+"""Relative amount by which a run may exceed a limit, because of rounding errors."""
 
 
 class Limits(NamedTuple):
@@ -105,9 +105,10 @@ def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.n
     """Return half the sum of the logarithms of the expected variances of the parameters, and its gradient with respect to the
     speeds.
 
-    F is the Fisher information of the run (the matrix of its normal equations). L, the projection onto the parameters that are
-    not eliminated, is kept fixed, so that a change dF changes L^T F L by L^T dF L. The gradient is therefore one
-    vector-Jacobian product of F: the vector contains the derivatives of the objective with respect to the entries of F.
+    F is the Fisher information of the run (the matrix of its normal equations), and L is the projection onto the parameters
+    that are not eliminated. A change dF changes L^T F L by L^T dF L to first order: the simultaneous change of L has no effect
+    of first order. The gradient is therefore one vector-Jacobian product of F: the vector contains the derivatives of the
+    objective with respect to the entries of F.
     """
     fitted, k, p = expected.fitted, len(fit.names), expected.fitted.x.size
     problem, indices = fitted.problem, linear_indices(fitted.problem)[0]

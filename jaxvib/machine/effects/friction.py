@@ -113,7 +113,7 @@ class DryFriction(Effect):
         return Typical(cls(0.0015, diameter), f"a ball bearing, mu2 = 0.0015, of {1e3 * float(diameter):.3g} mm")
 
     def terms(self) -> tuple[Term, ...]:
-        """Return the friction. The half turn phi -> phi + pi, q -> -q does not change the radial load."""
+        """Return the friction. Without gravity, the half turn phi -> phi + pi, q -> -q does not change the radial load."""
         return (ContactFriction(self.friction, is_half_turn_symmetric=True),)
 
     def validate(self, machine: Machine, loads: Loads) -> None:

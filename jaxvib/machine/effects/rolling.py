@@ -71,7 +71,7 @@ class RollingFriction(Effect):
         return Typical(cls(3e-5), "k = 0.03 mm, steel on steel")
 
     def terms(self) -> tuple[Term, ...]:
-        """Return the friction. The half turn phi -> phi + pi, q -> -q does not change the normal force."""
+        """Return the friction. Without gravity, the half turn phi -> phi + pi, q -> -q does not change the normal force."""
         return (ContactFriction(self.friction, is_half_turn_symmetric=True),)
 
     def validate(self, machine: Machine, loads: Loads) -> None:
