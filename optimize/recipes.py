@@ -94,7 +94,8 @@ def _factor(range_: Number) -> float:
 
 
 def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
-    """Return the design task for an antiphase machine of two masses: least foundation force per relative amplitude.
+    """Return the design task for an antiphase machine of two masses: least foundation force divided by the amplitude of the
+    relative motion of the platforms.
 
     The frequency of the jam and the sum of the squared support frequencies (k_i/M_i over the platforms) keep their values.
 

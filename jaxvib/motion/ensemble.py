@@ -74,7 +74,7 @@ class EnsembleStatus(eqx.Enumeration):
     not_finite = "the motion grew without bounds"
     refused = REFUSED
     not_resolved = (
-        "the steps are too long for contacts or for a fast decay, by drag of the loads, damping or a motor: use more steps"
+        "the steps are too long for contacts or for a fast decay due to drag of the loads, damping or a motor: use more steps"
     )
 
 
@@ -96,9 +96,10 @@ class Ensemble(Result):
       the resonance that catches the mass; `regimes` names the motions that follow from them. None for one exciter
     - `speed_group` (B,): groups of runs by the speed of their masses, from 1, ascending; 0 for a run whose masses turn at
       different speeds, or whose motion did not stay finite
-    - `error` (B,): estimated error of the final state, as for a `Run`; the largest displacement and velocity are those of the
-      final state. Typical: below 1e-6 with the default steps. NaN if no estimate was requested or the motion did not stay
-      finite; infinite for 4 steps or fewer, because a run with larger steps does not exist
+    - `error` (B,): estimated error of the final state, relative to the scales that `Run` describes; the largest displacement
+      and the largest velocity are taken from the final state. Typical: below 1e-6 with the default steps. NaN if no estimate
+      was requested or the motion did not stay finite; infinite for 4 steps or fewer, because a run with larger steps does not
+      exist
     - `allowed` (B,): False if `make` returned a scene with a value that its constructor does not allow
     - `finite` (B,): True if the motion stayed finite (with contacts: and did not grow by the factor 1e8)
     - `resolved` (B,): False if explicit steps are too long for the fastest decay, which is possible under a JAX transformation,
@@ -347,9 +348,9 @@ def _run_batch(
 def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equations, implicit: bool) -> _Ends:
     """Integrate a run with equal steps in `ENSEMBLE_PARTS` parts, once for each entry of `counts` (steps in a part).
 
-    **Returns** for the first entry: the final state; the mean load speeds over the last part; the distance of the final state
-    from that with the last entry; True if the motion stayed finite; True for loads that lost contact with their track; and the
-    number of steps.
+    **Returns** for the first entry: the final state; the mean load speeds over the last part; the difference between its final
+    state and the final state for the last entry of `counts`; True if the motion stayed finite; True for loads that lost contact
+    with their track; and the number of steps.
     """
     scene, (state, end) = with_first_derivatives(scene, (state, end))
     has_one_sided_loads = any(exciter.loads is not None and exciter.loads.one_sided for exciter in scene.exciters)

@@ -114,7 +114,7 @@ def _draw_deck(axis: Axes, view: View, deck: Deck, limits: Limits) -> None:
 
 
 def drawable_scene(scene: Scene) -> Scene:
-    """Return `validate_scene(scene)`. **Raises** `InputError` for a scene with traced numbers as well."""
+    """Return `validate_scene(scene)`. **Raises** its errors, and `InputError` for a scene with traced numbers."""
     require_known(scene, "scene", "a drawing", "draw it outside")
     return validate_scene(scene)
 

@@ -138,7 +138,7 @@ def test_unresolved_runs_are_named(monkeypatch):
     monkeypatch.setattr(plan, "equal_step_length", lambda *_: (1.0, False))
     many = jv.ensemble(of_drag, jnp.asarray([1.0, 1e5]), 5.0, stepsize_controller=jv.EqualSteps(1200))
     assert [str(s) for s in np.asarray(many.resolved)] == ["True", "False"]
-    assert "too long for contacts or for a fast decay, by drag" in many.summary()
+    assert "too long for contacts or for a fast decay due to drag" in many.summary()
 
 
 def test_a_sweep_over_drag_is_answered(tmp_path):
