@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 _LARGEST_MARGIN = 1e3
-"""Value of the margin of equal motors, which is infinite; a search needs a finite one."""
+"""Largest value of a margin. That of equal motors is infinite, but a search needs a finite number."""
 
 _PEAK_STEPS, _PEAK_REACH = 8, 0.1
 """Number of steps of the search for the speed of the largest torque at a resonance, and largest relative distance of this speed

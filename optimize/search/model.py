@@ -20,7 +20,8 @@ _MIN_SHARE_AT_KINK = 1e-4
 """Share of a piece of the objective (its multiplier) above which the piece counts as one of those that meet at a kink."""
 
 _SMALL_OBJECTIVE_SHARE = 1e-4
-"""Smallest scale of the objective, relative to the change of the objective over the bounds that is predicted from its slope."""
+"""Smallest scale of the objective, relative to its predicted change: its largest slope times the whole range of the parameter,
+from the lower to the upper bound."""
 
 
 class Step(NamedTuple):
@@ -76,8 +77,8 @@ def at_kink(point: Point, near: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
     """Return derivatives at a kink of the objective.
 
     **Returns** the derivatives (s, d) of the largest piece; for the next largest pieces, the derivatives (s, k, d) minus those
-    of the largest piece; and True (s, k) for pieces that equal the largest one within `near`, relative to the objective or to
-    its change over the bounds.
+    of the largest piece; and True (s, k) for pieces that equal the largest one within `near`. The unit of `near` is
+    the objective or, if this is small, its smallest scale (`_SMALL_OBJECTIVE_SHARE`).
     """
     order = np.argsort(-point.pieces, axis=1)[:, : point.z.shape[1] + 1]
     values = np.take_along_axis(point.pieces, order, axis=1)
@@ -175,7 +176,7 @@ def solve_model(
         return Step(solution.p, solution.held, solution.demands * _active(solution, demands), np.ones((len(hessian), 1)))
     values = (point.pieces - point.values[:, :1]) / size[:, None]
     slopes = point.piece_gradients / size[:, None, None]
-    # Only the 3 d + 8 pieces that can become largest in the trust region are used; d + 1 can meet at one kink.
+    # Only the 3 d + 8 pieces that can reach the largest values in the trust region are used; at most d + 1 meet at a kink.
     reachable = values + np.einsum("spd,sd->sp", np.abs(slopes), np.maximum(-box[0], box[1]))
     candidates = np.argsort(-reachable, axis=1)[:, : 3 * d + 8]
     values = np.take_along_axis(values, candidates, axis=1)
@@ -212,7 +213,7 @@ def _active(solution: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndar
 def predicted_decrease(problem: Problem, point: Point, hessian: np.ndarray, model: Step, size: np.ndarray) -> np.ndarray:
     """Return the change of the Lagrangian that the model predicts, as a positive number relative to the objective.
 
-    If the objective is about 0, the number is relative to the change of the objective over the bounds.
+    If the objective is about 0, the number is relative to its smallest scale (`_SMALL_OBJECTIVE_SHARE`).
     """
     values, slopes = _pieces(problem, point)
     linear_change = np.max(values - point.values[:, :1] + np.einsum("spd,sd->sp", slopes, model.p), axis=1)

@@ -149,6 +149,6 @@ def _text(
             ]
             for k in folds
         ]
-        head = [unit, "torque, N m", "times the drive torque", f"jump to, {unit}"]
+        head = [unit, "torque, N m", "torque / drive torque", f"jump to, {unit}"]
         lines.append(table("folds: the speed jumps if the drives have this torque", head, rows))
     return "\n".join(lines)

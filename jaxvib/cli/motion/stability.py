@@ -83,7 +83,9 @@ def _special_text(points: list[dict], scale: float) -> str:
 
 @command("onset")
 @_VARY
-@click.option("--kind", required=True, help="Kind: fold, torus (torus bifurcation), period_doubling or symmetry.")
+@click.option(
+    "--kind", required=True, help="Kind: fold, torus (torus bifurcation), period_doubling or symmetry (loss of symmetry)."
+)
 @click.option(
     "--between", nargs=2, required=True, metavar="LOW HIGH", help="A value without the special point, and a higher one with it."
 )
@@ -110,7 +112,8 @@ def onset(
     document = {"vary": vary, "kind": kind, "value": found, "accuracy": accuracy, "between": [low, high]}
     words, unit = _words_and_unit(loaded, vary)
     value = f"{found:.6g} {unit}".rstrip()
-    sentence = f"{kind.replace('_', ' ')} for {words} of {value} and above (relative accuracy {accuracy:g})"
+    name = {"torus": "torus bifurcation", "symmetry": "loss of symmetry"}.get(kind, kind.replace("_", " "))
+    sentence = f"{name}: appears when {words} increases to {value} (relative accuracy {accuracy:g})"
     output.done(document, lambda: sentence, "onset")
 
 

@@ -22,8 +22,8 @@ _DRIFT, _DELAY = 0.01, 0.1
 """Standard deviations of the drift and of the delay (s) before the fit; both are much larger than those of recorders."""
 
 _MIN_SHARE = 0.1
-"""Smallest share of the variance of the residuals that a drift and a delay explain together in some run, to first order, for
-which the fit is continued."""
+"""Smallest explained share for which the fit is continued with a drift and a delay: the share of the variance of a channel's
+residuals that both together explain to first order, the largest of all channels and runs."""
 
 
 def clock_notes(fitted: Fitted) -> list[str]:
