@@ -39,7 +39,8 @@ _POLYNOMIALS = np.array(
         [20.300692582210083, -53.90207774663854, 50.255836422617605, -19.008209934160803, 2.3537586759714983, 0.0],
     ]
 )
-"""Polynomials, in the fraction of the step and with the highest power first, by which the stages form states within a step.
+"""Coefficients (10, 6), highest power first, of the polynomials that weight the `dense_stages` in a state within a step. Their
+variable is the fraction of the step.
 
 Source: P. Kidger's diffrax 0.7 (Apache 2.0), `diffrax/_solver/dopri8.py`, without the stages whose polynomials are 0.
 """
@@ -55,8 +56,8 @@ ERROR = np.asarray(_TABLEAU.b_error)
 
 
 def ravel(tree: PyTree[Array], directions: int = 0) -> Array:
-    """Return the entries of a tree as a vector (n,), or as (n, ...) if all arrays have this number of `directions` as last
-    axes."""
+    """Return the entries of a tree as a vector (n,), or as (n, ...) with the last `directions` axes of every array, such as an
+    axis over tangents."""
     return jnp.concatenate([leaf.reshape(-1, *leaf.shape[leaf.ndim - directions :]) for leaf in jax.tree.leaves(tree)])
 
 

@@ -239,7 +239,8 @@ class PathsOfPoints(eqx.Module):
         - `at`: the place on the machine, see `Exciter`: (x, y) of a body, m, the number of a platform, or a distance along a
           rotor's axis, m; default: the centre of mass, platform 1, or the common station of a rotor's loads
         - `body`: number of the body from 0, on machines with several; typical: 0 (the default)
-        - `slope` of the deck, rad or text from x anticlockwise, for the throw number; typical: "-15 deg" to 0 (the default)
+        - `slope` of the deck, rad or a string with a unit, anticlockwise from x, for the throw number; typical: "-15 deg" to 0
+          (the default)
 
         **Returns** `Ellipse`. **Raises** `InputError` for a place that the machine does not have.
         """

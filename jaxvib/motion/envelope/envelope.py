@@ -195,7 +195,7 @@ def envelope(
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
     ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
     >>> run = jv.envelope(scene, 60.0, start="spin_up")
-    >>> bool(run.settled), round(float(run.omega), 1), int(run.steps) < 200      # caught below the resonance at 28.1 rad/s
+    >>> bool(run.settled), round(float(run.omega), 1), int(run.steps) < 200      # jammed below the resonance at 28.1 rad/s
     (True, 27.4, True)
 
     Source: see `averaged_field`.
@@ -350,8 +350,9 @@ def _equations(
 ) -> tuple[Callable[..., Array], Args, diffrax.AbstractSolver]:
     """Return the averaged equations as a function of the integrator's vector, their arguments, and the method.
 
-    For small systems the equations are computed on scalars. For several exciters the steps of the default method take the
-    blocks of the exciters one by one, see `Averaged.shifted_inverse`; with one exciter a dense matrix on scalars is faster.
+    For small systems the equations are computed on scalars. For several exciters the default method eliminates the unknowns of
+    one exciter after the other in each step, see `Averaged.shifted_inverse`; for one exciter a dense matrix on scalars is
+    faster.
     """
 
     def on_arrays(t: Array, y: Array, args: tuple[Averaged, _Units]) -> Array:
@@ -416,7 +417,7 @@ def _measure(model: Model, window: Envelopes) -> Measured:
     drift = amplitude_change / jnp.maximum(largest, MIN_CHANGE_SCALE * unit.displacement)
     force_change = jnp.abs(jnp.max(window.foundation_force[half:], axis=0) - jnp.max(window.foundation_force[:half], axis=0))
     force_drift = jnp.max(force_change) / jnp.maximum(jnp.max(force), MIN_CHANGE_SCALE * model.natural_force(unit))
-    force_drift = jnp.nan_to_num(force_drift)  # of an unknown force
+    force_drift = jnp.nan_to_num(force_drift)  # NaN if the foundation force is unknown
     speed_drift = jnp.max(jnp.abs(late - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
     return Measured(
         omega=omega,

@@ -78,7 +78,7 @@ class PeriodicScene(eqx.Module):
     - `length`, m: a typical displacement
     - `phases` alpha (bodies,), rad: approximate phases, so that the deviations psi are small and their derivatives with respect
       to theta lose no digits
-    - `feedback`: largest d^2 psi/dtheta^2 at any exciter that an acceleration d^2 q/dtheta^2 = `length` of the carrier causes
+    - `feedback`: largest d^2 psi/dtheta^2 of a body that is caused by the acceleration d^2 q/dtheta^2 = `length` of the carrier
     """
 
     model: Model
@@ -306,9 +306,11 @@ def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, 
 def multipliers_of(
     scene: PeriodicScene, grid: Grid, motion: WholeMotion, max_steps: int | None, *, forced: bool
 ) -> tuple[Array, Array, Array]:
-    """Return the Floquet multipliers of the full state about a periodic motion without the trivial one of a shift in time, the
-    trivial one (NaN with forcing), and the error of their moduli. Multipliers that need more than `MAX_INTEGRATION_STEPS` are
-    NaN.
+    """Return the Floquet multipliers of the full state about a periodic motion (all except the trivial one, and the trivial
+    one), and the error of their moduli.
+
+    The trivial multiplier belongs to a shift in time; it is NaN with forcing. Multipliers that need more than
+    `MAX_INTEGRATION_STEPS` are NaN.
 
     `max_steps`: limit of the steps of `radau.flow`, without which there are no derivatives in reverse mode.
     """
@@ -343,8 +345,11 @@ def _multipliers(matrix: Array, resolved: Array) -> Array:
 
 
 def _radians(scene: PeriodicScene, omega: Array) -> Array:
-    """Return the phase, rad, through which the fastest oscillation advances in a period: 2 pi (w/Omega + 2), with the highest
-    natural frequency w, an upper bound of its gyroscopic change, and a shift by up to 2 Omega by the rotating bodies."""
+    """Return the phase, rad, through which the fastest oscillation advances in a period: 2 pi (w/Omega + 2).
+
+    w is the highest natural frequency plus an upper bound of its gyroscopic change. The rotating bodies can shift the frequency
+    of an oscillation by up to 2 Omega.
+    """
     carrier, gyroscopic = scene.model.carrier, scene.model.mounts[0].gyroscopic
     half = jnp.linalg.inv(jnp.linalg.cholesky(carrier.mass))
     fastest = jnp.sqrt(jnp.max(jnp.abs(jnp.linalg.eigvalsh(half @ carrier.stiffness @ half.T))))

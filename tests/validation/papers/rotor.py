@@ -159,7 +159,7 @@ NUMBERS = (
             within=0.005,
             unit="rad/s",
             differs=differs,
-            reason="no interpretation of the data gives both; the closest one is c2 = 0 with four pendulums",
+            reason="no interpretation of the data gives both critical speeds; the closest one is c2 = 0 with four pendulums",
         )
         for k, differs in ((0, 176.51), (1, 272.81))
     ),
