@@ -161,7 +161,7 @@ _COMMANDS = {"design": "optimize", "study": "sweep", "identification": "identify
 
 
 def require_tables(tables: Tables, kind: str, allowed: list[str]) -> None:
-    """**Raises** `InputError` for a name in a file of a `kind` that is not allowed.
+    """**Raises** `InputError` for a name that is not `allowed` in a file of this `kind`.
 
     The message suggests a similar name or, if more names of the file belong to another kind of file, states that kind.
 
@@ -449,7 +449,8 @@ def in_one_line(array: str) -> str:
 
 
 _Write: TypeAlias = Callable[[NumberSpec, Any], Any]
-"""Function from the specification and the SI value of a number or an array to the value or the nested list of a file."""
+"""Function that converts a number or an array for a scene file. Its arguments are the specification and the SI value; it
+returns the value, or the nested list of an array, that the file contains."""
 
 
 def _si_numbers(spec: NumberSpec, value: Any) -> Any:

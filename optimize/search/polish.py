@@ -139,8 +139,8 @@ class Starts(NamedTuple):
 
     - `point`: all initial designs, or None
     - `drawn`: number of random designs; `existing`: number of those for which the objective exists
-    - `off_held`: random designs, before the change to the held values, that do not reach these values; at most the requested
-      number of starts, or None
+    - `off_held`: random designs that cannot be changed so that the held quantities have their values, in their state before
+      this change; at most the requested number of starts, or None
     """
 
     point: Point | None

@@ -34,7 +34,7 @@ class RollingFriction(Effect):
       can also pull, and then has the same friction
     - With the exact sign, a load does not move if the force on it is the fraction s < 1 of the largest friction. With the
       smooth sign it creeps at the speed width artanh(s), which tends to 0 with the width
-    - The sign of N is that of the motion without this friction
+    - The equations contain N times its sign in place of |N|; this sign is computed from the accelerations without this friction
 
     **Arguments** (SI, or strings with a unit)
 
