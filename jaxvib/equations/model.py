@@ -39,7 +39,8 @@ class Group(eqx.Module, Generic[Part]):
 
 
 def grouped(parts: Sequence[Part], kinds: Sequence[Hashable] | None = None) -> tuple[Group[Part], ...]:
-    """Return parts in groups of equal structure, and of equal `kinds` if these are given; small groups are single parts."""
+    """Return parts in groups of equal structure, and of equal `kinds` if these are given. The parts of a group with fewer than
+    `_MIN_GROUP_SIZE` members are returned as separate groups of one part."""
     alike: dict[Hashable, list[int]] = {}
     for k, part in enumerate(parts):
         leaves, structure = jax.tree.flatten(part)
@@ -113,7 +114,10 @@ class Model(eqx.Module):
         return self.known_force(self.carrier.foundation_force(displacement, 1j * omega * displacement))
 
     def natural_force(self, unit: State) -> Array:
-        """Return S n^2, N: the centrifugal force of the unbalance S at the rotor speed n. `unit`: state of `natural_units`."""
+        """Return S n^2, N: the centrifugal force of the unbalance S at the rotor speed n.
+
+        **Arguments**: `unit`: the natural units of the scene's state, computed by `natural_units`.
+        """
         speeds = [each.rate[0] for each in unit.exciters if each.rate] or [unit.velocity / unit.displacement]
         speed = functools.reduce(jnp.maximum, speeds)
         return jnp.mean(jnp.diagonal(self.carrier.mass)) * unit.displacement * speed**2

@@ -156,7 +156,8 @@ def outliers_of(white: np.ndarray) -> tuple[float, float, float]:
 
 
 def _outlying(relative: np.ndarray, share: float, width: float) -> np.ndarray:
-    """Return the probabilities (n,) that residuals, relative to the standard deviation of the others, are outliers."""
+    """Return the probabilities (n,) that residuals are outliers; `relative`: residuals divided by the standard deviation of
+    those that are not outliers."""
     exponent = 0.5 * relative**2 * (1.0 - 1.0 / width**2)
     return 1.0 / (1.0 + (1.0 - share) / max(share, 1e-300) * width * np.exp(-np.minimum(exponent, 700.0)))
 

@@ -177,7 +177,7 @@ class StoredFunction(Generic[T]):
                 parts, tree = jax.tree.flatten(result)
                 outputs = [part for part in parts if eqx.is_array(part)]
                 results[:] = [(None, Skeleton.of(parts, tree))]
-            return [jnp.asarray(x, x.dtype) for x in outputs]  # not weakly typed, as the outputs of a stored program
+            return [jnp.asarray(x, x.dtype) for x in outputs]  # not weakly typed, because a stored program's outputs are not
 
         jitted = jax.jit(flat)
         try:

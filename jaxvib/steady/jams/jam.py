@@ -73,8 +73,8 @@ class AbstractJam(Result):
     - `mode`: number of the mode
     - `status`: a `JamStatus`
     - `omega`: load speed, rad/s; `rotor_speed`, rad/s
-    - `stable`: True if the slope dn/dOmega > 0 and the vibration can drive each load, for light loads that stay together
-      (`phase_jams` shows whether they do)
+    - `stable`: True if the slope dn/dOmega > 0 and the vibration can balance the drag and dry friction of each load.
+      This holds for light loads that stay together (`phase_jams` shows whether they do)
     - `slope`: dn/dOmega
     - `displacement` (nd,): complex amplitudes of q = Re(displacement exp(i Omega t)), m (rad for tilts)
     - `amplitude` (nd,), m (rad for tilts), zero to peak; typical: 0.5 to 10 mm
@@ -332,8 +332,8 @@ def jam_modes(scene: Scene) -> JamModes:
     **Raises** `InputError` for
 
     - loads without drag, at different stations, or not on a circle
-    - a machine whose coordinates couple through the rotor speed (`rotor`), and a body in a plane, with whose rotation the
-      housing of the exciter rotates
+    - a machine whose coordinates couple through the rotor speed (`rotor`), and a body in a plane, because the housing of the
+      exciter rotates with the body
     - a motor in place of a prescribed speed
     - effects that this function does not include, such as `CubicSupport`, `Stop`, `FrictionSupport` and `Sliding`
 
@@ -413,7 +413,7 @@ def jam_at(
     speed, slope, displacement = branch_tangent(model, omega)
     rotor_speed = speed if rotor_speed is None else rotor_speed
     at_fold = jnp.abs(slope) < jnp.sqrt(jnp.finfo(omega.dtype).eps) if at_fold is None else at_fold
-    # Within a few units in the last place of the speed of an undamped resonance, the amplitude consists of rounding errors.
+    # If the speed equals that of an undamped resonance up to rounding, the amplitude consists of rounding errors.
     radius = model.unbalance / jnp.min(jnp.diagonal(model.mass))
     bounded = jnp.all(magnitude(displacement) * 100.0 * jnp.finfo(radius.dtype).eps < radius)
     displacement = jnp.where(bounded, displacement, jnp.nan)

@@ -127,8 +127,8 @@ def _total_torques(phases: Array, balance: TorqueBalance, speeds: Array) -> Arra
 
 
 def _speeds(balance: TorqueBalance) -> np.ndarray:
-    """Return speeds up to the largest working speed, above which drives and vibration brake, dense near resonances and near the
-    working speeds of the drives.
+    """Return speeds up to 1.02 times the largest working speed. They are dense near resonances and near the working speeds of
+    the drives. Above the largest working speed there is no balance, because drives and vibration both brake.
 
     The largest speed is repeated, so that the number of speeds, and with it the compiled program, is always the same.
     """
@@ -188,8 +188,8 @@ def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tup
 
 
 def _nearly_touching(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of local minima of |values| (n, points) whose neighbours have the same sign, the larger of them at
-    least twice as large."""
+    """Return the indices of local minima of |values| (n, points) without a change of sign. Both neighbours of such a point have
+    the same sign, and the larger of their absolute values is at least twice that of the point."""
     left, size, right = (np.abs(x) for x in (values[:, :-2], values[:, 1:-1], values[:, 2:]))
     sign = np.sign(values)
     same = (sign[:, :-2] * sign[:, 1:-1] > 0.0) & (sign[:, 1:-1] * sign[:, 2:] > 0.0)
