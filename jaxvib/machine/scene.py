@@ -48,7 +48,8 @@ class Exciter(Part):
       from its centre of mass, m (a float or text), or the point (x, y) of a body in a plane, m; None for the default of the
       machine
     - `body`: number of the body from 0, on machines with several; typical: 0 (the default)
-    - `direction` of rotation: +1 anticlockwise, -1 clockwise. Angles and speeds of a state are anticlockwise in both cases
+    - `direction` of rotation: +1 anticlockwise, -1 clockwise. Angles and speeds of a state are positive anticlockwise in
+      both cases
     - `effects` of the rotor and its loads such as `StaticImbalance` or `DryFriction`
 
     **Attributes**: the arguments; `at` is stored as `platform` or `position`; `carries`: "loads", "unbalance", or both.

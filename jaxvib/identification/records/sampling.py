@@ -203,8 +203,8 @@ def without_spikes(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.
     """Return the readings with NaN in place of spikes, and a note about them.
 
     At most 9 readings at each end of the range count as spikes. A spike is outside the range of the other readings by more than
-    three times this range. Channels of fewer than 100 readings are returned unchanged. A fit by least squares begins with all
-    readings, and one spike can hide the motion.
+    three times this range. Channels of fewer than 100 readings are returned unchanged. Spikes are left out here because a fit
+    by least squares begins with all readings, in which one spike could hide the motion.
 
     >>> value = np.sin(0.1 * np.arange(400.0))
     >>> value[7] = 500.0

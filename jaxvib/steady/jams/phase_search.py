@@ -136,8 +136,9 @@ def phase_jams(
       lies between them, and Newton's method solves for its speed and phases. The load speeds are closer together near
       resonances
     - Jams that differ by a common rotation of all loads, or by an exchange of equal loads, count as one
-    - Loads that turn with the rotor and balance it are left out. Two equal loads at one point of the machine also have a jam at
-      the speed at which the response of the machine lags by 90 degrees. It is left out too; `synchronous_regimes` lists it
+    - Loads that turn with the rotor and balance it are left out. Two equal loads of one station also have a jam at the load
+      speed at which the vibration of the machine lags behind the force of the loads by 90 degrees. It is left out too;
+      `synchronous_regimes` lists it
     - Loads count as points: their `ball_radius` is not used, so that loads at one angle have the unbalance N m R. `jam_modes`
       places them side by side
     - An imbalance of the rotor (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force rotates at the rotor
