@@ -116,8 +116,8 @@ def export_uff(
     - Histories of a `Run`: the motion of every node and the force on the foundation (node 0; not of a machine from matrices
       without a foundation), and the amplitude spectra at the end of the run
 
-    Modes and responses are those of small vibrations: of nonlinear supports they include the linear parts only, which the
-    description of the machine in the file states.
+    Modes and responses are those of small vibrations: they include only the linear parts of nonlinear supports. In this case
+    the description of the machine in the file states this.
 
     Header, units (SI), nodes and lines come first, because programs for modal analysis reject functions without them. Numbers
     have 12 digits; those of the abscissa and of mode shapes have 6 digits, as the format prescribes.

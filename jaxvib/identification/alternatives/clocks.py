@@ -1,8 +1,8 @@
 """Drift between the clocks of a tachometer and of the vibration sensors of one run.
 
-If the clock of the sensors runs fast by the share e, a vibration at the angle theta is recorded as if the rotor's angle were
-theta((1 - e) t - d) at the recorded time t. After a fit that is patterned, e and the delay d of each run become unknowns, and
-the fit is continued.
+The clock of the sensors runs fast by the fraction e and differs by the delay d. A sample that has the time t on this clock was
+taken at the time (1 - e) t - d of the tachometer, at the rotor's angle theta((1 - e) t - d). After a fit with the status
+`patterned`, e and d of each run become unknowns, and the fit is continued.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ _DRIFT, _DELAY = 0.01, 0.1
 """Standard deviations of the drift and of the delay (s) before the fit; both are much larger than those of recorders."""
 
 _MIN_SHARE = 0.1
-"""Smallest explained share for which the fit is continued with a drift and a delay: the share of the variance of a channel's
-residuals that both together explain to first order, the largest of all channels and runs."""
+"""Smallest explained share for which the fit is continued with a drift and a delay. The explained share of a channel is the
+share of the variance of its residuals that drift and delay together explain to first order; the largest share of all channels
+and runs counts."""
 
 
 def clock_notes(fitted: Fitted) -> list[str]:
     """Return a sentence for each run in which the clocks of the tachometer and of the sensors drift apart, if the model
     explains the records much better with these drifts.
 
-    **Arguments**: a patterned fit.
+    **Arguments**: a fit with the status `patterned`.
     """
     problem = fitted.problem
     measured = all(rotor.samples is not None for rotors in problem.rotors for rotor in rotors)

@@ -18,7 +18,7 @@ contain the exact largest displacements."""
 
 
 def beat_period(scene: Scene, trajectory: Trajectory) -> float | None:
-    """Return the period, s, after which loads that turn slower than the rotor have the same place beside its imbalance.
+    """Return the period, s, after which loads that turn slower than the rotor are again at the same angle from its imbalance.
 
     The vibration then repeats itself after each period, but never becomes steady. The result is None if there is no imbalance,
     if the loads do not all fall behind the rotor by the same number of turns, and unless the second half of the `trajectory`
@@ -28,7 +28,8 @@ def beat_period(scene: Scene, trajectory: Trajectory) -> float | None:
         return None
     half = trajectory.time.shape[0] // 2
     time, turn, angle = (np.asarray(x)[half:] for x in (trajectory.time, trajectory.rotor_angle, trajectory.state.azimuth))
-    behind = np.abs(turn - turn[-1])[:, None] - np.abs(angle - angle[-1])  # turns still to be lost, in rad
+    # Angle, rad, by which the loads still fall behind the rotor until the end of the run.
+    behind = np.abs(turn - turn[-1])[:, None] - np.abs(angle - angle[-1])
     total, lost = behind[0], np.maximum.accumulate(np.mean(behind, axis=1)[::-1])
     beats = int(lost[-1] / (2.0 * np.pi))
     if beats < _MIN_BEATS or np.ptp(total) > np.pi or not np.all(np.isfinite(total)):

@@ -124,7 +124,8 @@ def _speed_and_amplitudes(model: ExcitedModel, omega: Array, speed: Array | None
 
 def _speed_from_acceleration(model: ExcitedModel, omega: Array, acceleration: Array) -> Array:
     """Return the value of `rotor_speed_at` at `omega`, from w^2 e^H B Y, m/s^2, see `ExcitedModel.forward_acceleration`."""
-    # The torque of the drag is opposite to that of the acceleration -w^2 Y.
+    # The drag torque is minus the mean torque of the vibration. The vibration has the acceleration -w^2 Y, so that the mean
+    # torque of +w^2 Y is the drag torque.
     torque = mean_torque(model.unbalance, acceleration)
     if isinstance(model, UnbalancedModel):
         return torque / model.motor_torque(omega)
