@@ -72,7 +72,7 @@ class Result(Readable):
     def plot(self) -> "Figure":
         """Plot the result by matplotlib.
 
-        **Arguments** (those of a result that has them): `unit` of speeds, "rad/s", "rpm" or "Hz"; `ax`: axes to draw onto, one
+        **Arguments** (some results do not have them): `unit` of speeds, "rad/s", "rpm" or "Hz"; `ax`: axes to draw onto, one
         for each panel.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.

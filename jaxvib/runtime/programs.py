@@ -152,8 +152,8 @@ def _is_none(x: object) -> bool:
 def _differentiable(
     call: _CallSignature, active: Sequence[bool], arrays: Sequence[Array]
 ) -> tuple[Callable[..., tuple[list[Array], list[Array]]], list[Array]]:
-    """Return a function from the active arrays to the floating-point outputs and, as auxiliary data, all outputs; and these
-    arrays."""
+    """Return a function and the active arrays, which are its arguments. The function returns the floating-point outputs and, as
+    auxiliary data, all outputs."""
 
     def function(*active_arrays: Array) -> tuple[list[Array], list[Array]]:
         outputs = call.split(call(_replaced(active, arrays, active_arrays)))

@@ -73,8 +73,8 @@ class Floquet(NamedTuple):
 
 
 def decay_error(needed: int | Array, steps: int | Array, turn: float, *, implicit: bool) -> Array:
-    """Return a bound of the relative growth or decay of an undamped oscillation of the carrier over the span `turn`, rad, of
-    the grid, if the number of `steps` differs from the `needed` number of `steps_for`."""
+    """Return a bound of the relative growth or decay that the integration causes in an undamped oscillation of the carrier,
+    over the span `turn`, rad, of the grid. `steps` is the number of steps, and `needed` the number that `steps_for` returns."""
     phase = ((radau.PHASE if implicit else _PHASE_PER_STEP) * needed - 2.0 * turn) / jnp.asarray(steps)
     return radau.decay_error(phase, steps) if implicit else _GROWTH_ERROR * phase**10 * steps
 
@@ -105,8 +105,8 @@ def _drag_rate(model: JammedBodies, omega: Array, speed: Array) -> Array:
 
         max_g(-T_rate / I)_g / (1 - mu sum_g S_g^2 / I_g),      mu the largest eigenvalue of B M^-1 B^T
 
-    The denominator is the share of the inertia of a body that the motion of the carrier leaves; T_rate is the derivative of its
-    torque with respect to its speed.
+    The denominator is the factor by which the motion of the carrier reduces the inertia of a body; T_rate is the derivative of
+    the torque of the body with respect to its speed.
     """
     linear, mount = model.linear, model.linear.mount
     still = jnp.zeros((len(mount.axes), 1), linear.mass.dtype)
@@ -395,7 +395,8 @@ def _integrate(
     sizes: Sequence[int],
     step: _Step,
 ) -> tuple[Array, ...]:
-    """Return the state after `steps` steps from unit matrices of 2 `sizes`, each with the coefficients at its `nodes`."""
+    """Return the state after `steps` steps. The initial state consists of unit matrices, with 2 n rows for each n of `sizes`.
+    Each step uses the coefficients at its `nodes`, which are fractions of the step."""
     places = jnp.asarray(nodes, dtype=equations.omega.dtype)
     # exp(i k theta) is updated by a product in each step, because sines and cosines at every node took a quarter of the time.
     every = np.arange(max(grid.deviation_orders[-1], grid.orders[-1]) + 1)
