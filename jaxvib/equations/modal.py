@@ -43,8 +43,8 @@ class ModalResponse(eqx.Module):
         receptances e_i^H B_i D^-1 B_k^T e_k (count, count) between several masses.
 
         The sum is a loop over the poles. In a batch each of its steps is then computed for many frequencies by vector
-        instructions, which for 200 platforms takes a fifth of the time of sums over arrays. The sum uses real numbers because
-        the imaginary part of an undamped carrier is then exactly 0.
+        instructions, which for 200 platforms takes a fifth of the time of sums over arrays. The sum uses real numbers; the
+        imaginary part of the receptance of an undamped carrier is then exactly 0.
         """
         residues = jnp.moveaxis(self.residues, -1, 0)
 
@@ -102,8 +102,8 @@ def modal_response(
     """
     n, eps = frequencies.shape[0], jnp.finfo(frequencies.dtype).eps
     positive = jnp.where(frequencies > 0.0, frequencies, jnp.inf)
-    # q must follow from Omega q. A motion that is free to drift (Omega = 0) therefore gets a spring. It is too soft to have an
-    # effect at any load speed.
+    # The displacement q is computed from the state Omega q by a division by Omega. A coordinate without a spring (Omega = 0)
+    # therefore gets a spring that is too soft to have an effect at any load speed.
     drift_frequency = jnp.where(jnp.isfinite(jnp.min(positive)), jnp.min(positive), 1.0) * eps ** (1 / 3)
     stiff = jnp.where(frequencies > 0.0, frequencies, drift_frequency)
     coupling, rounding = shapes.T @ damping @ shapes, jnp.abs(shapes.T) @ jnp.abs(damping) @ jnp.abs(shapes)

@@ -156,7 +156,8 @@ class State(Readable):
 
 
 def require_state(scene: Scene, state: State, name: str) -> None:
-    """**Raises** `InputError` for a state of another scene, and for several states in one; `name`: the state in messages."""
+    """**Raises** `InputError` for a state of another scene, and for a `State` that contains several states (arrays with an
+    additional axis); `name` of the state in messages."""
     require_motion(scene, state, name)
     if len(state.exciters) != len(scene.exciters):
         raise InputError(f"{name}.exciters", f"are {len(state.exciters)}; this scene needs {len(scene.exciters)}")

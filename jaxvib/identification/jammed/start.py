@@ -103,8 +103,8 @@ class _Trial(NamedTuple):
 
 
 def with_first_motion(problem: Problem) -> tuple[Problem, np.ndarray]:
-    """Return the problem of a motion with loads with first values of the linear unknowns, and the first values x of the other
-    unknowns.
+    """Return the problem of a scene with jammed loads, to which the first values of the linear unknowns are added, and the
+    first values x of the other unknowns.
 
     If the motion with the first values of the scene does not resemble the records, it is computed again with other stiffnesses,
     see `_stiffnesses_of_jam`.
@@ -298,7 +298,9 @@ def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.
             where = np.concatenate([np.arange(p), p + indices, [size, size + 1]])
             columns = weighted_columns(samples, at, at.columns)
             total[np.ix_(where, where)] += columns.T @ columns
-            total[size:, size:] += np.sum((at.gaps / (_GAP_SIZE * scale)) ** 2)  # the last unknown is 1 for closed gaps
+            total[size:, size:] += np.sum(
+                (at.gaps / (_GAP_SIZE * scale)) ** 2
+            )  # the last unknown is the closed share of the gaps
             start_changes.append(at.start_changes)
         prior[:size, :size], gradient[:size] = prior_equations(problem, x, linear)
         cost = float(total[-1, -1]) + known_cost(problem, x, linear)

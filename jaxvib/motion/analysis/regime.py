@@ -307,8 +307,9 @@ def _unbalance(scene: Scene, unbalances: Array, rotor_unbalance: Array, turn: Ar
     """Return the residual unbalance of the loads and the rotor, relative to that of all loads at one angle.
 
     `unbalances` (count,) and `rotor_unbalance` are complex. For a rotor that tilts, the result is the larger of this value and
-    the moment about the point of the loads, relative to that of the loads' levers, or to the radius of gyration of the rotor if
-    the levers are 0.
+    the relative residual moment. The residual moment is that of all unbalances about the reference point of the mount. It is
+    divided by the largest moment that the loads can have, or, if all levers of the loads are 0, by the unbalance of the loads
+    times the radius of gyration of the rotor.
     """
     mount, origin = scene.mount(), jnp.zeros_like(turn[0])
     imbalances = [term.at(origin) for term in terms_of(scene.all_effects, RotorImbalance)]

@@ -30,9 +30,9 @@ class TierRow(NamedTuple):
     **Attributes**
 
     - `tier`: its name; `applicable`: True if it can compute the quantities of the audit for the scene
-    - `amplitude`, `foundation_force`, `omega`: relative errors of these quantities, compared with the best tier; NaN if
-      `applicable` is False, or if the value of the best tier is 0. `amplitude` is the error of the coordinate with the largest
-      error, divided by the largest amplitude in the same unit
+    - `amplitude`, `foundation_force`, `omega`: relative errors, compared with the best tier. They are NaN if `applicable` is
+      False. An error is also NaN if only the best tier has the value 0, or if all of its amplitudes are 0.
+      `amplitude` is the error of the coordinate with the largest error, divided by the largest amplitude in the same unit
     - `seconds` of a computation; `compile`: additional seconds of the first computation; NaN without timings
     - `note`: purpose of the tier, the reason why it cannot compute the quantities, or the motion that the run reached after it
       left the jam

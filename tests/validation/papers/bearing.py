@@ -62,7 +62,7 @@ def _load(rate: float) -> float:
 
 
 def _share_of_gravity() -> float:
-    """Per cent, at the slowest published jam."""
+    """Per cent, at the slowest jam that the rotor paper computes."""
     heavy = (float(normal_force(_scene(Gravity()), 0.0, _state(_JAM, sign * math.pi / 2.0))[0]) for sign in (-1.0, 1.0))
     return 100.0 * max(abs(load / _load(_JAM) - 1.0) for load in heavy)
 
@@ -137,8 +137,8 @@ NUMBERS = (
         _share_of_gravity,
         within=0.5,
         unit="%",
-        note=f"the paper prints an upper limit, without a speed; at the slowest published jam, {_JAM} rad/s, the change is "
-        f"below it; the limit is reached at {math.sqrt(9.81 / (0.005 * _LENGTH)):.1f} rad/s",
+        note=f"the paper prints an upper limit, without a speed; at the slowest jam that the rotor paper computes, {_JAM} "
+        f"rad/s, the change is below it; the limit is reached at {math.sqrt(9.81 / (0.005 * _LENGTH)):.1f} rad/s",
     ),
     _measured("scatter of 20 measurements", 2.1, reason="the twenty measurements are not printed"),
     _measured(
