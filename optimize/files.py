@@ -164,7 +164,8 @@ def _read_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Catal
         or not column_names
     ):
         advice = (
-            "write a list, or file = 'springs.csv', column = 'rate', or, for rows, columns = {'drive.power' = 'power', ...}"
+            "write a list, or file = 'springs.csv', column = 'rate', or, for whole rows, "
+            "columns = {'drive.power' = 'power', ...}"
         )
         raise InputError(f"choices.{name}", f"is {quoted(dict(values))}; {advice}")
     path = folder / values["file"]

@@ -31,9 +31,10 @@ _BYTES_PER_SAMPLE = 1000.0
 """Memory for each sample of a planned run, bytes: readings, their derivatives and copies."""
 
 _INACCURATE, _MAX_ERROR, _MAX_DECREASE = 0.02, 1.0, 0.9
-"""Relative changes that give the range of expected errors: standard error of a direction of the fit above which the direction
-is changed; largest standard error that counts, because an undetermined direction has no bound; largest decrease of a positive
-parameter."""
+"""Limits of the changes, relative to the parameters, that give the range of expected errors. The fit is changed along a
+direction if the standard error of this direction is above the first number. A larger standard error than the second number
+counts as this number, because the standard error of an undetermined direction can be arbitrarily large. The third number is
+the largest decrease of a positive parameter."""
 
 
 class PlannedRun(Readable):
@@ -121,7 +122,8 @@ class Expected(NamedTuple):
 def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     """Return a planned run, evaluated with the parameters of a fit.
 
-    A run with loads on the rotor begins with the state at the first sample of the first run of the fit, all others at rest.
+    If the scene has loads, the planned run begins with the state at the first sample of the first run of the fit, otherwise at
+    rest.
 
     **Raises** `InputError` for a channel whose noise is unknown, for a scene with several exciters, and for loads that do not
     stay jammed.
@@ -251,10 +253,11 @@ def range_of_errors(fit: MachineFit, planned: PlannedRun, errors: np.ndarray) ->
 
 
 def _changed_fit(fit: MachineFit, change: np.ndarray) -> MachineFit:
-    """Return the fit with relative changes (k,) of its parameters, shortened such that none of a positive parameter is below
-    -0.9.
+    """Return the fit with relative changes (k,) of its parameters.
 
-    The changes are not those of logarithms: modal dampings, which the runs so far may determine, are linear in the dampings.
+    If a positive parameter would decrease by more than 90 %, all changes are reduced by a common factor. The parameters are
+    changed and not their logarithms, because the modal dampings, which the runs so far may determine, are linear in the
+    damping coefficients.
     """
     numbers = [find_number(fit.scene, name, "unknown") for name in fit.names]
     values = np.array([float(each.read(fit.scene)[0]) for each in numbers])

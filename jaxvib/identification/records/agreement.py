@@ -104,7 +104,7 @@ def turn_speed(channel: Channel, time: np.ndarray, value: np.ndarray) -> tuple[n
     if channel.kind == "speed":
         is_finite = np.isfinite(value)
         return time[is_finite], value[is_finite]
-    if channel.kind == "pulses":  # those of one mark, by their numbers
+    if channel.kind == "pulses":  # only the pulses of one mark, selected by their numbers
         angles = 2.0 * np.pi * value / channel.per_turn
         is_used = np.isfinite(value) & ((value - value[np.isfinite(value)][0]) % channel.per_turn == 0.0)
     else:
