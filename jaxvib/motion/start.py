@@ -121,7 +121,7 @@ def initial_state(
         modes = jam_modes(scene)
     except InputError as error:
         problem, _, advice = error.problem.partition(";")
-        if "simulate" not in advice:  # `simulate` is the caller, so that advice would be circular
+        if "simulate" not in advice:  # the caller is `simulate`; the advice to use it would be circular
             raise
         raise InputError("start", f"is 'jam', but {error.field} {problem}; start at 'rest', or from a State") from error
     row, angle = np.asarray(modes.row(mode, throw=throw), np.uint32), phases(scene.exciter, scene.loads, 0.0)

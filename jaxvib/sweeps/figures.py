@@ -284,7 +284,8 @@ def _is_log(store: Store, axis: str) -> bool:
 
 
 _USUAL_SIZES = {"m": 0.01, "N/m": 1e5, "N": 100.0}
-"""Typical values, SI, by unit. The display unit of a figure suits this value, not the values in the store."""
+"""Typical values, SI, by unit. The display unit of a figure is chosen for these values; the values in the store do not change
+it."""
 
 
 def display_unit(store: Store, name: str) -> tuple[str, float]:
@@ -362,7 +363,8 @@ def case_labels(store: Store, region: slice | tuple[slice, ...]) -> _Labels:
 
 
 def label_counts(store: Store) -> list[tuple[str, int]]:
-    """Return the labels of the finished cases with their numbers of cases, the most frequent first; none without labels."""
+    """Return the labels of the finished cases with their numbers of cases, the most frequent first. The list is empty
+    if the study has no labels."""
     if not _has_labels(store):
         return []
     total: Counter[str] = Counter()

@@ -29,7 +29,7 @@ class LoadContact(Effect):
 
     - On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other. Load j+1 follows load j, and load 1
       follows the last one a turn later; there are therefore as many pairs as loads. The angles of a start must be in this
-      order, within one turn. Starts by name, such as "rest", place coincident loads side by side
+      order, within one turn. Starts by name, such as "rest", place the loads side by side
     - Only loads at one station of a rotor can touch. For loads at several stations `prepare` sets the attribute `tracks`, see
       `Tracks`; otherwise it is None
     - If loads have several coordinates, as in a torus, each pair can touch, s = |p(u_i) - p(u_j)|, and no two loads may start
