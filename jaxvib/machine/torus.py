@@ -77,7 +77,7 @@ class TorusBalls(Loads):
         return self._arm(a) * jnp.cos(f), self._arm(a) * jnp.sin(f), -self.gap * jnp.cos(a)
 
     def rest(self) -> tuple[Array, Array]:
-        """Return the outer equator at f = -pi/2, the bottom of an upright torus."""
+        """Return the point of the outer equator at f = -pi/2, the lowest point of a torus with a horizontal axis."""
         quarter = jnp.full((self.count,), 0.5 * jnp.pi, dtype=jnp.result_type(self.radius))
         return -quarter, quarter
 
@@ -183,7 +183,7 @@ def _require_room(count: int, radius: float, tube: float, ball_radius: float) ->
     if not tube < radius:
         raise InputError("loads.tube", f"is {tube:.6g} m; it must be less than the ring's radius, {radius:.6g} m")
     if not ball_radius < tube:
-        problem = "leaves no gap" if ball_radius == tube else "is larger than the tube"
+        problem = "leaves no gap in the tube" if ball_radius == tube else "is larger than the tube"
         hint = "give a smaller one, or use balls(...) for balls that only run around the axis"
         raise InputError("loads.ball_radius", f"is {ball_radius:.6g} m, which {problem} of {tube:.6g} m radius; {hint}")
     require_side_by_side(count, radius + tube - ball_radius, ball_radius)

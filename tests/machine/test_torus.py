@@ -145,7 +145,7 @@ def test_frequency_about_the_equator_is_the_resolved_one():
     ("build", "says"),
     [
         (lambda: balls(ball_radius=0.02), "loads.ball_radius is 0.02 m, which is larger than the tube of 0.015 m"),
-        (lambda: balls(ball_radius=0.015), r"which leaves no gap of 0.015 m radius.*balls\(\.\.\.\)"),
+        (lambda: balls(ball_radius=0.015), r"which leaves no gap in the tube of 0.015 m radius.*balls\(\.\.\.\)"),
         (lambda: balls(tube=0.25), "loads.tube is 0.25 m; it must be less than the ring's radius"),
         (lambda: balls(51), "loads.ball_radius is 0.0125 m; 51 side by side on a circle of 0.2025 m need a ball_radius below"),
         (lambda: balls(mass=0.0), "loads.mass is 0 kg; it must be greater than 0"),

@@ -1,9 +1,8 @@
 """Synchronous regimes in which all loads of each exciter are at one angle, and their course over the speed of the drives.
 
 One mass stands for all loads of an exciter: it has the sum of their unbalances, moments of inertia and drags. In the averaged
-equations the loads can also separate. If the deviations of the phases of N equal loads from their mean add to 0, the force of
-the loads does not change, and neither does the acceleration of the point about which they turn. The averaged equation of each
-load becomes
+equations the loads can also separate. Small deviations of the phases of N equal loads whose sum is 0 do not change the total
+force of the loads, nor the acceleration of the point about which they turn. The averaged equation of each load becomes
 
     I d'' + D d' - (S/2) Re(e^{-i psi} a) d = 0
 
@@ -47,7 +46,10 @@ class _CollectedBalance(TorqueBalance):
     loads_per_mass: tuple[int, ...] = eqx.field(static=True, kw_only=True)
 
     def total_driving_torque(self, omega: Array, factor: Array | None = None) -> Array:
-        """Return `driving_torque`, with all differences between the single loads multiplied by `factor`."""
+        """Return `driving_torque`, with the differences from the mean multiplied by `factor`, as in the base class.
+
+        The mean is that of the single loads: the torque of a mass that stands for k loads is compared with k times this mean.
+        """
         torque, count = self.driving_torque(omega), jnp.asarray(self.loads_per_mass)
         if factor is None:
             return torque
