@@ -2,8 +2,9 @@
 
 The angle of rotating mass k in the fixed frame is th_k = sigma_k (Omega t + alpha_k), with sigma_k = +1 anticlockwise, -1
 clockwise, and e_k = (1, -i sigma_k). The displacement of its point is B_k q, S_k is its unbalance, and L_k its driving
-torque: that of the drag on a load, T(Omega) of the motor of an unbalance. M, C, K and G are the mass, damping, stiffness and
-gyroscopic matrices of the carrier with its loads, and n is the rotor speed. With D(w) = K - w^2 M + i w (C + n G),
+torque. A load is driven by the torque of its drag, and an unbalance by the torque T(Omega) of its motor. M, C, K and G are the
+mass, damping, stiffness and gyroscopic matrices of the carrier with its loads, and n is the rotor speed. With
+D(w) = K - w^2 M + i w (C + n G),
 
     H_ik = e_i^H B_i D(Omega)^-1 B_k^T e_k
     V_i = (Omega^4/2) sum_k S_i S_k Im(exp(i (alpha_k - alpha_i)) H_ik)
@@ -417,8 +418,8 @@ def torques_at(unbalance: Array, influence: Array, omega: Array, phasors: Array)
 
 
 def unknowns_of(balance: TorqueBalance, omega: Array, phase: Array) -> Array:
-    """Return the unknowns of the balance: the speed relative to `TorqueBalance.speed`, and all phases relative to the first;
-    with unbalances of prescribed speed the phases of the other masses."""
+    """Return the unknowns of the balance: the speed relative to `TorqueBalance.speed`, and all phases relative to the first. If
+    ideal drives prescribe the speed of unbalances, the unknowns are only the phases of the other masses."""
     if any(balance.is_prescribed):
         return phase[np.flatnonzero(~balance.is_prescribed)]
     return jnp.concatenate([jnp.reshape(omega / jax.lax.stop_gradient(balance.speed), (1,)), phase[1:] - phase[0]])

@@ -276,7 +276,8 @@ class Converter(MotorWrapper):
     def __init__(self, motor: Motor, reference: IdealDrive):
         if not isinstance(motor, Motor) or motor.jump_ts() or motor.state_units() or isinstance(motor, Converter):
             needed = (
-                "it must be a motor without currents as states, switching times or a converter, such as InductionMotor(...)"
+                "it must be a motor such as InductionMotor(...), without currents as states, without switching times, "
+                "and without a converter"
             )
             raise InputError("drive.motor", f"is {quoted(motor)}; {needed}")
         _require_ideal(reference)
