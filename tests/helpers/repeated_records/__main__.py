@@ -29,6 +29,8 @@ def main(count: int, names: list[str], store: str | None) -> None:
         counts = zip(*np.unique(found.statuses, return_counts=True), strict=True)
         print(f"  {time.process_time() - begin:.0f} s of CPU time; {', '.join(f'{n} {name}' for name, n in counts)}")
         print(f"  held {found.held.round(3).tolist()}, ratio {found.ratio.round(2).tolist()}")
+        errors = found.error_ratio[~found.wrong]
+        print(f"  standard errors {np.min(errors):.2f} to {np.max(errors):.2f} times the bound")
         if found.linear is not None:
             most = np.max(np.abs(found.from_linear[~found.wrong]))
             print(f"  linearized fits: held {found.linear_held.round(3).tolist()}, up to {most:.2f} bounds from the fits")

@@ -45,8 +45,10 @@ JAMMED_CASES = {
 SUPPORT_CASES = {"stop": {"support": "stop"}, "cubic support": {"support": "cubic"}, "friction": {"support": "friction"}}
 """Cases of `repeated_records.supports`."""
 
-FACTORS = {"stop[0].gap": 1.2, "stop[0].stiffness": 1.3, "cubic": 1.3, "force": 1.3, "stiffness": 1.1, "damping": 1.5}
-JAMMED_FACTORS = {"stiffness": 1.05, "damping": 1.3, "loads.mass": 1.1, "drag": 1.2}
+FACTORS = {
+    "stop[0].gap": 1.2, "stop[0].stiffness": 1.3, "cubic": 1.3, "force": 1.3, "stiffness": 1.1, "damping": 1.5,
+    "loads.mass": 1.1, "drag": 1.2,
+}  # fmt: skip
 """Factors on the first values; the first word in the name of a number counts."""
 
 
@@ -79,6 +81,11 @@ class Repeated:
     def ratio(self):
         """Standard deviation (p,) of the errors relative to the Cramer-Rao bound, wrong minima left out."""
         return np.sqrt(np.mean(self.relative[~self.wrong] ** 2, axis=0)) / self.bound
+
+    @property
+    def error_ratio(self):
+        """Standard errors (r, p) of the fits relative to the Cramer-Rao bound."""
+        return self.relative / self.away / self.bound
 
     @property
     def linear_held(self):
@@ -115,14 +122,14 @@ def run_up(motor, ending=False):
 def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None, store=None, **options):
     """Return the fits of `count` records from stiffnesses 10 % off and dampings 50 % off, in random directions, see `FACTORS`.
 
-    In records of jammed balls, the mass and the drag of the balls are 10 % and 20 % off, the dampings 30 %, and the stiffnesses
-    5 %. Fits that the file `store` contains are not repeated, and each new fit is added to it.
+    In records of jammed balls, the mass and the drag of the balls are 10 % and 20 % off. Fits that the file `store` contains
+    are not repeated, and each new fit is added to it.
     """
     clean, turning = (jammed.clean(), None) if balls else run_up(motor, ending)
     if "full_scale" in options:
         options = options | {"full_scale": options["full_scale"] * np.max(np.abs(clean))}
     truth, scene = (jammed.TRUTH, jammed.scene_of) if balls else (TRUTH, scene_of)
-    names, factor = ((*NAMES, "loads.mass", "loads.drag"), JAMMED_FACTORS) if balls else (NAMES, FACTORS)
+    names = (*NAMES, "loads.mass", "loads.drag") if balls else NAMES
     if support:
         truth, scene = supports.truth(support), supports.scene_of
         names = [*NAMES, *(name for name in truth if name.startswith("effects") and "width" not in name)]
@@ -137,7 +144,7 @@ def repeated(count, seed=0, motor=False, ending=False, balls=False, support=None
         else:
             run = record(TIMES, clean, NOISE, rng, turning=turning, **options)
         first = {
-            name: value * next((f for word, f in factor.items() if word in name), 1.0) ** rng.choice([-1.0, 1.0])
+            name: value * next((f for word, f in FACTORS.items() if word in name), 1.0) ** rng.choice([-1.0, 1.0])
             for name, value in truth.items()
         }
         runs.append(run)

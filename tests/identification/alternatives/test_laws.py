@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from repeated_records.fits import JAMMED_NOISE, NAMES, NOISE
 from repeated_records.jammed import RADIUS, TIMES, TRUTH, jammed_record, scene_of, turning
+from repeated_records.laws import Named, named
 from repeated_records.supports import motion, support_record, truth
 from run_ups_by_scipy import TRUTH as MACHINE
 from run_ups_by_scipy import record
@@ -61,6 +62,15 @@ def test_law_of_jammed_balls_is_named(law, words):
     assert fit.status_name == "patterned"
     (note,) = law_notes(fit)
     assert note.startswith(f"the model fits clearly better with {words}")
+
+
+def test_no_law_is_named_if_the_fit_lacks_none():
+    assert named(np.random.default_rng([1, 0]), color=0.9) == Named("found", [], [])
+
+
+@pytest.mark.slow
+def test_no_law_of_jammed_balls_is_named_if_the_fit_lacks_none():
+    assert named(np.random.default_rng([1, 0]), balls=True) == Named("found", [], [])
 
 
 @pytest.mark.parametrize(("count", "is_tried"), [(MIN_SAMPLES - 1, True), (MIN_SAMPLES, False)])

@@ -189,7 +189,7 @@ def test_jammed_balls_are_found_with_other_noise(name):
     found = repeated(2, **JAMMED_CASES[name])
     assert found.statuses.tolist() == ["found"] * 2
     assert np.max(np.abs(found.away)) < 3.5
-    ratio = np.abs(found.relative / found.away / found.bound)  # the bound does not know of clipped readings, 24 % of all
+    ratio = found.error_ratio  # the bound does not know of clipped readings, 24 % of all
     assert np.min(ratio) > 0.9 and np.max(ratio) < (1.35 if "clipped" in name else 1.1)
 
 
