@@ -58,7 +58,7 @@ class NamePlateMotor(Motor):
     **Raises** `InputError` for
 
     - a wrong unit and a value out of bounds
-    - a rated speed that needs more than 48 pole pairs, or a breakdown slip of 1 or more
+    - a rated speed that needs more than 48 pole pairs or is a synchronous speed, or a breakdown slip of 1 or more
     - a `starting_ratio` that is below that of Kloss's formula or not below `breakdown_ratio`
 
     >>> import jaxvib as jv
@@ -164,6 +164,10 @@ def _require_plate(rated: float, frequency: float, ratio: float, synchronous: fl
     if pole_pairs > _MAX_POLE_PAIRS + 0.5:
         problem = f"{speed}, which needs {pole_pairs:.0f} pole pairs; motors have 1 to {_MAX_POLE_PAIRS}"
         raise InputError("drive.rated_speed", f"{problem}; give the speed of the name plate, and the supply's frequency")
+    own = frequency / rated
+    if abs(own - np.round(own)) < 1e-6 * own:
+        problem = f"{speed}, the synchronous speed of {own:.0f} pole pairs, at which a motor has no torque"
+        raise InputError("drive.rated_speed", f"{problem}; give the speed at rated load, some percent below it, as '1440 rpm'")
     if not breakdown_slip < 1.0:
         slip = f"{100.0 * (1.0 - rated / synchronous):.3g} % below the synchronous speed of {speed_text(synchronous)}"
         problem = f"{speed}, {slip}; with the breakdown_ratio {ratio:.4g} the breakdown slip is {breakdown_slip:.3g}"

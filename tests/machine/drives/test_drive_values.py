@@ -192,6 +192,11 @@ REFUSED = {
         lambda: jv.NamePlateMotor(4e3, "3000 rpm", 2.8, 0.02),
         "drive.rated_speed is 3000 rpm; it must be below 3000 rpm, the synchronous speed of one pole pair",
     ),
+    "rated at 750 rpm": (
+        lambda: jv.NamePlateMotor(4e3, "750 rpm", 2.0, 0.02),
+        "drive.rated_speed is 750 rpm, the synchronous speed of 4 pole pairs, at which a motor has no torque; give the speed "
+        "at rated load",
+    ),
     "breakdown slip": (
         lambda: jv.NamePlateMotor(4e3, "1200 rpm", 3.0, 0.02),
         "drive.rated_speed is 1200 rpm, 20 % below the synchronous speed of 1500 rpm; with the breakdown_ratio 3 the breakdown "
@@ -353,7 +358,7 @@ def test_speed_profile_jumps_at_its_points():
 
 
 def test_name_plate_gives_the_number_of_pole_pairs():
-    for rated, frequency, synchronous in ((1000, "50 Hz", 1500.0), (999, "50 Hz", 1000.0), (1740, "60 Hz", 1800.0)):
+    for rated, frequency, synchronous in ((1001, "50 Hz", 1500.0), (999, "50 Hz", 1000.0), (1740, "60 Hz", 1800.0)):
         motor = jv.NamePlateMotor(2e3, f"{rated} rpm", 1.1, 0.02, frequency)
         np.testing.assert_allclose(motor.speed, synchronous * np.pi / 30.0, rtol=1e-12)
         slip = 1.0 - motor.rated_speed / motor.speed
