@@ -158,6 +158,7 @@ def implausible_numbers(scene: Scene) -> list[str]:
     """
     notes = []
     mass = float(np.sum(getattr(scene.machine, "mass", 0.0)))
+    likely_mass = mass / 1e3 if mass > _MAX_MASS else mass  # one wrong mass shall not cause notes about motors and springs
 
     def note(name: str, value: str, si: str, meant: str) -> None:
         notes.append(f"{name} is {value}; a plain number is in {si}: did you mean '{meant}'?")
@@ -169,8 +170,8 @@ def implausible_numbers(scene: Scene) -> list[str]:
         if speed > MAX_USUAL_SPEED and is_short:  # a speed that was given in rpm has many digits in rad/s
             note(f"{place}drive.speed", speed_text(speed), "rad/s", f"{speed:g} rpm")
         power = float(getattr(exciter.drive, "power", np.inf))
-        if mass >= _MIN_MASS and power < _MIN_POWER * mass:
-            note(f"{place}drive.power", f"{power:g} W for a machine of {mass:g} kg", "W", f"{power:g} kW")
+        if mass >= _MIN_MASS and power < _MIN_POWER * likely_mass:
+            note(f"{place}drive.power", f"{power:g} W for a machine of {likely_mass:g} kg", "W", f"{power:g} kW")
         radius = 0.0 if loads is None else float(np.max(getattr(loads, "radius", 0.0)))
         if radius > _MAX_RADIUS:
             note(f"{place}loads.radius", f"{radius:g} m", "m", f"{radius:g} mm")
@@ -204,8 +205,8 @@ def implausible_numbers(scene: Scene) -> list[str]:
                 note(name, f"{value:g} N/m, but another one is {np.max(springs):g} N/m", "N/m", f"{value:g} N/mm")
     for name, stiffness in (("supports.stiffness", supports), ("stiffness", getattr(scene.machine, "stiffness", 0.0))):
         total = float(np.sum(stiffness))
-        if mass >= _MIN_MASS and 0.0 < total * _MAX_SAG < STANDARD_GRAVITY * mass:
-            value = f"so small that the machine sags by {STANDARD_GRAVITY * mass / total:.3g} m"
+        if mass >= _MIN_MASS and 0.0 < total * _MAX_SAG < STANDARD_GRAVITY * likely_mass:
+            value = f"so small that the machine sags by {STANDARD_GRAVITY * likely_mass / total:.3g} m"
             note(f"machine.{name}", value, "N/m", f"{float(np.max(stiffness)):g} N/mm")
     return notes
 

@@ -208,8 +208,14 @@ def test_implausible_bodies_in_a_plane_are_noted():
         "exciters[0].at is 931.5 m from the centre of mass, the supports at most 1.628 m; a plain number is in m: "
         "did you mean '810 mm'?",
         "machine.mass is 450 t; a plain number is in kg: did you mean '450 kg'?",
-        "machine.supports.stiffness is so small that the machine sags by 2.98e+03 m; a plain number is in N/m: "
+        "machine.supports.stiffness is so small that the machine sags by 2.98 m; a plain number is in N/m: "
         "did you mean '460 N/mm'?",
+    ]
+    heavy = SCREENS["feeder"].replace("mass = 400.0", "mass = 400e3")
+    assert implausible_numbers(jv.scene_from_toml(heavy)) == [
+        "exciters.unbalance is so small that it moves the machine by 2.03 µm; a plain number is in kg m, a plain force in N: "
+        "did you mean 'kN'?",
+        "machine.mass is 400 t; a plain number is in kg: did you mean '400 kg'?",
     ]
     motor = 'kind = "name_plate_motor"\npower = 1.1\nrated_speed = "930 rpm"\nbreakdown_ratio = 2.6\ninertia = 0.6\n'
     head, _, tail = SCREENS["linear_screen"].partition('kind = "induction_motor"')
