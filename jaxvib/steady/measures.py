@@ -22,7 +22,7 @@ from jaxvib.machine.carrier import BodyPoint, Place, on_body, read_place
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction, GravityField
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.structures.plane_body import PlaneNetwork
+from jaxvib.machine.structures.plane_body import PlaneBody, PlaneNetwork
 from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import magnitude
@@ -496,13 +496,18 @@ def weight_deflection(model: LinearModel) -> Array | None:
 
 
 def static_deflections(scene: Scene) -> Array:
-    """Return the static deflection (nd,), m, of each platform under the weight of platforms and loads: K y = M g.
+    """Return the static deflection, m, of each platform, or of the centre of mass of each body in a plane, under the weight of
+    the machine and its loads: K y = M g. It is positive if a body moves downward.
 
-    It is NaN for a platform that no support carries, directly or by links.
+    It is NaN for a platform that no support carries, directly or by links, and for bodies whose supports cannot carry them.
     """
-    machine = require_platforms(scene, "the deflection")
+    machine = scene.machine
+    if not isinstance(machine, Platforms | PlaneBody | PlaneNetwork):
+        raise InputError("machine.kind", f"is {quoted(machine.kind)}; the deflection needs platforms or bodies in a plane")
     sag = weight_deflection(linear_model(scene))
     assert sag is not None
+    if not isinstance(machine, Platforms):
+        return sag[np.flatnonzero(machine.upward())]
     return jnp.where(has_support(machine), jnp.abs(sag), jnp.nan)
 
 

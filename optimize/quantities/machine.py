@@ -14,6 +14,7 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers.named import spec_of
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.steady.measures import require_platforms, static_deflections
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation
@@ -134,13 +135,14 @@ def _mass(evaluation: Evaluation, tier: Tier) -> Array:
 
 @validated
 def static_deflection(of: int | None = None) -> Quantity:
-    """Return the static deflection of a platform under the weight of platforms and loads, m: K y = M g, g = 9.80665 m/s^2.
+    """Return the static deflection of a platform, or of the centre of mass of a body in a plane, under the weight of the
+    machine and its loads, m: K y = M g, g = 9.80665 m/s^2.
 
-    **Arguments**: `of`: the platform; typical: 1 to 3; default: the largest deflection of all platforms.
+    **Arguments**: `of`: number of the platform or body, from 1; typical: 1 to 3; default: the largest deflection of all.
 
     **Returns** `Quantity`; typical: 2 to 50 mm; NaN if the platform neither has a support nor is connected by links to
-    a platform with one. A machine without platforms, or without this platform, raises `InputError` when the quantity is
-    computed.
+    a platform with one, or if the supports of bodies cannot carry them. Other machines, and machines without this platform or
+    body, raise `InputError` when the quantity is computed.
 
     >>> import jaxvib as jv
     >>> from optimize import static_deflection
@@ -151,14 +153,15 @@ def static_deflection(of: int | None = None) -> Quantity:
     """
     if of is not None:
         count(of, "of")
-    text = "static deflection" + (f" of platform {of}" if of is not None else "")
+    text = "static deflection" + (f" of platform or body {of}" if of is not None else "")
     return _make_quantity("static_deflection", "m", _sag, text, of)
 
 
 def _sag(evaluation: Evaluation, tier: Tier, of: int | None) -> Array:
     sag = static_deflections(evaluation.scene)
     if of is not None and of > sag.shape[0]:
-        raise InputError("of", f"is {of}; the machine has platforms 1 to {sag.shape[0]}")
+        parts = "platforms" if isinstance(evaluation.scene.machine, Platforms) else "bodies"
+        raise InputError("of", f"is {of}; the machine has {parts} 1 to {sag.shape[0]}")
     return jnp.max(sag) if of is None else sag[of - 1]
 
 

@@ -8,6 +8,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
+from jaxvib.machine.files import SCREENS
 from optimize import product, spring_cost, static_deflection, support_frequency_squared, total, total_mass
 
 SCENE, THREE, CHAIN = scene("two_mass"), scene("three_mass", "pendulums"), scene("network")
@@ -55,12 +56,30 @@ def test_platforms_sag_under_the_weight_above():
     sag = np.cumsum([weights.sum() / 1e4, weights[1:].sum() / 2e4, weights[2] / 5e4])
     np.testing.assert_allclose([static_deflection(k)(hung) for k in (1, 2, 3)], sag, rtol=1e-12)
     np.testing.assert_allclose(static_deflection()(hung), sag[2], rtol=1e-12)
-    assert static_deflection(2).words == "static deflection of platform 2" and static_deflection().words == "static deflection"
+    assert (
+        static_deflection(2).words == "static deflection of platform or body 2"
+        and static_deflection().words == "static deflection"
+    )
     for wrong in (0, -1, 1.5):
         with pytest.raises(jv.InputError, match="of is"):
             static_deflection(wrong)
     with pytest.raises(jv.InputError, match="platforms 1 to 3"):
         static_deflection(4)(hung)
+
+
+def test_bodies_in_a_plane_have_a_static_deflection():
+    """A body in a plane sags by M g / k; a body on another one by the sum of both deflections."""
+    feeder = jv.scene_from_toml(SCREENS["feeder"])
+    np.testing.assert_allclose(static_deflection()(feeder), 400.0 * 9.80665 / 252e3, rtol=1e-12)
+    with pytest.raises(jv.InputError, match="bodies 1 to 1"):
+        static_deflection(2)(feeder)
+    upper = [jv.support(at=(x, 0.0), stiffness=(2e5, 3e5), damping=(0.0, 0.0), to=1, at_other=(x, 0.0)) for x in (-1.0, 1.0)]
+    lower = [jv.support(at=(x, 0.0), stiffness=(5e5, 8e5), damping=(0.0, 0.0), body=1) for x in (-1.0, 1.0)]
+    bodies = [jv.body(mass=300.0, inertia=100.0), jv.body(mass=200.0, inertia=80.0)]
+    double = jv.Scene(jv.plane_network(bodies, upper + lower), exciters=feeder.exciters)
+    below = 500.0 * 9.80665 / 16e5
+    np.testing.assert_allclose(static_deflection(2)(double), below, rtol=1e-9)
+    np.testing.assert_allclose(static_deflection()(double), below + 300.0 * 9.80665 / 6e5, rtol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-9, 1e9])
