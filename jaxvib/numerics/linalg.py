@@ -144,7 +144,8 @@ def poles_of(
 def hermitian_modes(square: Array) -> tuple[Array, Array]:
     """Return the ascending eigenvalues (..., n) and the eigenvectors (..., n, n), as columns, of Hermitian matrices.
 
-    The eigenvectors of equal eigenvalues are not unique; their derivative relative to each other is 0 instead of NaN.
+    The eigenvectors of equal eigenvalues are not unique. The component of the derivative of an eigenvector along other
+    eigenvectors with the same eigenvalue is therefore not defined; it is set to 0.
     """
     if square.shape[-1] > 3 or jnp.iscomplexobj(square):
         values, vectors = jnp.linalg.eigh(square)  # a plain tuple, because a derivative rule cannot return a named pair

@@ -151,7 +151,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         The torque of a motor is its torque at the averaged speed. The torque of an ideal drive is that of the drag of its
         loads, NaN for loads with dry friction and for unbalances.
 
-        **Raises** `InputError` if there is `no_vibration`.
+        **Raises** `InputError` with the text of `no_vibration`, unless this is empty.
         """
         when_known(lambda *_: require_vibration(self.no_vibration), self.window, self.amplitude)
         scene, window = self.scene, self.window
