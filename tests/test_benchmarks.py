@@ -19,6 +19,20 @@ def mutants(monkeypatch):
     return importlib.import_module("mutants")
 
 
+def own_file(importer: Path, module: str) -> Path | None:
+    """Return the file of a module of the benchmarks, which is searched beside the importer and in their main folder."""
+    files = [folder / f"{module.replace('.', '/')}.py" for folder in (importer.parent, BENCHMARKS)]
+    return next((file for file in files if file.exists()), None)
+
+
+def bound_names(item: ast.stmt) -> set[str]:
+    """Return the names that a statement of a module binds."""
+    if isinstance(item, (ast.FunctionDef, ast.ClassDef)):
+        return {item.name}
+    imported = {each.asname or each.name for each in ast.walk(item) if isinstance(each, ast.alias)}
+    return imported | {each.id for each in ast.walk(item) if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)}
+
+
 @pytest.mark.parametrize("path", sorted(BENCHMARKS.rglob("*.py")), ids=lambda path: path.stem)
 def test_what_a_benchmark_imports_exists(path):
     """Only what belongs to the packages and to the benchmarks' own parts: what else they measure may not be installed."""
@@ -28,12 +42,9 @@ def test_what_a_benchmark_imports_exists(path):
             for name in node.names:
                 found = hasattr(module, name.name) or importlib.util.find_spec(f"{node.module}.{name.name}")
                 assert found, f"{path.name} imports {name.name} from {node.module}, which has none"
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("parts."):
-            text = (BENCHMARKS / f"{node.module.replace('.', '/')}.py").read_text()
-            body = ast.parse(text).body
-            own = {item.name for item in body if isinstance(item, (ast.FunctionDef, ast.ClassDef))}
-            own |= {item.target.id for item in body if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)}
-            own |= {t.id for item in body if isinstance(item, ast.Assign) for t in item.targets if isinstance(t, ast.Name)}
+        source = own_file(path, node.module) if isinstance(node, ast.ImportFrom) and node.module else None
+        if source is not None:
+            own = {name for item in ast.parse(source.read_text()).body for name in bound_names(item)}
             assert {name.name for name in node.names} <= own, f"{path.name}, {node.module}"
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from first_answers import asked
+from first_answers import time_call
 from guard import chain, planar
 from parts.common import say
 
@@ -81,6 +81,6 @@ def first_answers(quick: bool = False) -> None:
     for name in FIRST_ANSWERS[:1] if quick else FIRST_ANSWERS:
         with tempfile.TemporaryDirectory() as cache:
             for way in ("empty cache", "full cache"):
-                first, again = asked(name, cache)
+                first, again = time_call(name, cache)
                 base = first if base is None else base
                 say("first answers", f"{name}, {way}", first, base, None, None, f"again {1e3 * again:.3g} ms")
