@@ -98,8 +98,8 @@ class SynchronousOrbit(PathsOfPoints, Result):
     """Exact synchronous motion: th_k = sigma_k (theta + alpha_k + psi_k(theta)), theta = Omega t, psi_k of mean 0.
 
     th_k is the angle of the rotor of exciter k, or of its loads if its rotor is balanced; sigma_k is the direction of the
-    exciter. Returned by `synchronous_orbit`. Values except `residual` are NaN if the status is `not_converged` or
-    `different_speeds`. Signals are Re sum_k c_k exp(i k theta).
+    exciter. Returned by `synchronous_orbit`. Values except `residual` and `error` are NaN if the status is
+    `not_converged` or `different_speeds`. Signals are Re sum_k c_k exp(i k theta).
 
     **Attributes**
 
@@ -114,7 +114,8 @@ class SynchronousOrbit(PathsOfPoints, Result):
       multiplier, that of a shift in time, whose exact value is 1. It is NaN if an ideal drive turns an unbalance, because a
       shifted motion is then not a solution
     - `residual` of the equations of motion, relative; `error`: estimated relative error of speed and displacements, and error
-      of angles in rad, due to the limited number of harmonics
+      of angles in rad, due to the limited number of harmonics. A motion whose error is above 1 and that
+      is not at a fold is `not_converged`
     - `deviation_harmonics` (bodies, K), rad: alpha_k + psi_k of each load or rotor, `displacement_harmonics` (nd, K), m (rad
       for rotations), and `force_harmonics` (directions, K), N, of the force on the foundation; orders 0, 1, 2, ...
     - `scene`
@@ -397,22 +398,24 @@ def _solve_program(
     multipliers, trivial, multiplier_error = multipliers_of(whole, grid, motion, max_steps, forced=forced)
     eps = float(jnp.finfo(speed.dtype).eps)
     largest = jnp.max(jnp.abs(multipliers))
-    is_met = residual < 4096.0 * eps
+    at_fold = jnp.min(jnp.abs(multipliers - 1.0)) < eps**0.4
+    is_solved = residual < 4096.0 * eps
+    is_met = is_solved & (~(error > 1.0) | at_fold)  # the estimate is useless at a fold
     has_one_speed = jnp.asarray(True)
     for k in forcing:
         has_one_speed = has_one_speed & (jnp.abs(scene.exciters[k].drive.speed / speed - 1.0) < 64.0 * eps)
     status = SynchronousStatus.where(error <= accuracy, SynchronousStatus.found, SynchronousStatus.under_resolved)
     status = SynchronousStatus.where(jnp.isnan(largest), SynchronousStatus.unresolved, status)
-    nearest = jnp.min(jnp.abs(multipliers - 1.0))
-    status = SynchronousStatus.where(nearest < eps**0.4, SynchronousStatus.at_fold, status)
+    status = SynchronousStatus.where(at_fold, SynchronousStatus.at_fold, status)
     status = SynchronousStatus.where(is_met, status, SynchronousStatus.not_converged)
     status = SynchronousStatus.where(has_one_speed, status, SynchronousStatus.different_speeds)
     is_solution = is_met & has_one_speed
     numbers = {
         **_quantities(whole, grid, motion), "multiplier": largest, "multiplier_error": multiplier_error,
-        "multipliers": multipliers, "trivial": trivial, "error": error,
+        "multipliers": multipliers, "trivial": trivial,
     }  # fmt: skip
     numbers = {name: jnp.where(is_solution, x, jnp.nan) for name, x in numbers.items()}
+    numbers["error"] = jnp.where(is_solved & has_one_speed, error, jnp.nan)
     stable = is_solution & (largest < 1.0 - multiplier_error)
     return SynchronousOrbit(status=status, stable=stable, residual=residual, scene=scene, **numbers)
 

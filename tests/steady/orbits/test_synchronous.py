@@ -311,6 +311,15 @@ def test_stability_with_very_fast_vibrations_is_unresolved():
     np.testing.assert_allclose(found.foundation_force, 0.05 * 60.0**2, rtol=1e-9)
 
 
+def test_motion_without_a_correct_digit_is_not_found():
+    """Rounding errors of the stiffness terms exceed the torques, so that any speed satisfies the equations at the points."""
+    supports = [jv.support(at=(x, 0.0), stiffness=k, damping=(2e3, 2e3)) for x, k in ((-1.0, (4e5, 1e154)), (1.0, (4e5, 4e5)))]
+    exciters = [jv.Exciter(drive=motor(), unbalance=1.5, at=(x, 0.0), direction=d) for x, d in ((-0.3, 1), (0.3, -1))]
+    scene = jv.Scene(jv.plane_body(mass=2000.0, inertia=600.0, supports=supports), exciters=exciters)
+    found = jv.synchronous_orbit(scene, phases=(0.0, 3.1), points=17, throw=False)
+    assert found.status_name == "not_converged" and found.error > 1.0 and np.isnan(found.speed)
+
+
 def test_wrong_input_ends_in_one_sentence(general):
     machine, loads = body(), jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
     with pytest.raises(jv.InputError, match="speed is missing"):
