@@ -20,7 +20,8 @@ from jaxvib.units import Number, conditions_of_traced_values, count, number, num
 
 
 class BodyPoint(Readable):
-    """Point (x, y) of one of several bodies, m from its centre of mass; None for the centre itself. Bodies count from 0."""
+    """Point (x, y) of one of several bodies, m from its centre of mass; None for the centre itself. `body`: its number,
+    counted from 0."""
 
     at: Array | None
     body: int = eqx.field(static=True)
@@ -397,5 +398,7 @@ def _structure(
     def shapes(machine: Machine, position: Array | None) -> tuple[Carrier, Mount]:
         return machine.carrier(), machine.mount(position if platform is None else platform)
 
-    with conditions_of_traced_values():  # discards conditions of abstract values, which would leak into an outer trace
+    # Constructors collect the checks of traced values. Those of this trace have no values and must not reach an outer trace;
+    # the list of this block, which is not used, receives them.
+    with conditions_of_traced_values():
         return eqx.filter_eval_shape(shapes, machine, position)

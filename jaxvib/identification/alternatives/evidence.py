@@ -16,7 +16,7 @@ only noise."""
 
 
 def explains_better(after: Fitted, information: Information, ratio: float) -> bool:
-    """Return True if only noise remains of the residuals of the fit `after`, or if they are much smaller.
+    """Return True if the residuals of the fit `after` are only noise, or much smaller than those of the patterned fit.
 
     **Arguments**: `information` of the fit; `ratio` of its residuals to those of the patterned fit.
     """
