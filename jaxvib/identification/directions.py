@@ -33,7 +33,10 @@ _MIN_COMMON_PART = 0.95
 """The direction of the common factor of all masses, stiffnesses, dampings and unbalances is a vector of length 1. If the part
 of this vector within the undetermined directions is longer than this number, the factor itself counts as undetermined."""
 
-_ADVICE = "give one of these parameters as known, or record a run with a known mass added"
+_ADDED_MASS = ", or record a run with a known mass added"
+"""Remedy for an unknown common factor. It does not help for unbalances alone: an added mass leaves their size unknown."""
+
+_ADVICE = f"give one of these parameters as known{_ADDED_MASS}"
 
 
 class Direction(NamedTuple):
@@ -213,49 +216,75 @@ def principal_errors(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def directions_of(information: Information) -> tuple[tuple[Direction, ...], tuple[Direction, ...]]:
     """Return the undetermined directions, and the directions that only the gains of the sensors determine, with sentences."""
-    undetermined = _sentences(
-        information, information.undetermined, information.errors, " changes no reading by more than its noise", _ADVICE
-    )
-    gains = []
-    for direction in _sentences(information, information.by_gain, information.by_gain_errors, "", ""):
-        words = direction.sentence.rstrip(": ")
-        gains.append(
-            direction._replace(
-                sentence=f"{words} is known from the gains of the sensors only, to {direction.error:.1%}, and an error of a "
-                f"gain leaves no trace in the residuals; calibrate the sensors, or {_ADVICE}"
-            )
+    undetermined = [
+        each.direction._replace(sentence=f"{each.change} changes no reading by more than its noise: {each.advice}")
+        for each in _described(information, information.undetermined, information.errors)
+    ]
+    gains = [
+        each.direction._replace(
+            sentence=f"{each.subject} is known from the gains of the sensors only, to {each.direction.error:.1%}, and an error "
+            f"of a gain leaves no trace in the residuals; calibrate the sensors, or {each.advice_for_gain}"
         )
+        for each in _described(information, information.by_gain, information.by_gain_errors)
+    ]
     return tuple(undetermined), tuple(gains)
 
 
-def _sentences(information: Information, axes: np.ndarray, errors: np.ndarray, effect: str, advice: str) -> list[Direction]:
-    common = np.array([_kind_with_kg(name) is not None for name in information.names], float)
-    sentences = []
-    if axes.size and np.any(common):
+class _Described(NamedTuple):
+    """A direction without its sentence, and parts of sentences about it: its `change`, the `subject` of the change, the
+    `advice` if it is undetermined, and the `advice_for_gain` if only the gains determine it."""
+
+    direction: Direction
+    change: str
+    subject: str
+    advice: str
+    advice_for_gain: str
+
+
+def _described(information: Information, axes: np.ndarray, errors: np.ndarray) -> list[_Described]:
+    names = information.names
+    described = []
+    common = np.array([_kind_with_kg(name) is not None for name in names], float)
+    if axes.size and np.sum(common) > 1.0:
         common /= np.linalg.norm(common)
         inside = axes @ (axes.T @ common)
         if np.linalg.norm(inside) > _MIN_COMMON_PART:
-            present = {_kind_with_kg(name) for name in information.names}
-            kinds = [kind for kind in _KINDS_WITH_KG.values() if kind in present]
-            listed = " and ".join(filter(None, [", ".join(kinds[:-1]), kinds[-1]]))
-            text = f"multiplying all {listed} by one number{effect}: {advice}"
-            weights = (axes.T @ common) * errors
-            sentences.append(Direction(text, information.names, tuple(map(float, common)), float(np.linalg.norm(weights))))
             spread = axes * errors
+            direction = Direction("", names, tuple(map(float, common)), float(np.linalg.norm((axes.T @ common) * errors)))
+            described.append(_common_factor(direction))
             axes = axes - np.outer(common, common @ axes)
             basis, size, _ = np.linalg.svd(axes, full_matrices=False)
             axes = basis[:, size > 0.5]
             errors = np.linalg.norm(axes.T @ spread, axis=1)
     for axis, error in zip(axes.T, errors, strict=True):
         axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-        largest = [k for k in np.argsort(-np.abs(axis)) if abs(axis[k]) > 0.2]
-        parts = ", ".join(f"{information.names[k]} by {axis[k]:+.2g}" for k in largest)
-        advice_for_direction = (
-            "give one of these parameters as known, add a sensor at another place, or record a run through all resonances"
-        )
-        text = f"changing {parts} (relative to one another){effect}: {advice_for_direction if advice else ''}"
-        sentences.append(Direction(text, information.names, tuple(map(float, axis)), float(error)))
-    return sentences
+        described.append(_combination(Direction("", names, tuple(map(float, axis)), float(error))))
+    return described
+
+
+def _common_factor(direction: Direction) -> _Described:
+    present = {_kind_with_kg(name) for name in direction.names}
+    kinds = [kind for kind in _KINDS_WITH_KG.values() if kind in present]
+    listed = " and ".join(filter(None, [", ".join(kinds[:-1]), kinds[-1]]))
+    advice = _ADVICE if kinds != ["unbalances"] else _ADVICE.removesuffix(_ADDED_MASS)
+    return _Described(
+        direction, f"multiplying all {listed} by one number", f"the common factor of all {listed}", advice, advice
+    )
+
+
+def _combination(direction: Direction) -> _Described:
+    names, axis = direction.names, np.array(direction.weights)
+    order = np.argsort(-np.abs(axis))
+    largest = [order[0], *(k for k in order[1:] if abs(axis[k]) > 0.2)]
+    known = "give one of these parameters as known"
+    if len(largest) == 1:
+        known, subject = "give it as known", names[order[0]]
+        change = f"changing {subject}"
+    else:
+        parts = ", ".join(f"{names[k]} by {axis[k]:+.2g}" for k in largest) + " (relative to one another)"
+        subject, change = f"a change of {parts}", f"changing {parts}"
+    remedies = "add a sensor at another place, or record a run through all resonances"
+    return _Described(direction, change, subject, f"{known}, {remedies}", known)
 
 
 _KINDS_WITH_KG = {

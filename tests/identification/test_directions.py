@@ -122,7 +122,7 @@ def test_directions_that_only_the_gains_determine():
     assert found.undetermined.size == 0 and np.all(found.determined)
     (sentence,) = (each.sentence for each in directions_of(found)[1])
     assert sentence.startswith(
-        "changing machine.stiffness by +0.71, place by +0.71 (relative to one another) is known from the"
+        "a change of machine.stiffness by +0.71, place by +0.71 (relative to one another) is known from the"
     )
     assert "gains of the sensors only, to 1.6%, and an error of a gain leaves no trace in the residuals; calibrate" in sentence
     fit.prior = np.zeros((4, 4))
@@ -176,13 +176,34 @@ def test_common_factor_is_one_sentence():
     ("names", "axis", "words"),
     [
         (("machine.stiffness", "place"), [0.9, 0.436], "changing machine.stiffness by +0.9, place by +0.44 ("),
-        (("machine.stiffness", "place"), [0.99, 0.141], "multiplying all stiffnesses by one number"),
-        (("place", "machine.stiffness"), [0.141, -0.99], "multiplying all stiffnesses by one number"),
+        (("machine.stiffness", "place"), [0.99, 0.141], "changing machine.stiffness changes no reading"),
+        (("place", "machine.stiffness"), [0.141, -0.99], "changing machine.stiffness changes no reading"),
         (("angle", "place"), [0.3, -0.954], "changing place by +0.95, angle by -0.3 ("),
-        (("angle", "place"), [0.141, -0.99], "changing place by +0.99 ("),
+        (("angle", "place"), [0.141, -0.99], "changing place changes no reading"),
     ],
 )
 def test_direction_in_words(names, axis, words):
-    """A direction within 5 % of the common factor of masses and forces counts as this factor."""
+    """A direction along one parameter names this parameter alone."""
     lost, _ = directions_of(information(names, np.array([axis]).T / np.linalg.norm(axis), [2.0]))
     assert lost[0].sentence.startswith(words) and lost[0].error == pytest.approx(2.0, rel=0.02)
+
+
+def gain_sentence(*names):
+    """Return the sentence about the common factor of the parameters, which only the gains determine, to 0.7 %."""
+    size = len(names)
+    axis = np.ones((size, 1)) / np.sqrt(size)
+    found = information(names, np.zeros((size, 0)), [])._replace(by_gain=axis, by_gain_errors=np.array([0.007]))
+    return directions_of(found)[1][0].sentence
+
+
+def test_added_mass_is_no_remedy_for_unbalances_alone():
+    """The readings remain the same if the unbalance is larger and the gain smaller, whatever mass is added."""
+    assert gain_sentence("exciters[0].unbalance") == (
+        "exciters[0].unbalance is known from the gains of the sensors only, to 0.7%, and an error of a gain leaves no trace in "
+        "the residuals; calibrate the sensors, or give it as known"
+    )
+    two = gain_sentence("exciters[0].unbalance", "exciters[1].unbalance")
+    assert two.startswith("the common factor of all unbalances is known") and "added" not in two
+    with_mass = gain_sentence("machine.mass", "exciters[0].unbalance")
+    assert with_mass.startswith("the common factor of all masses and unbalances is known")
+    assert with_mass.endswith("or record a run with a known mass added")

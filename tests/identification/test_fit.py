@@ -162,7 +162,7 @@ def test_gains_of_sensors_are_named_if_they_alone_determine():
     run = run_of(3, gain_error=0.01)
     fit = jv.identify(start(1.05), run, unknown=[*NAMES[:4], "machine.mass"])
     assert fit.status_name == "found"
-    assert "multiplying all masses, stiffnesses and dampings by one number is known from the gains" in fit.by_gain[0].sentence
+    assert "the common factor of all masses, stiffnesses and dampings is known from the gains" in fit.by_gain[0].sentence
     assert fit.estimate("machine.stiffness[0]").error / fit.estimate("machine.stiffness[0]").value > 0.02
     assert np.max(np.abs(distances(fit))) < 4.0
 
