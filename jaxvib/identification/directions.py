@@ -7,6 +7,7 @@ after all other unknowns (gains, errors of the angle and others) are eliminated.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -244,7 +245,7 @@ class _Described(NamedTuple):
 def _described(information: Information, axes: np.ndarray, errors: np.ndarray) -> list[_Described]:
     names = information.names
     described = []
-    common = np.array([_kind_with_kg(name) is not None for name in names], float)
+    common = has_kg(names).astype(float)
     if axes.size and np.sum(common) > 1.0:
         common /= np.linalg.norm(common)
         inside = axes @ (axes.T @ common)
@@ -300,6 +301,11 @@ _KINDS_WITH_KG = {
 }
 """Words in the names of parameters whose unit is proportional to kg (kg, N s/m, kg m and others), and their plurals. The
 readings do not change if all these parameters are multiplied by the same factor."""
+
+
+def has_kg(names: Sequence[str]) -> np.ndarray:
+    """Return (k,) True for parameters whose unit is proportional to kg."""
+    return np.array([_kind_with_kg(name) is not None for name in names], bool)
 
 
 def _kind_with_kg(name: str) -> str | None:

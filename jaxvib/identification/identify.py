@@ -14,15 +14,17 @@ from jaxvib.boundary import call_user, is_real, validated
 from jaxvib.display import Drawn, Onto
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.identification.alternatives.clocks import clock_notes
-from jaxvib.identification.alternatives.descriptions import description_notes
+from jaxvib.identification.alternatives.descriptions import description_notes, scale_notes
 from jaxvib.identification.alternatives.laws import law_notes
 from jaxvib.identification.checks import FitStatus, coverage_notes, resembles, status_of
 from jaxvib.identification.directions import (
     Direction,
+    Information,
     combined_information,
     directions_of,
     eliminate,
     free_unbalances,
+    has_kg,
     in_polar_unbalances,
     information_of,
 )
@@ -306,6 +308,7 @@ def _interpret(scene: Scene, first: Problem, fitted: Fitted) -> MachineFit:
     problem, information = fitted.problem, information_of(fitted)
     status, p_value, notes = status_of(fitted, information)
     notes = ([] if status in (FitStatus.found, FitStatus.undetermined) else description_notes(first)) + list(notes)
+    notes = scale_notes(problem, _ratios_to_first_values(scene, information)) + notes
     undetermined, by_gain = directions_of(information)
     fit_scene = fitted_scene(problem, fitted.x, fitted.linear)
     modes = propagate(
@@ -362,6 +365,16 @@ def _interpret(scene: Scene, first: Problem, fitted: Fitted) -> MachineFit:
         readings=tuple(np.where(mask, raw, np.nan) for raw, mask in zip(problem.raw, problem.masks, strict=True)),
         fitted=tuple(raw - left for raw, left in zip(problem.raw, fitted.residuals, strict=True)),
     )
+
+
+def _ratios_to_first_values(scene: Scene, information: Information) -> np.ndarray:
+    """Return the ratios of the fitted parameters whose unit is proportional to kg to their first values in `scene`; an empty
+    array without an unknown mass."""
+    if not any(".mass" in name for name in information.names):
+        return np.zeros(0)
+    chosen = information.logarithmic & information.determined & ~information.vanished & has_kg(information.names)
+    first = np.array([float(find_number(scene, name, "unknown").read(scene)) for name in information.names])
+    return information.values[chosen & (first > 0.0)] / first[chosen & (first > 0.0)]
 
 
 def fitted_scene(problem: Problem, x: np.ndarray, linear: np.ndarray) -> Scene:

@@ -223,7 +223,12 @@ def run_of(
         time = times_by_name[channel.name]
         if channel.kind != "pulses":
             times_by_name[channel.name] = grids.setdefault((time.size, time[0], time[-1]), time)
-    notes = [note for each in samples.values() for note in each.notes]
+    notes = [
+        f"{source}: channel {quoted(channel.name)} has no unit in the file; its readings are taken as {UNITS[channel.kind]}"
+        for channel in channels
+        if channel.kind != "pulses" and channel.unit is None and units.get(channel.name) == ""
+    ]
+    notes += [note for each in samples.values() for note in each.notes]
     notes += check_agreement(channels, times_by_name, values_by_name, source, units)
     clipped = {name: each.clipped for name, each in samples.items()}
     return MeasuredRun(tuple(channels), times_by_name, values_by_name, clipped, parsed, tuple(notes), source)

@@ -30,6 +30,10 @@ units is low, because readings of a sensor with a wrong gain also fit better wit
 _EQUAL_COST = 1e-3
 """Relative difference of the costs of two descriptions up to which the records do not distinguish them."""
 
+_MAX_SCALE_ERROR = 1.25
+"""Largest ratio of the common factor of the fitted parameters, relative to their first values, to the factor between two
+units."""
+
 
 class _Description(NamedTuple):
     """Other description of channels.
@@ -63,6 +67,32 @@ def description_notes(problem: Problem) -> list[str]:
         return []
     words = [each.words for each, cost in zip(others, costs, strict=True) if cost <= (1.0 + _EQUAL_COST) * np.min(costs)]
     return [f"the model explains the records with {', or with '.join(words)}: correct the description of the channels"]
+
+
+def scale_notes(problem: Problem, ratios: np.ndarray) -> list[str]:
+    """Return a sentence if the unit of all vibration channels is probably wrong; otherwise an empty list.
+
+    Readings that are too small by the factor of a wrong unit are explained by masses, stiffnesses and dampings that are too
+    large by the same factor. The fit then has no misfit, and only the first values contradict this factor.
+
+    **Arguments**: the `problem` of a fit; `ratios` (k,) of the fitted masses, stiffnesses, dampings and so on to their first
+    values.
+    """
+    channels = list({channel.name: channel for samples in problem.runs for channel in samples.channels}.values())
+    if not ratios.size or len({(channel.kind, channel.unit) for channel in channels}) != 1:
+        return []
+    kind, stated = channels[0].kind, channels[0].unit
+    scale = float(np.exp(np.median(np.log(ratios))))
+    for unit, of_unit in itertools.product(
+        OTHER_UNITS.get(kind, ()), OTHER_UNITS.get(kind, ()) if stated is None else (stated,)
+    ):
+        factor = (unit_factor(unit, UNITS[kind]) or 1.0) / (unit_factor(of_unit, UNITS[kind]) or 1.0)
+        if factor != 1.0 and abs(np.log(scale / factor)) < np.log(_MAX_SCALE_ERROR):
+            return [
+                f"the fitted parameters are about {scale:.3g} times their first values, as if the readings of "
+                f"{_names(channels)} were in {quoted(unit)} and not in {quoted(of_unit)}: check the unit"
+            ]
+    return []
 
 
 def _descriptions(problem: Problem) -> Iterator[_Description]:

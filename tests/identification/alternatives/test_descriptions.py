@@ -7,7 +7,7 @@ import pytest
 from run_ups_by_scipy import TRUTH, accelerations, record, scene_of
 
 import jaxvib as jv
-from jaxvib.identification.alternatives.descriptions import description_notes
+from jaxvib.identification.alternatives.descriptions import description_notes, scale_notes
 from jaxvib.identification.problem import build_problem
 
 TIMES = np.arange(0.0, 16.0, 0.01)
@@ -69,3 +69,20 @@ def test_description_that_fits_is_named(runs, unknown, words):
 @pytest.mark.parametrize("factors", [(1.0, 1.0), (1.0, 0.5), (0.0, 0.0)], ids=["right", "wrong gain", "silent"])
 def test_other_faults_are_no_wrong_description(factors):
     assert notes_of(run_of(factors)) == []
+
+
+def test_unit_of_all_channels_is_doubted_if_masses_are_unknown():
+    """Readings in g that are taken as m/s^2: masses, stiffnesses and dampings 9.8 times too large explain them."""
+    run = run_of((1.0 / G, 1.0 / G), ({"gain_error": 0.01}, {"gain_error": 0.01}))
+    unknown = [*UNKNOWN, "machine.mass", "machine.link_stiffness", "machine.link_damping"]
+    fit = jv.identify(first_values(), run, unknown=unknown)
+    np.testing.assert_allclose(fit.estimate("machine.mass[0]").value, G * TRUTH["machine.mass[0]"], rtol=0.03)
+    assert fit.notes[0] == (
+        "the fitted parameters are about 9.81 times their first values, as if the readings of channels 'a1' and 'a2' were in "
+        "'g' and not in 'm/s^2': check the unit"
+    )
+
+
+@pytest.mark.parametrize("ratio", [1.0, 2.0, 7.0])
+def test_factor_of_no_unit_raises_no_doubt(ratio):
+    assert scale_notes(build_problem(first_values(), [run_of()], UNKNOWN, {}), np.full(5, ratio)) == []
