@@ -64,7 +64,14 @@ def _extremes(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def fit_chart(
-    time: np.ndarray, readings: np.ndarray, fitted: np.ndarray, noise: np.ndarray, names: Sequence[str], *, ax: Onto = None
+    time: np.ndarray,
+    readings: np.ndarray,
+    fitted: np.ndarray,
+    noise: np.ndarray,
+    names: Sequence[str],
+    *,
+    y_label: str = "reading, SI units",
+    ax: Onto = None,
 ) -> Drawn:
     """Draw the readings of channels and their fit over time, and the residuals relative to their noise in a second panel.
 
@@ -78,7 +85,7 @@ def fit_chart(
         top.plot(time, fitted[:, k], color=color, lw=0.8, label=name)
         bottom.plot(time, (readings[:, k] - fitted[:, k]) / max(float(noise[k]), 1e-300), ".", color=color, ms=1.5)
     legend_above(top)
-    top.set_ylabel("reading, SI units")
+    top.set_ylabel(y_label)
     for sign in (-2.0, 2.0):
         bottom.axhline(sign, color=GUIDE, lw=0.9, ls=":", label="twice the noise" if sign > 0.0 else None)
     legend_above(bottom)

@@ -269,6 +269,15 @@ def points_chart(values: np.ndarray, *, x_label: str, y_label: str, ax: Axes | N
     return figure if ax is None else ax
 
 
+def named_points_chart(names: Sequence[str], values: np.ndarray, *, x_label: str, ax: Axes | None = None) -> Drawn:
+    """Draw positive values (n,) as points on a logarithmic axis, in lines with their names, the first one at the top."""
+    figure, (axis,) = panels(1, size=(7.0, 1.0 + 0.32 * len(names)), ax=ax)
+    axis.plot(values, np.arange(values.size), marker_of(0), ms=4.5, color=color_of(0))
+    axis.set_yticks(np.arange(values.size), names)
+    axis.set(xscale="log", xlabel=x_label, ylim=(values.size - 0.5, -0.5))
+    return figure if ax is None else ax
+
+
 def shares_chart(
     share: np.ndarray, low: np.ndarray, high: np.ndarray, *, names: Sequence[str], ax: Axes | None = None
 ) -> Drawn:

@@ -32,6 +32,7 @@ from jaxvib.identification.fit import Fitted, unknown_count
 from jaxvib.identification.jammed.start import first_states, with_first_motion
 from jaxvib.identification.problem import Problem, build_problem, damped_modes, has_nonlinear_supports
 from jaxvib.identification.profile_likelihood import QUANTILE, profile_intervals
+from jaxvib.identification.records.channel import UNITS
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.identification.start import fit_amplitudes
 from jaxvib.identification.supports.start import untouched_stops, with_guided_motion
@@ -46,7 +47,7 @@ from jaxvib.results.result import Result
 from jaxvib.study.bearing.identify import Identified, identify_bearing
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum
-from jaxvib.units import Number
+from jaxvib.units import Number, count
 
 _REFITS_NEAR_FIRST_VALUES = 2
 """Largest number of repeated fits that begin with undetermined combinations of parameters moved back towards their first
@@ -157,18 +158,27 @@ class MachineFit(Result):
             lines.append(f"mode {k + 1}: {_with_interval(w)} rad/s, damping ratio {_with_interval(ratio)}")
         for name, each in zip(self.gain_names, self.gains, strict=True):
             lines.append(f"gain of channel {name}: {_with_interval(each)}")
-        for names, noise in zip(self.channels, self.noise, strict=True):
-            lines.append("noise: " + ", ".join(f"{name} {each:.3g}" for name, each in zip(names, noise, strict=True)))
+        for k, (names, kinds, noise) in enumerate(zip(self.channels, self.kinds, self.noise, strict=True)):
+            each_noise = (f"{n} {value:.3g} {UNITS[kind]}" for n, kind, value in zip(names, kinds, noise, strict=True))
+            lines.append(f"noise{f' of run {k + 1}' if len(self.noise) > 1 else ''}: {', '.join(each_noise)}")
         lines += [f"not determined: {each.sentence}" for each in self.undetermined]
         lines += [each.sentence for each in self.by_gain]
         return "\n".join([*lines, *self.notes])
 
     @validated
-    def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the readings of the first run with the fit, and the residuals, onto two axes: `ax`, or those of a new figure."""
+    def plot(self, *, run: int = 1, ax: Onto = None) -> Drawn:
+        """Plot the readings of a run with the fit, and the residuals, onto two axes: `ax`, or those of a new figure.
+
+        **Arguments**: `run`: number of the run, counted from 1 as in the notes. **Raises** `InputError` for another number.
+        """
         from jaxvib.draw.record import fit_chart  # slow import
 
-        return fit_chart(self.time[0], self.readings[0], self.fitted[0], self.noise[0], self.channels[0], ax=ax)
+        k = count(run, "run") - 1
+        if k >= len(self.time):
+            raise InputError("run", f"is {run}; the fit has the runs 1 to {len(self.time)}")
+        kinds = set(self.kinds[k])
+        label = f"{self.kinds[k][0]}, {UNITS[self.kinds[k][0]]}" if len(kinds) == 1 else "reading, SI units"
+        return fit_chart(self.time[k], self.readings[k], self.fitted[k], self.noise[k], self.channels[k], y_label=label, ax=ax)
 
 
 def _with_interval(each: Estimate) -> str:
@@ -373,7 +383,7 @@ def _ratios_to_first_values(scene: Scene, information: Information) -> np.ndarra
     if not any(".mass" in name for name in information.names):
         return np.zeros(0)
     chosen = information.logarithmic & information.determined & ~information.vanished & has_kg(information.names)
-    first = np.array([float(find_number(scene, name, "unknown").read(scene)) for name in information.names])
+    first = np.array([np.asarray(find_number(scene, name, "unknown").read(scene)).item() for name in information.names])
     return information.values[chosen & (first > 0.0)] / first[chosen & (first > 0.0)]
 
 

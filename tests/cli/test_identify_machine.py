@@ -132,6 +132,24 @@ acceleration = "12 rad/s^2"
 """
 
 
+def test_numbers_in_tables_of_plans_are_not_broken():
+    """Eight unknown parameters and a long name of a run; the table has 80 columns."""
+    from jaxvib.cli.study.plan import _text
+    from jaxvib.identification.further_runs.plan import RunPlan
+
+    errors = np.array([[0.00012, 0.0071, 0.033, 0.25, 1.5, np.inf, 4.4e-4, 0.0005]])
+    names = tuple(f"machine.stiffness[{k}]" for k in range(8))
+    plan = RunPlan(
+        ("20 kg on the table, optimized speed",), names, errors, errors, errors, errors[0], np.ones(1), np.ones(1), None
+    )
+    lines = _text(plan).splitlines()
+    assert max(map(len, lines)) <= 80
+    words = ["0.012", "0.71", "3.3", "25", "150", "-", "0.044", "0.05"]
+    rows = [[each.strip() for each in line.split("│")][1:-1] for line in lines]
+    assert ["so far", *words] in rows and ["1", *words] in rows
+    assert any("1 20 kg on the table, optimized speed" in line for line in lines)
+
+
 @pytest.mark.slow
 def test_candidate_runs_are_ranked_from_the_command_line(typed, tmp_path):
     (tmp_path / "fit.toml").write_text(FIT + CANDIDATES)

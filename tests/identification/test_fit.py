@@ -1,5 +1,6 @@
 """Machines fitted to run-ups that SciPy integrates, with noise."""
 
+import dataclasses
 import functools
 
 import jax.numpy as jnp
@@ -236,6 +237,20 @@ def test_results_are_saved_and_drawn(tmp_path):
     again = jv.load(fit.save(tmp_path / "fit"))
     assert again.summary() == fit.summary() and "mode 2" in fit.summary()
     assert len(fit.plot().axes) == 2
+    (noise,) = [line for line in fit.summary().splitlines() if line.startswith("noise")]
+    assert noise.startswith("noise: ") and noise.count(" m/s^2") == len(fit.channels[0])
+
+
+def test_each_run_has_its_figure_and_noise():
+    fit = fitted()
+    fields = ("channels", "kinds", "noise", "time", "readings", "fitted")
+    two = dataclasses.replace(fit, **{name: 2 * getattr(fit, name) for name in fields})
+    two = dataclasses.replace(two, time=(fit.time[0], fit.time[0] + 100.0))
+    assert "noise of run 1: " in two.summary() and "noise of run 2: " in two.summary()
+    top = two.plot(run=2).axes[0]
+    assert top.get_xlim()[1] > 100.0 and top.get_ylabel() == "acceleration, m/s^2"
+    with pytest.raises(jv.InputError, match="run is 3; the fit has the runs 1 to 2"):
+        two.plot(run=3)
 
 
 def test_plan_predicts_the_errors_after_a_run_with_an_added_mass():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -65,7 +66,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Identify parameters of a machine from recorded runs, or the friction of a bearing from a recorded swing.
 
     For a machine, RECORD is an identification file (TOML) with the names of a scene file, of recorded runs and of their
-    channels. --out adds the fitted scene (found.toml), the figure and the fit (fit.npz).
+    channels. --out adds the fitted scene (found.toml), a figure of each run and the fit (fit.npz).
 
     For a bearing, RECORD is a CSV file with the time and the angle of a pendulum that swings on the bearing, or a measurement
     file (TOML) with the name of the CSV file. Options replace the values in the measurement file. --out adds the
@@ -138,7 +139,8 @@ def _identify_machine(tables: Tables, folder: Path, output: Output, options: lis
     fit = fit_from_tables(tables, folder)
     found = jv.identify(fit.scene, fit.runs, unknown=fit.unknown, known=fit.known)
     assert isinstance(found, jv.MachineFit)
-    output.figure("fit.png", found.plot)
+    for run in range(1, len(found.time) + 1):
+        output.figure("fit.png" if run == 1 else f"fit_run_{run}.png", partial(found.plot, run=run))
     output.save_result("fit.npz", found)
     path = output.file("found.toml")
     if path is not None:

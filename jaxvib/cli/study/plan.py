@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -10,6 +12,9 @@ import jaxvib as jv
 from jaxvib.cli.app import Output, command, table
 from jaxvib.cli.output import fields_of
 from jaxvib.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxvib.identification.further_runs.plan import RunPlan
 
 
 @command("plan", "identification")
@@ -22,10 +27,7 @@ def plan(identification: Path, fit: Path | None, output: Output) -> None:
     recorded next: a run-up, a run at constant speed or a coast-down, other places of sensors, or changed parameters of the
     machine, such as an added mass. With the table [limits], the speed of the best candidate over time is optimized for the
     smallest expected errors."""
-    import numpy as np  # slow imports, which --help does not need
-
-    from jaxvib.display import speed_text
-    from jaxvib.exchange.recordings.fit_file import fit_from_tables
+    from jaxvib.exchange.recordings.fit_file import fit_from_tables  # slow imports, which --help does not need
     from jaxvib.machine.files import read_toml
 
     fit_input = fit_from_tables(read_toml(identification), identification.parent)
@@ -44,20 +46,29 @@ def plan(identification: Path, fit: Path | None, output: Output) -> None:
     document |= fields_of(plan, "candidates", "numbers", "errors", "now", "minutes", "benefit")
     document["profile"] = None if profile is None else fields_of(profile, "times", "speeds")
 
-    def text() -> str:
-        def error_text(error: float) -> str:
-            return f"{error:.2g}" if np.isfinite(error) else "-"
+    output.done(document, lambda: _text(plan), "plan", plan)
 
-        rows = [["so far", "", "", *map(error_text, plan.now)]]
-        for name, minutes, benefit, errors in zip(plan.candidates, plan.minutes, plan.benefit, plan.errors, strict=True):
-            rows.append([name, f"{minutes:.3g}", f"{benefit:.3g}", *map(error_text, errors)])
-        heads = ["run", "minutes", "benefit per minute", *(f"({k + 1})" for k in range(len(plan.numbers)))]
-        lines = [f"({k + 1}) {name}" for k, name in enumerate(plan.numbers)]
-        lines.append(table("expected relative standard errors; -: not determined", heads, rows))
-        if profile is not None:
-            points = zip(np.asarray(profile.times), np.asarray(profile.speeds), strict=True)
-            parts = [[f"{t:.4g}", speed_text(float(n), 4)] for t, n in points]
-            lines.append(table("optimized speed, linear between these times", ["time, s", "speed"], parts))
-        return "\n".join(lines)
 
-    output.done(document, text, "plan", plan)
+def _text(plan: RunPlan) -> str:
+    """Return the candidates of a plan, the expected errors in percent, and the optimized speed, as tables."""
+    from jaxvib.display import speed_text  # slow import, which --help does not need
+
+    runs, errors = [], [["so far", *map(_percent, plan.now)]]
+    for k, (name, minutes, benefit) in enumerate(zip(plan.candidates, plan.minutes, plan.benefit, strict=True)):
+        runs.append([f"{k + 1} {name}", f"{minutes:.3g}", f"{benefit:.3g}"])
+        errors.append([str(k + 1), *map(_percent, plan.errors[k])])
+    lines = [table("candidate runs, the best one first", ["run", "minutes", "benefit per minute"], runs)]
+    lines += [f"({k + 1}) {name}" for k, name in enumerate(plan.numbers)]
+    heads = ["run", *(f"({k + 1})" for k in range(len(plan.numbers)))]
+    lines.append(table("expected relative standard errors after the run, %; -: not determined", heads, errors))
+    if plan.profile is not None:
+        points = zip(plan.profile.times.tolist(), plan.profile.speeds.tolist(), strict=True)
+        rows = [[f"{t:.4g}", speed_text(speed, 4)] for t, speed in points]
+        lines.append(table("optimized speed, linear between these times", ["time, s", "speed"], rows))
+    return "\n".join(lines)
+
+
+def _percent(error: float) -> str:
+    if not math.isfinite(error):
+        return "-"
+    return f"{100.0 * error:.2g}" if error < 0.995 else f"{100.0 * error:.0f}"

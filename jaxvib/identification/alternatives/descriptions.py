@@ -88,8 +88,9 @@ def scale_notes(problem: Problem, ratios: np.ndarray) -> list[str]:
     ):
         factor = (unit_factor(unit, UNITS[kind]) or 1.0) / (unit_factor(of_unit, UNITS[kind]) or 1.0)
         if factor != 1.0 and abs(np.log(scale / factor)) < np.log(_MAX_SCALE_ERROR):
+            words = f"{scale:.2g}" if scale < 99.5 else f"{scale:.0f}"
             return [
-                f"the fitted parameters are about {scale:.3g} times their first values, as if the readings of "
+                f"the fitted parameters are about {words} times their first values, as if the readings of "
                 f"{_names(channels)} were in {quoted(unit)} and not in {quoted(of_unit)}: check the unit"
             ]
     return []

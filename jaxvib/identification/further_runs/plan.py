@@ -80,11 +80,14 @@ class RunPlan(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the largest relative error of the parameters after each candidate run; an undetermined parameter counts as 1."""
-        from jaxvib.draw.results import points_chart  # slow import
+        """Plot the largest relative error of the parameters so far and after each candidate run, the best run first; an
+        undetermined parameter counts as 1."""
+        from jaxvib.draw.results import named_points_chart  # slow import
 
-        largest = np.max(np.where(np.isfinite(self.errors), self.errors, 1.0), axis=1)
-        return points_chart(largest[:, None], x_label="candidate run", y_label="largest relative error", ax=ax)
+        errors = np.concatenate([self.now[None], self.errors])
+        largest = np.max(np.where(np.isfinite(errors), errors, 1.0), axis=1)
+        label = "largest relative standard error of a parameter, %"
+        return named_points_chart(("so far", *self.candidates), 100.0 * largest, x_label=label, ax=ax)
 
 
 @validated

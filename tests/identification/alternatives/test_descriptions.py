@@ -78,7 +78,7 @@ def test_unit_of_all_channels_is_doubted_if_masses_are_unknown():
     fit = jv.identify(first_values(), run, unknown=unknown)
     np.testing.assert_allclose(fit.estimate("machine.mass[0]").value, G * TRUTH["machine.mass[0]"], rtol=0.03)
     assert fit.notes[0] == (
-        "the fitted parameters are about 9.81 times their first values, as if the readings of channels 'a1' and 'a2' were in "
+        "the fitted parameters are about 9.8 times their first values, as if the readings of channels 'a1' and 'a2' were in "
         "'g' and not in 'm/s^2': check the unit"
     )
 

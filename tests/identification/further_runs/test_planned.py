@@ -293,9 +293,9 @@ def test_empty_plan_and_chart():
         plan_runs.__wrapped__(None, [])
     errors = np.array([[0.1, np.inf], [0.3, 0.2]])
     shown = RunPlan(("a", "b"), ("m", "k"), errors, errors, errors, errors[0], np.ones(2), np.ones(2), None).plot()
-    (line,) = [each for each in shown.axes[0].lines if len(each.get_ydata()) == 2] or [None]
-    if line is not None:
-        np.testing.assert_allclose(line.get_ydata(), [1.0, 0.3])
+    (line,) = shown.axes[0].lines
+    np.testing.assert_allclose(line.get_xdata(), [100.0, 100.0, 30.0])
+    assert [each.get_text() for each in shown.axes[0].get_yticklabels()] == ["so far", "a", "b"]
 
 
 @pytest.mark.parametrize(
