@@ -337,8 +337,7 @@ def _interpret(scene: Scene, first: Problem, fitted: Fitted) -> MachineFit:
         each._replace(low=max(each.low, 0.0)) if is_zero else each
         for each, is_zero in zip(estimates, information.vanished, strict=True)
     ]
-    has_profiles = resembles(fitted) and not fitted.misfits
-    ends = profile_intervals(fitted, information) if has_profiles else {}
+    ends = profile_intervals(fitted, information) if resembles(fitted) and not fitted.misfits else {}
     for name, (low, high) in ends.items():
         i = information.names.index(name)
         estimates[i] = _with_ends(estimates[i], information.scale[i], bool(information.logarithmic[i]), low, high)
