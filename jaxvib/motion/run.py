@@ -23,6 +23,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import start_notes
 from jaxvib.motion.analysis.beat import beat_period
+from jaxvib.motion.analysis.creep import creep_text
 from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory, duration_text, turning_masses
 from jaxvib.motion.analysis.points import (
     PointMotion,
@@ -228,12 +229,15 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
                 *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
+                *([f"  {creep}"] if (creep := creep_text(self.scene, self.window)) else []),
                 *([] if unstable else self._pass_through_note()),
                 *self._detachment(),
             ]
         )
 
     def _unsettled_text(self) -> str:
+        if creep_text(self.scene, self.window):
+            return "the loads creep, see below"
         period = beat_period(self.scene, self._stored)
         if period is None:
             return "run longer"

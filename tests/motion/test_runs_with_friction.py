@@ -152,3 +152,15 @@ def test_exact_periodic_motion_with_friction_is_that_of_a_run():
 
 def test_growth_with_friction_is_regular():
     assert jv.growth(one_mass(jv.FrictionSupport(60.0), damping=60.0), 20.0).status_name == "regular"
+
+
+def test_creeping_balls_are_not_advised_to_run_longer():
+    """Two balls near their balanced places: exact rolling friction would hold the axis up to an amplitude of 0.31 mm."""
+    machine = jv.planar_rotor(mass=48.0, stiffness=3e4, damping="8 %")
+    loads = jv.balls(count=2, mass=0.111, radius=0.23, drag=0.3, ball_radius=0.015)
+    scene = jv.Scene(machine, loads, jv.ConstantSpeed("1200 rpm"), (jv.RollingFriction(2e-5, width=0.1),))
+    still, place = np.zeros(2), np.array([0.05, np.pi - 0.05])
+    start = jv.State(still, still, (place,), (np.full(2, float(scene.drive.speed)),))
+    text = jv.simulate(scene, 4.0, start=start, save="window").summary()
+    assert "not settled: the loads creep, see below (drift" in text
+    assert "  the loads creep: dry friction is smoothed over 4.2 rpm" in text

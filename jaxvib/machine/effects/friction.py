@@ -114,7 +114,7 @@ class DryFriction(Effect):
 
     def terms(self) -> tuple[Term, ...]:
         """Return the friction. Without gravity, the half turn phi -> phi + pi, q -> -q does not change the radial load."""
-        return (ContactFriction(self.friction, is_half_turn_symmetric=True),)
+        return (ContactFriction(self.friction, is_half_turn_symmetric=True, smoothing=lambda _: self.width),)
 
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for loads without bearings, and for loads that do not move on a circle."""

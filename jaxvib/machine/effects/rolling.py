@@ -41,8 +41,8 @@ class RollingFriction(Effect):
     - `coefficient` k, m, at least 0; typical: about 2e-5 to 4e-5 for steel balls on steel, 0 for none
     - `direction`: "along" the rolling (the default), or "each": for each coordinate separately, d_i = tanh(v_i/width), as
       printed in the source; motion around the axis then does not reduce the friction against motion in the cross-section
-    - `width`, m/s: range of speeds v over which the sign is smoothed; typical: 0.01 (the default) to 0.1. A smaller width is
-      more exact and needs more steps
+    - `width`, m/s: range of speeds v over which the sign is smoothed; typical: 0.01 (the default) to 0.1; 1e-4 to 1e-3 for
+      balls that stick near the balanced motion. A smaller width is more exact and needs more steps
 
     **Raises** `InputError` for values that are not allowed. A scene raises it for loads without a ball radius.
 
@@ -72,7 +72,7 @@ class RollingFriction(Effect):
 
     def terms(self) -> tuple[Term, ...]:
         """Return the friction. Without gravity, the half turn phi -> phi + pi, q -> -q does not change the normal force."""
-        return (ContactFriction(self.friction, is_half_turn_symmetric=True),)
+        return (ContactFriction(self.friction, is_half_turn_symmetric=True, smoothing=lambda loads: self.width / loads.radius),)
 
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for loads that do not roll on a track."""

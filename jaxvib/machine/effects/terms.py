@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.loads import Loads, NormalForce
+from jaxvib.machine.loads import CircularLoads, Loads, NormalForce
 
 Coordinates: TypeAlias = tuple[Array, ...]
 """Arrays (count,), one for each coordinate of a load."""
@@ -197,10 +197,13 @@ class ContactFriction:
 
     - `friction`: function of the loads, `u`, the rates of `u`, the rotor speed, and gravity by axis; it returns `Friction`
     - `is_half_turn_symmetric`: True if phi -> phi + pi, q -> -q leaves the equations with the friction unchanged
+    - `smoothing`: function of loads on a circle that returns the rate relative to the rotor, rad/s, over which the sign of the
+      friction is smoothed; None if the sign is exact or the rate is unknown
     """
 
     friction: Callable[[Loads, Coordinates, Coordinates, Array, Mapping[int, Array]], Friction]
     is_half_turn_symmetric: bool = False
+    smoothing: Callable[[CircularLoads], Array] | None = None
     is_smooth: ClassVar[bool] = False
 
 
