@@ -38,6 +38,9 @@ to the next point on each side of the extremum. It divides each of these two dis
 _MAX_SPREAD_OF_MEAN = 0.2
 """Largest difference of the speeds of turning masses, relative to the largest speed, with which their mean is stated."""
 
+_MAX_CONSTANT_SPREAD = 0.01
+"""Largest difference of the speeds of a rotor, relative to the largest one, with which its speed counts as constant."""
+
 Field = Callable[[Array, State], State]
 """Equations of motion: function from a time and a state to the rates of the state."""
 
@@ -131,10 +134,13 @@ class AbstractMeasured(Readable):
 
     def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array]) -> str:
         """Return a line of text with the speeds of the turning masses, and the last of the `rotor_speeds` (nt,), rad/s, of each
-        exciter with loads. The mean speed is left out if the speeds differ much, for example because a motor stands still."""
-        exciters = zip(scene.exciters, rotor_speeds, strict=True)
-        rotors = [speeds[-1] for exciter, speeds in exciters if exciter.loads is not None]
-        rotor = f", {'rotor' if len(rotors) == 1 else 'rotors'} at {speed_text(rotors, 6)}" if rotors else ""
+        exciter with loads. The mean speed is left out if the speeds differ much, for example because a motor stands still. If a
+        rotor speed is not constant, the text states that it is the last one."""
+        exciters = zip(scene.exciters, map(np.asarray, rotor_speeds), strict=True)
+        histories = [speeds for exciter, speeds in exciters if exciter.loads is not None]
+        changes = any(np.ptp(speeds) > _MAX_CONSTANT_SPREAD * np.max(np.abs(speeds)) for speeds in histories)
+        last = speed_text([speeds[-1] for speeds in histories], 6) + (" at the end" if changes else "")
+        rotor = f", {'rotor' if len(histories) == 1 else 'rotors'} at {last}" if histories else ""
         clockwise = np.any(np.asarray([exciter.direction for exciter in scene.exciters]) < 0)
         each = speed_text(self.load_speed, 6) + ("; negative: clockwise" if clockwise else "")
         magnitudes = np.abs(np.asarray(self.load_speed))

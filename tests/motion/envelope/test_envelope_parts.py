@@ -349,10 +349,16 @@ def test_summary_states_the_duration_of_a_spin_up():
     assert ": 5 s (spin-up during the first 2.5 s), 31 steps" in run.summary()
 
 
+def test_speeds_state_that_a_changing_rotor_speed_is_the_last():
+    steady, changing = jnp.array([59.9, 60.0]), jnp.array([50.0, 60.0])
+    assert run_of().speeds_text(platform(), (steady,)).endswith("rotor at 572.958 rpm")
+    assert run_of().speeds_text(platform(), (changing,)).endswith("rotor at 572.958 rpm at the end")
+
+
 def test_summary_of_a_run():
     lines = run_of().summary().splitlines()
     assert lines[0] == "the averaged run reached its end: 5 s, 31 steps (4 rejected), settled (drift 1.0e-04)"
-    assert lines[1] == "  loads turn at 600 rpm (each: 570, 630 rpm), rotor at 572.958 rpm"
+    assert lines[1] == "  loads turn at 600 rpm (each: 570, 630 rpm), rotor at 572.958 rpm at the end"
     assert lines[2] == "  amplitude, zero to peak: y1 1 mm; foundation force 40 N"
     assert lines[3].startswith("  y1: stroke 2 mm peak to peak, ") and lines[5].startswith("  support 1: ")
     assert lines[4].startswith("  static deflection, down: y1 ")
