@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import click
 
@@ -220,9 +220,11 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     """Print the jams of light loads at any phases."""
     import jax  # slow imports, which --help does not need
 
+    from jaxvib.machine.loads import CircularLoads
     from jaxvib.results.status import sentence
 
-    result, limits = jv.phase_jams(scene), jax.device_get(jv.drag_limits(scene, phases=True))
+    is_gathered = cast(CircularLoads, scene.loads).alike and scene.mount().at_one_point
+    result, limits = jv.phase_jams(scene), jax.device_get(jv.drag_limits(scene, phases=not is_gathered))
     output.figure("phases.png", lambda: result.plot())
     jams = [result.select(k) for k in range(result.omega.shape[0])]
     measures = [measures_of(scene, jam) if jam.stable else None for jam in jams]
@@ -254,7 +256,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
         stable_jams = [f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam in jams if jam.stable]
         reached = _reached_lines(scene, output, [f"the jam at {each}" for each in stable_jams], balanced)
         if not rows:
-            return "\n".join([f"no jam at {rotor}", *reached, *_drag_lines(scene, limits, points=True)])
+            return "\n".join([f"no jam at {rotor}", *reached, *_drag_lines(scene, limits, points=not is_gathered)])
         conclusion = (
             f"loads can stay jammed at {', '.join(stable_jams)}"
             if stable_jams
@@ -265,7 +267,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
             for jam, measures_of_jam in zip(jams, measures, strict=True)
             if measures_of_jam is not None
         ]
-        drags = _drag_lines(scene, limits, points=True)
+        drags = _drag_lines(scene, limits, points=not is_gathered)
         rows_of_force = [table(title, head, rows), *_force_lines(scene)]
         return "\n".join([conclusion, *reached, *rows_of_force, *measure_texts, *drags, *_imbalance_lines(scene)])
 

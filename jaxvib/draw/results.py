@@ -339,7 +339,7 @@ def drag_diagram(
     label: str,
     at: float,
     jams: tuple[np.ndarray, np.ndarray] | None = None,
-    within: float | None = None,
+    within: tuple[float, float] | None = None,
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
@@ -353,7 +353,7 @@ def drag_diagram(
     - `label`: label of the drag axis
     - `at`: drag of the scene, drawn as a vertical line
     - `jams`: jams (speed, stable) at the drag of the scene; unstable ones are hollow
-    - `within`: the drag axis is from `at` / `within` to `at` x `within`; None: automatic range
+    - `within`: ends of the drag axis, as multiples of `at`; None: automatic range
     - `unit`: unit in which speeds, rad/s, are drawn
     """
     unit, scale = speed_unit(unit)
@@ -376,7 +376,7 @@ def drag_diagram(
             axis.plot(np.full(np.sum(kind), at), scale * speed[kind], "o", ms=4.0, mfc=face, mec="black", mew=0.8, zorder=3)
     axis.set_xscale("log")
     if within is not None:
-        axis.set_xlim(at / within, at * within)
+        axis.set_xlim(at * within[0], at * within[1])
     log_ticks(axis, "x")
     axis.set(ylim=(0.0, 1.05 * scale * rotor_speed), xlabel=label, ylabel="load speed, " + unit)
     legend_above(axis, 3)

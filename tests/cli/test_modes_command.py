@@ -54,6 +54,14 @@ def equal_points(table):
     return jv.Scene(table.machine, points, table.drive)
 
 
+def test_modes_limit_the_drag_of_touching_balls(typed, tmp_path):
+    (tmp_path / "rotor.toml").write_text(TEMPLATES["ball_balancer"])
+    expected = jv.drag_limits(jv.load_scene(tmp_path / "rotor.toml"))
+    document = json.loads(typed("modes", "rotor.toml", "--json")[1])
+    np.testing.assert_allclose(document["drag_limits"][0]["drag"], expected.drag[0], rtol=1e-9)
+    assert "loads count as points: touching" not in typed("modes", "rotor.toml")[1]
+
+
 def test_modes_name_a_resonance_without_a_peak(typed, tmp_path):
     plain = scene("two_mass", speed=150.0)
     damped = eqx.tree_at(lambda s: s.machine.damping, plain, 30.0 * plain.machine.damping)

@@ -39,7 +39,13 @@ from jaxvib.units import count, random_numbers
 
 _SHOWN_DRAG_FACTOR = 30.0
 """Factor of the drag range in a figure of all jams: the range begins at the drag of the scene divided by this factor, and ends
-at this drag multiplied by it."""
+at this drag multiplied by it, or farther if a jam ends at a resonance outside of this range."""
+
+_SHOWN_BEYOND_A_FOLD = 2.0
+"""Ratio of the end of the drag axis and the drag of the last fold."""
+
+_MAX_SHOWN_DRAG_FACTOR = 1e4
+"""Largest ratio of an end of the drag axis and the drag of the scene."""
 
 _SAME_LINE_DIFFERENCE = 5e-3
 """Relative difference of drags below which the lines of two unstable patterns are drawn as one line."""
@@ -90,8 +96,8 @@ class PhaseJams(AbstractPhaseJam):
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot the load speeds over the drag, from 1/30 to 30 times the drag of the scene, for each pattern of these jams.
 
-        Colours show the arrangement of the loads. Stable parts are solid lines, unstable parts dashed lines, and the jams of
-        the scene are points.
+        The drag axis is longer if the jams at a resonance end outside of this range. Colours show the arrangement of the loads.
+        Stable parts are solid lines, unstable parts dashed lines, and the jams of the scene are points.
         """
         from jaxvib.draw.results import drag_diagram  # slow import
 
@@ -110,7 +116,20 @@ class PhaseJams(AbstractPhaseJam):
                 curves.append((sentence(jam.pattern), factor, at, stable))
         top, jams = float(self.scene.drive.speed), (omega, np.asarray(self.stable))
         label = "drag / drag of the scene"
-        return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN_DRAG_FACTOR, unit=unit, ax=ax)
+        return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_shown_drags(curves), unit=unit, ax=ax)
+
+
+def _shown_drags(curves: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]) -> tuple[float, float]:
+    """Return the ends of the drag axis, relative to the drag of the scene, between which the folds of the `curves` lie."""
+    folds = [1.0]
+    for _, factor, _, _ in curves:
+        is_peak = (factor[1:-1] > factor[:-2]) & (factor[1:-1] > factor[2:])
+        folds.extend(factor[1:-1][is_peak])
+    low, high = min(folds) / _SHOWN_BEYOND_A_FOLD, max(folds) * _SHOWN_BEYOND_A_FOLD
+    return (
+        max(min(low, 1.0 / _SHOWN_DRAG_FACTOR), 1.0 / _MAX_SHOWN_DRAG_FACTOR),
+        min(max(high, _SHOWN_DRAG_FACTOR), _MAX_SHOWN_DRAG_FACTOR),
+    )
 
 
 @overload

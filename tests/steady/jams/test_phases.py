@@ -211,6 +211,17 @@ def test_figure_of_all_jams_has_each_on_a_line():
     assert len(points["white"]) == 2
 
 
+@pytest.mark.parametrize("times", [1e-3, 200.0])
+def test_figure_of_all_jams_reaches_their_greatest_drag(times):
+    scene = planar(0.04 * times)
+    factor = float(jv.drag_limits(scene, phases=True).factor[0])
+    (axis,) = jv.phase_jams(scene, starts=8).plot(unit="rad/s").axes
+    low, high = axis.get_xlim()
+    assert not 1.0 / 30.0 < factor < 30.0 and low < factor < high
+    drags = np.concatenate([line.get_xdata() for line in axis.lines if len(line.get_xdata()) > 2])
+    assert np.nanmin(np.abs(np.log(drags / factor))) < 0.05
+
+
 def test_derivatives_are_the_implicit_function_theorems():
     """Central differences, step 1e-5 of each number: their error is about 1e-9."""
     phase = jnp.array([0.0, 0.13, -3.0, 3.14])
