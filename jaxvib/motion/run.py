@@ -60,6 +60,14 @@ def _detachment_times(scene: Scene, trajectory: Trajectory) -> Array:
 _CONTACT = "add load_contact = { stiffness = 1e5, restitution = 0.6 } to [effects], or LoadContact(1e5, restitution=0.6)"
 
 
+_MIN_PEAK_RATIO = 1.02
+"""Smallest ratio of the largest value during a run to that of its window for which the summary states the time."""
+
+
+def _length(vectors: Array) -> np.ndarray:
+    return np.linalg.norm(np.asarray(vectors), axis=-1)
+
+
 class RunStatus(eqx.Enumeration):
     """Outcomes of a run. The value of each member is the message shown to the user."""
 
@@ -254,11 +262,25 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         return [f"  loads passed through each other on the way, which may change the result; {_CONTACT}"]
 
     def _on_the_way(self) -> str:
-        structure = self.scene.machine.structure()
-        largest = zip(structure.coordinates, np.asarray(self.largest_displacement), structure.units, strict=True)
-        named = ", ".join(f"{name} {quantity_text(x, unit, 4)}" for name, x, unit in largest)
-        force = quantity_text(self.largest_force, "N", 4)
-        return f"largest on the way, zero to peak: {named}; magnitude of the foundation force {force}"
+        structure, window, stored = self.scene.machine.structure(), self.window, self._stored
+        values = [*np.moveaxis(np.asarray(stored.state.displacement), -1, 0), _length(stored.foundation_force)]
+        last = [*np.moveaxis(np.asarray(window.state.displacement), -1, 0), _length(window.foundation_force)]
+        largest = zip(
+            [*structure.coordinates, "magnitude of the foundation force"],
+            [*np.asarray(self.largest_displacement), self.largest_force],
+            [*structure.units, "N"],
+            [self._peak_time_text(each, end) for each, end in zip(values, last, strict=True)],
+            strict=True,
+        )
+        *named, force = (f"{name} {quantity_text(x, unit, 4)}{time}" for name, x, unit, time in largest)
+        return f"largest on the way, zero to peak: {', '.join(named)}; {force}"
+
+    def _peak_time_text(self, values: np.ndarray, last: np.ndarray) -> str:
+        """Return the time of the largest of the `values` as text; "" if those of the window, `last`, are about as large."""
+        values = np.abs(values)
+        if not np.max(values) > _MIN_PEAK_RATIO * np.max(np.abs(last)):
+            return ""
+        return f" at {float(self._stored.time[np.argmax(values)]):.4g} s"
 
     def _detachment(self) -> list[str]:
         times = np.asarray(self.detached)

@@ -26,6 +26,15 @@ def stopped():
     return jv.simulate(coasting(), "60 s")
 
 
+def test_the_summary_states_the_times_of_peaks(stopped):
+    """The peaks of start and stop are distinguished by their times."""
+    path = stopped.trajectory
+    tilt, force = np.abs(path.state.displacement[:, 2]), np.linalg.norm(path.foundation_force, axis=-1)
+    line = next(each for each in stopped.summary().splitlines() if "largest on the way" in each)
+    assert f" at {float(path.time[np.argmax(tilt)]):.4g} s; magnitude of the foundation force" in line
+    assert line.endswith(f"N at {float(path.time[np.argmax(force)]):.4g} s")
+
+
 def test_a_screen_that_coasts_down_has_no_measures(stopped):
     assert "turns in the measured window, fewer than 3" in stopped.no_vibration
     text = stopped.summary()
