@@ -129,6 +129,14 @@ def _point_settings(at: Any, body: int) -> tuple[object, int]:
     return place, count(body, "body", low=0)
 
 
+def _words(name: str, at: int | Number | Sequence[Number] | None, body: int) -> str:
+    """Return the words of a quantity at a point; tables may contain it for several points."""
+    point = ", ".join(map(str, at)) if isinstance(at, Sequence) and not isinstance(at, str) else at
+    parts = ([] if at is None else [f"at = {point}"]) + ([f"body = {body}"] if body else [])
+    where = f" ({', '.join(parts)})" if parts else ""
+    return f"{name}{where} under unbalances"
+
+
 @validated
 def response_amplitude(
     *,
@@ -156,7 +164,7 @@ def response_amplitude(
     'largest amplitude under unbalances from 100 to 900 rpm at most 20 mm'
     """
     place = _point_settings(at, body)
-    return _response_quantity("response_amplitude", "m", _amplitude, "amplitude under unbalances", speed, between, *place)
+    return _response_quantity("response_amplitude", "m", _amplitude, _words("amplitude", at, body), speed, between, *place)
 
 
 def _amplitude(model: UnbalancedModel, w: Array, at: int | Array | None, body: int) -> Array:
@@ -182,10 +190,10 @@ def response_stroke(
 
     >>> from optimize import response_stroke
     >>> response_stroke(at=1, speed="950 rpm").words
-    'stroke under unbalances at 950 rpm'
+    'stroke (at = 1) under unbalances at 950 rpm'
     """
     place = _point_settings(at, body)
-    return _response_quantity("response_stroke", "m", _stroke, "stroke under unbalances", speed, between, *place)
+    return _response_quantity("response_stroke", "m", _stroke, _words("stroke", at, body), speed, between, *place)
 
 
 def _stroke(model: UnbalancedModel, w: Array, at: int | Array | None, body: int) -> Array:

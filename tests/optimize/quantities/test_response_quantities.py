@@ -169,3 +169,9 @@ def test_points_of_a_body_and_wrong_scenes():
     )
     with pytest.raises(jv.InputError, match="loads turn at a speed of their own"):
         response_force(speed=80.0)(balls)
+
+
+def test_words_name_the_point():
+    """A table with the strokes of two platforms needs different words for them."""
+    assert response_stroke(at=2).words == "stroke (at = 2) under unbalances"
+    assert response_amplitude(at=(0.5, 0.1), body=1).words == "amplitude (at = 0.5, 0.1, body = 1) under unbalances"
