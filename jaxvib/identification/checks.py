@@ -39,6 +39,9 @@ _COARSE_ANGLE = 0.3
 _DECAY_TIMES = 2.0
 """Duration of a run, in decay times of the mode that decays most slowly, below which a note says that it is short."""
 
+_ROUNDING = 1e-12
+"""Information of a part of the records about an unknown, relative to that of all records, that is a rounding error."""
+
 _UNEXPLAINED = 0.5
 """Standard deviation of a channel's residuals, relative to that of its readings, above which the model does not resemble the
 channel."""
@@ -296,6 +299,7 @@ def disagreement(others: np.ndarray, run: np.ndarray, gradient: np.ndarray, name
     """
     from scipy.special import chdtrc  # slow to import
 
+    run, others = (_without_rounding(each, np.diagonal(others + run)) for each in (run, others))
     (of_run, rank_of_run), (of_others, rank_of_others), (of_all, rank_of_all) = (
         pseudoinverse(run),
         pseudoinverse(others),
@@ -310,6 +314,18 @@ def disagreement(others: np.ndarray, run: np.ndarray, gradient: np.ndarray, name
     statistic = float(gradient @ (of_run + of_others) @ gradient)
     change, error = gradient[largest] / information[largest], 1.0 / math.sqrt(information[largest])
     return Disagreement(float(chdtrc(freedom, statistic)), names[largest], float(change), float(error))
+
+
+def _without_rounding(information: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return the information of a part of the records with zeros for unknowns about which it contains rounding errors only.
+
+    Such an unknown is the angle of the unbalance in a run with an unknown zero of the rotor's angle. Its diagonal has either
+    sign, and would count as information after it is scaled to 1.
+
+    **Arguments**: `size` (k,): diagonal of the information of all records.
+    """
+    is_rounding = np.diagonal(information) <= _ROUNDING * size
+    return np.where(is_rounding[:, None] | is_rounding, 0.0, information)
 
 
 def pseudoinverse(matrix: np.ndarray) -> tuple[np.ndarray, int]:

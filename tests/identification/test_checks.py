@@ -78,6 +78,16 @@ def test_disagreement_is_a_ratio_of_likelihoods():
     assert found.sentence("run 2") == text + f"{found.change:+.3g} +- {1.96 * found.error:.1g} explains most of it"
 
 
+@pytest.mark.parametrize("rounding", [-1e-13, 1e-13])
+def test_rounding_errors_are_no_information_about_a_difference(rounding):
+    """The run has no information about the second unknown; its rounding errors have either sign."""
+    others, run = np.diag([400.0, 300.0]), np.array([[100.0, 1e-9], [1e-9, rounding]])
+    found = disagreement(others, run, np.array([20.0, 1e-5]), ["mass", "angle"])
+    expected = disagreement(others[:1, :1], run[:1, :1], np.array([20.0]), ["mass"])
+    assert found.name == "mass"
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-6)
+
+
 @pytest.mark.parametrize(("others", "run"), [(0.0, 100.0), (400.0, 0.0)])
 def test_numbers_of_one_side_alone_cannot_disagree(others, run):
     nothing = disagreement(np.array([[others]]), np.array([[run]]), np.array([5.0]), ["mass"])
