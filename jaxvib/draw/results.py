@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import FormatStrFormatter, NullFormatter
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
 from jaxvib.draw.charts import scaled_amplitudes, solid_and_dashed
@@ -17,6 +18,7 @@ from jaxvib.draw.style import (
     Look,
     color_of,
     legend_above,
+    log_places,
     log_ticks,
     marker_of,
     panels,
@@ -275,6 +277,9 @@ def named_points_chart(names: Sequence[str], values: np.ndarray, *, x_label: str
     axis.plot(values, np.arange(values.size), marker_of(0), ms=4.5, color=color_of(0))
     axis.set_yticks(np.arange(values.size), names)
     axis.set(xscale="log", xlabel=x_label, ylim=(values.size - 0.5, -0.5))
+    axis.xaxis.set_major_locator(log_places(*axis.get_xlim()))
+    axis.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
     return figure if ax is None else ax
 
 
