@@ -173,8 +173,11 @@ def _drag_document(limits: jv.DragLimits | None) -> list[dict[str, Any]]:
     return [{name: getattr(limits, name)[k] for name in names} for k in np.flatnonzero(np.isfinite(limits.factor))]
 
 
-def _drag_lines(scene: jv.Scene, limits: jv.DragLimits | None, *, points: bool = False) -> list[str]:
-    """Return a table of the greatest drags; an empty list if there is none. `points`: True for limits of point loads."""
+def _drag_lines(scene: jv.Scene, limits: jv.DragLimits | None, *, points: bool | None = None) -> list[str]:
+    """Return a table of the greatest drags; an empty list if there is none.
+
+    `points`: True if balls count as points in the table, False if only in the table of jams, None if in neither.
+    """
     from jaxvib.display import speed_unit  # slow imports, which --help does not need
     from jaxvib.machine.loads import CircularLoads
 
@@ -187,8 +190,13 @@ def _drag_lines(scene: jv.Scene, limits: jv.DragLimits | None, *, points: bool =
     of_load = "drag, N s/m" if equal else "drag of load 1, N s/m"
     head = [f"resonance, {unit}", of_load, "times the scene's", f"loads, {unit}"]
     lines = [table("greatest drag: with a larger one no jam exists at the resonance", head, rows)] if rows else []
-    if lines and points and getattr(scene.loads, "ball_radius", None) is not None:
-        lines.append("loads count as points: touching balls jam only up to a smaller drag")
+    if lines and points is not None and getattr(scene.loads, "ball_radius", None) is not None:
+        smaller = "touching balls jam only up to a smaller drag"
+        lines.append(
+            f"loads count as points: {smaller}"
+            if points
+            else "greatest drag of touching balls; in the jams they count as points"
+        )
     return lines
 
 
