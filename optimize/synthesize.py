@@ -149,7 +149,7 @@ def synthesize(
     limits = limits_of(problem, demands, result, reports[1, len(named) + 1 :].reshape(-1, 2))
     if throw and status is SynthesisStatus.contradictory:
         raise _unmet(limits, space, scene, [*(held.quantity for held in space.held), *(demand.quantity for demand in demands)])
-    report("integrating the best machine" if verify else "computing quantities", 0.9)
+    report("integrating the best machine" if verify and motion is not None else "computing quantities", 0.9)
     verify = verify and not why_unverified
     run, unverified = (None, why_unverified) if why_unverified else _run(scene, motion, verify)
     report("computing the exact motion", 0.99)
@@ -335,7 +335,7 @@ def _run(scene: Scene, motion: _Motion, verify: bool) -> tuple[Run | None, str]:
     **Returns** the run and an empty text, or None and the reason why there is no run.
     """
     if motion is None:
-        return None, "no quantity of the search has a motion to integrate"
+        return None, "no quantity of the search belongs to a jam or a working regime, which the full equations could verify"
     if not verify:
         return None, "not requested"
     try:  # a failed verification must not lose the machine

@@ -198,7 +198,8 @@ def _angle_of_channel(run: MeasuredRun, channel: Channel) -> RotorAngle:
         change = float(np.max(np.abs(np.diff(speed) / speed[1:]), where=is_fast, initial=0.0))
         if change > _MAX_SPEED_CHANGE:
             notes.append(
-                f"{field}: the speed changes by up to {change:.0%} from one pulse to the next, and the angle between them is "
+                f"{field}: the speed changes by up to {100.0 * change:.0f} % from one pulse to the next, and the angle between "
+                "them is "
                 "uncertain; use more pulses per turn"
             )
     grid = spline(np.linspace(time[0], time[-1], 4 * spline.c.shape[0]))[:, 1:]

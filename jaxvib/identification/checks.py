@@ -112,13 +112,13 @@ def status_of(fitted: Fitted, information: Information) -> tuple[FitStatus, floa
                 is_inaccurate = True
                 notes.append(
                     f"the intervals do not include an error of {fitted.problem.angle_errors[k]:.2g} rad of the rotor's angle "
-                    f"in run {k + 1}, which causes {shares[k][c]:.0%} of the residuals of channel {channel.name!r}: use more "
-                    "pulses per turn, or sample them faster"
+                    f"in run {k + 1}, which causes {100.0 * shares[k][c]:.0f} % of the residuals of channel {channel.name!r}: "
+                    "use more pulses per turn, or sample them faster"
                 )
             if fitted.outliers[k][c]:
                 notes.append(
-                    f"{fitted.outliers[k][c]:.1%} of the readings of channel {channel.name!r} in run {k + 1} are outliers, "
-                    "which have little influence"
+                    f"{100.0 * fitted.outliers[k][c]:.1f} % of the readings of channel {channel.name!r} in run {k + 1} are "
+                    "outliers, which have little influence"
                 )
             angles = fitted.problem.angles[k].T
             for angle, whose in zip(angles if fitted.problem.has_loads else angles[:1], _ANGLE_NAMES, strict=False):
@@ -173,7 +173,7 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
                     "leave out the part of the record in which loads are jammed or another machine runs"
                 )
             what = f"the {'residuals' if has_fit else 'readings'} of channel {channel.name!r} in run {k + 1}"
-            yield f"{vibration.share:.0%} of the power of {what} is {vibration.frequency_text}{reason}"
+            yield f"{100.0 * vibration.share:.0f} % of the power of {what} is {vibration.frequency_text}{reason}"
 
 
 def residual_p_value(residuals: np.ndarray, taps: np.ndarray, angle: np.ndarray, fitted_count: int) -> float:

@@ -223,8 +223,8 @@ def directions_of(information: Information) -> tuple[tuple[Direction, ...], tupl
     ]
     gains = [
         each.direction._replace(
-            sentence=f"{each.subject} is known from the gains of the sensors only, to {each.direction.error:.1%}, and an error "
-            f"of a gain leaves no trace in the residuals; calibrate the sensors, or {each.advice_for_gain}"
+            sentence=f"{each.subject} is known from the gains of the sensors only, to {100.0 * each.direction.error:.1f} %, "
+            f"and an error of a gain leaves no trace in the residuals; calibrate the sensors, or {each.advice_for_gain}"
         )
         for each in _described(information, information.by_gain, information.by_gain_errors)
     ]

@@ -205,7 +205,7 @@ def _robust(
             raise InputError(f"tolerances.{name}", f"is {quoted(value)}; it must be between 0 and 1, such as 0.05 for 5 %")
     size = count(samples, "samples", low=2, each=64.0 * len(tolerances))
     case = Sampled(tuple((k, float(v)) for k, v in tolerances.items()), size, count(seed, "seed", low=0))
-    words = statistic if statistic != "quantile" else f"{level:.0%} quantile of"
+    words = statistic if statistic != "quantile" else f"{100.0 * level:.0f} % quantile of"
     return Robust(
         f"{words} {quantity.words}",
         quantity.unit,

@@ -232,12 +232,12 @@ def outcome(monkeypatch, **changes):
             {"shares": (0.0, 0.12)},
             "patterned",
             0.3,
-            ["an error of 0.05 rad of the rotor's angle in run 1, which causes 12% of the"],
+            ["an error of 0.05 rad of the rotor's angle in run 1, which causes 12 % of the"],
         ),
         ({"shares": (0.0, 0.09)}, "found", 0.3, []),
         ({"misfits": (0.9, 2.1)}, "patterned", 0.3, ["run 2 deviates from the torque balance of its motor by 2.1"]),
         ({"absorbed": True}, "patterned", 0.3, ["no noise model distinguishes such residuals from the motion of the machine"]),
-        ({"outliers": (0.02, 0.0)}, "found", 0.3, ["2.0% of the readings of channel 'a' in run 1 are outliers"]),
+        ({"outliers": (0.02, 0.0)}, "found", 0.3, ["2.0 % of the readings of channel 'a' in run 1 are outliers"]),
     ],
 )
 def test_status_follows_from_the_checks(monkeypatch, changes, status, least, words):
@@ -249,11 +249,11 @@ def test_status_follows_from_the_checks(monkeypatch, changes, status, least, wor
 @pytest.mark.parametrize(
     ("fits", "share", "order", "size", "words"),
     [
-        (True, 0.6, None, 1.0, "60% of the power of the residuals of channel 'a' in run 1 is at 9 Hz, but an unbalance turns"),
+        (True, 0.6, None, 1.0, "60 % of the power of the residuals of channel 'a' in run 1 is at 9 Hz, but an unbalance turns"),
         (True, 0.4, None, 1.0, ""),
         (True, 0.6, None, 0.09, ""),  # residuals like noise
-        (True, 0.6, 2.0, 0.09, "60% of the power of the residuals"),
-        (False, 0.6, None, 0.09, "60% of the power of the readings"),
+        (True, 0.6, 2.0, 0.09, "60 % of the power of the residuals"),
+        (False, 0.6, None, 0.09, "60 % of the power of the readings"),
     ],
 )
 def test_foreign_vibration_in_words(monkeypatch, fits, share, order, size, words):

@@ -124,7 +124,7 @@ def test_directions_that_only_the_gains_determine():
     assert sentence.startswith(
         "a change of machine.stiffness by +0.71, place by +0.71 (relative to one another) is known from the"
     )
-    assert "gains of the sensors only, to 1.6%, and an error of a gain leaves no trace in the residuals; calibrate" in sentence
+    assert "gains of the sensors only, to 1.6 %, and an error of a gain leaves no trace in the residuals; calibrate" in sentence
     fit.prior = np.zeros((4, 4))
     unknown = information_of(fit)  # nothing determines the sum now
     assert unknown.by_gain.shape == (2, 0) and unknown.undetermined.shape == (2, 1)
@@ -199,8 +199,8 @@ def gain_sentence(*names):
 def test_added_mass_is_no_remedy_for_unbalances_alone():
     """The readings remain the same if the unbalance is larger and the gain smaller, whatever mass is added."""
     assert gain_sentence("exciters[0].unbalance") == (
-        "exciters[0].unbalance is known from the gains of the sensors only, to 0.7%, and an error of a gain leaves no trace in "
-        "the residuals; calibrate the sensors, or give it as known"
+        "exciters[0].unbalance is known from the gains of the sensors only, to 0.7 %, and an error of a gain leaves no trace "
+        "in the residuals; calibrate the sensors, or give it as known"
     )
     two = gain_sentence("exciters[0].unbalance", "exciters[1].unbalance")
     assert two.startswith("the common factor of all unbalances is known") and "added" not in two

@@ -88,7 +88,7 @@ def test_large_changes_of_speed_between_pulses_are_noted():
     middle = 10.0 + RATE * 0.5 * (edges[1:] + edges[:-1])
     largest = np.max(np.diff(middle) / middle[1:])
     (note,) = measured("pulses", edges, numbers).notes
-    assert f"the speed changes by up to {largest:.0%} from one pulse to the next" in note
+    assert f"the speed changes by up to {100.0 * largest:.0f} % from one pulse to the next" in note
 
 
 def test_a_speed_gives_the_angle_without_its_zero():

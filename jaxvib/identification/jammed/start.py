@@ -228,7 +228,7 @@ def _jam_of(problem: Problem, r: int) -> _Jam:
     if not np.max(power) > _MIN_LINE_POWER * np.sum(power) / max(np.count_nonzero(in_range), 1):
         raise InputError(
             f"records[{r}]",
-            f"has no vibration of jammed loads below {high:.3g} rad/s, {_BELOW_ROTOR:.0%} of the lowest rotor speed; "
+            f"has no vibration of jammed loads below {high:.3g} rad/s, {100.0 * _BELOW_ROTOR:.0f} % of the lowest rotor speed; "
             "identify needs records in which the loads of the scene are jammed from the first sample to the last, for at least "
             "8 turns",
         )

@@ -136,7 +136,7 @@ def _compare_speeds(reference_signal: _Signal, other: _Signal, source: str) -> l
     scatter = float(np.median(np.abs(speed[is_turning] / reference[is_turning] / ratio - 1.0)))
     if scatter > _SPEED_ERROR:
         raise InputError(
-            where, f"and {name} are not the speed of one rotor: their ratio changes by {scatter:.0%}; leave one out"
+            where, f"and {name} are not the speed of one rotor: their ratio changes by {100.0 * scatter:.0f} %; leave one out"
         )
     problem = f"turns {abs(ratio):.4g} times as fast as {name} at all times"
     raise InputError(where, f"{problem}: correct per_turn, or leave out the channel of the shaft without the exciter")
@@ -275,7 +275,7 @@ def _aliasing(motion: _Signal, speeds: Sequence[_Signal], source: str) -> list[s
     power = np.mean(np.abs(np.fft.rfft((pieces - np.mean(pieces, axis=1, keepdims=True)) * window, axis=1)) ** 2, axis=0)
     share = float(np.sum(power[int(0.8 * power.size) :]) / max(float(np.sum(power)), 1e-300))
     if share > 0.5:
-        problem = f"has {share:.0%} of its power between 0.4 and 0.5 times its sampling rate of {rate:.4g} Hz"
+        problem = f"has {100.0 * share:.0f} % of its power between 0.4 and 0.5 times its sampling rate of {rate:.4g} Hz"
         return [f"{where} {problem}: it is probably aliased; record faster, or with an anti-aliasing filter"]
     return []
 

@@ -96,7 +96,8 @@ def even_samples(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.nd
         first = f"the first at {time[np.argmax(is_missing)]:g} s"
         if count > _MAX_MISSING * value.size:
             share = f"has {count} of {value.size} readings that are not numbers, {first}"
-            raise InputError(where, f"{share}; at most {_MAX_MISSING:.0%} may be missing; use another part of the record")
+            allowed = f"at most {100.0 * _MAX_MISSING:.0f} % may be missing"
+            raise InputError(where, f"{share}; {allowed}; use another part of the record")
         readings = "reading that is not a number" if count == 1 else "readings that are not numbers"
         notes.append(f"{where} has {count} {readings}, {first}; left out")
     is_dropout = dropouts(value)

@@ -31,7 +31,7 @@ def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], s
     omega, stable = np.asarray(branch.omega), np.asarray(branch.stable)
     ends = speed_text([np.fmin.reduce(omega), np.fmax.reduce(omega)], 6, " to ")
     lines = [
-        f"{omega.size} points from {ends}, {np.mean(stable):.1%} of them stable {stability_text}; "
+        f"{omega.size} points from {ends}, {100.0 * np.mean(stable):.1f} % of them stable {stability_text}; "
         f"resonances {speed_text(estimated_frequencies(branch.scene), 6)}"
     ]
     names = [(kind.replace("_", " "), w, n) for kind, w, n in marks]

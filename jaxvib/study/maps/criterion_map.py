@@ -57,9 +57,8 @@ class CriterionMap(Result):
             cells = []
             for m in range(self.mass_factor.size):
                 shift = np.abs(self.shift[d, m][~np.isnan(self.shift[d, m])])
-                cells.append(
-                    f"{self.agreement[d, m]:.3f} ({np.mean(shift):.2%})" if shift.size else f"{self.agreement[d, m]:.3f}"
-                )
+                mean = f" ({100.0 * np.mean(shift):.2f} %)" if shift.size else ""
+                cells.append(f"{self.agreement[d, m]:.3f}{mean}")
             lines.append(f"{factor:>16.3g}" + "".join(f"{cell:>16}" for cell in cells))
         return "\n".join(lines)
 

@@ -44,7 +44,7 @@ class StabilityMap(Result):
         lines = []
         for x, stable, points in zip(self.value, self.stable, self.special, strict=True):
             kinds = ", ".join(f"{point.kind.replace('_', ' ')} at {speed_text(point.omega, 6)}" for point in points)
-            lines.append(f"{x:.6g}: {np.mean(stable):.1%} of the load speeds stable; {kinds or 'no special point'}")
+            lines.append(f"{x:.6g}: {100.0 * np.mean(stable):.1f} % of the load speeds stable; {kinds or 'no special point'}")
         return "\n".join(lines)
 
     def plot(self, *, label: str = "x", unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:

@@ -214,7 +214,7 @@ def test_scene_without_a_jam_in_the_record_is_refused():
     channels = (*run.channels[:2], jv.Channel("tacho", "pulses"))
     with pytest.raises(
         jv.InputError,
-        match=r"records\[0\] has no vibration of jammed loads below 11\.9 rad/s, 95% of the lowest rotor speed",
+        match=r"records\[0\] has no vibration of jammed loads below 11\.9 rad/s, 95 % of the lowest rotor speed",
     ):
         jv.identify(scene_of(TRUTH), jv.MeasuredRun.from_arrays(channels, slow, noise), unknown=UNKNOWN)
 

@@ -142,7 +142,7 @@ def test_a_tenth_of_the_readings_may_be_missing(count, is_refused):
         ]
         assert np.count_nonzero(np.isnan(even_samples(T, value, "a:")[1])) == count
         return
-    with pytest.raises(jv.InputError, match="has 41 of 400 readings that are not numbers, the first at 3 s; at most 10% may"):
+    with pytest.raises(jv.InputError, match="has 41 of 400 readings that are not numbers, the first at 3 s; at most 10 % may"):
         even_samples(T, value, "a:")
     with pytest.raises(jv.InputError, match="is constant in segments for 41 of 400 readings, the first at 3 s: the sensor"):
         even_samples(T, constant, "a:")
