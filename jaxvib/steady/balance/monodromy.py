@@ -115,8 +115,10 @@ def validate_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | 
     if steps is not None:
         return count(steps, "steps", low=2, each=64.0)
     slowest = float(np.min(np.asarray(speeds), initial=np.inf))
+    # An array, because a Python number would be a constant of the program, which then were compiled for each speed.
+    speed = jnp.asarray(slowest, float_dtype())
     decay, needed_steps = (
-        float(x) for x in _slowest_decay(eqx.tree_at(lambda s: s.drive.speed, at_constant_speed(scene), slowest))
+        float(x) for x in _slowest_decay(eqx.tree_at(lambda s: s.drive.speed, at_constant_speed(scene), speed))
     )
     if needed_steps >= _MAX_STEPS and decay * 2.0 * np.pi / slowest < _MIN_DECAY_EXPONENT:
         problem = (

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from scenes import scene
 
-from jaxvib.steady.balance.monodromy import balanced_motion
+from jaxvib.steady.balance.monodromy import _slowest_decay, balanced_motion, validate_steps
 
 
 def test_balanced_loads_turn_with_the_rotor():
@@ -13,3 +13,11 @@ def test_balanced_loads_turn_with_the_rotor():
     np.testing.assert_allclose(state.angle[0], [0.6, 2.5, 4.5])
     np.testing.assert_array_equal(state.rate[0], [7.0, 7.0, 7.0])
     assert not np.any(state.displacement) and not np.any(state.velocity)
+
+
+def test_one_program_validates_steps_at_all_speeds():
+    s = scene()
+    before = len(_slowest_decay.stored.ready)
+    for speed in (20.0, 21.0, 22.0):
+        assert validate_steps(s, [speed], None) is None
+    assert len(_slowest_decay.stored.ready) - before <= 1
