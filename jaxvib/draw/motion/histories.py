@@ -130,7 +130,7 @@ def time_histories(
     first, last = float(whole[0][0]), float(whole[0][-1])
     title = "the whole run" if first < 0.01 * last else f"the last part of the run, from {first:.4g} s"
     title += "" if whole[0].size < 2 * bins else ": bands between peaks"
-    for axis, text in zip(axes[:2], (title, f"its last {_SHOWN_PERIODS} periods"), strict=True):
+    for axis, text in zip(axes[:2], (title, f"its last {last - float(part[0][0]):.2g} s"), strict=True):
         axis.text(1.0, 1.02, text, transform=axis.transAxes, ha="right", va="bottom", fontsize="small", color="#555555")
     for axis in axes[-2:]:
         axis.set_xlabel("time, s")
