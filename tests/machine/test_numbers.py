@@ -109,6 +109,16 @@ def test_wrong_names_of_numbers_are_refused(name, says):
     assert str(error.value).startswith(f"free.{name} {says}"), str(error.value)
 
 
+def test_arrays_whose_entries_have_names_list_them():
+    with pytest.raises(jv.InputError) as error:
+        find_number(SCREEN, "machine.supports[0].stiffness", "free")
+    entries = "machine.supports[0].stiffness[0], machine.supports[0].stiffness[1]"
+    assert (
+        str(error.value)
+        == f"free.machine.supports[0].stiffness has entries with names of their own; give one of them: {entries}"
+    )
+
+
 def test_values_of_names_have_their_unit_and_range():
     assert read_value("machine.stiffness[1]", "2 N/mm") == 2e3
     assert read_value("drive.speed", "30 rpm") == pytest.approx(np.pi)

@@ -219,6 +219,9 @@ def find_number(scene: Scene, name: str, field: str) -> NamedNumber:
         if entries[0].entry is None or int(index) >= len(entries):
             raise InputError(field, f"does not exist; {array} has {named[array].size} entries, counted from 0")
         return entries[int(index)]
+    if entries := [each for each in named if each.startswith(f"{name}[")]:
+        listed = ", ".join(entries[:4]) + (" ..." if len(entries) > 4 else "")
+        raise InputError(field, f"has entries with names of their own; give one of them: {listed}")
     raise InputError(field, f"{_why_unnamed(scene, name)}; {suggest_name(name, list(named))}")
 
 
@@ -231,9 +234,7 @@ def _why_unnamed(scene: Scene, name: str) -> str:
     value = getattr(owner, last)
     if value is None or np.size(value) == 0:
         return "is not set in this scene"
-    return (
-        "has entries of different units" if _is_continuous(value) else f"is {quoted(value)}, which is not a continuous number"
-    )
+    return f"is {quoted(value)}, which is not a continuous number"
 
 
 def _row_by_row(leaf: Array) -> Array:
