@@ -92,7 +92,7 @@ def test_jams_over_the_drag_have_the_scenes_jams_as_points():
     drag, speed = np.array([1.0, 2.0, 3.0]), np.array([5.0, 6.0, 7.0])
     branch, jams = ("all together", drag, speed, np.array([True, True, False])), (np.array([5.5, 6.5]), np.array([True, False]))
     about = {"label": "drag, N s/m", "at": 1.5, "unit": "rad/s"}
-    axis = drag_diagram([branch], 8.0, jams=jams, within=4.0, **about).axes[0]
+    axis = drag_diagram([branch], 8.0, jams=jams, within=(0.25, 4.0), **about).axes[0]
     assert [line.get_xydata().tolist() for line in axis.lines[:2]] == [[[1.0, 5.0], [2.0, 6.0], [3.0, 7.0]], [[3.0, 7.0]]]
     assert [line.get_linestyle() for line in axis.lines[:2]] == ["-", "--"]
     points = [(xy, face) for xy, face in marks(axis) if xy]
