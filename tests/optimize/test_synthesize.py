@@ -120,7 +120,7 @@ def test_wrong_arguments_raise_clear_errors():
     ):
         with pytest.raises(jv.InputError, match=says):
             synthesize(space, wish, subject_to=subject_to, begin=begin)
-    assert _run(SCENE, None, True)[1].startswith("no quantity of the search has a motion")
+    assert _run(SCENE, None, True)[1].startswith("no quantity of the search belongs to a jam or a working regime")
     assert _run(SCENE, 3, False) == (None, "not requested")
 
 
