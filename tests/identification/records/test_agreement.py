@@ -99,7 +99,7 @@ def test_wrong_number_of_marks_is_seen():
 
 
 def test_speeds_of_different_rotors_are_refused():
-    with pytest.raises(jv.InputError, match=r"and 'tacho' are not the speed of one rotor: their ratio changes by \d+%"):
+    with pytest.raises(jv.InputError, match=r"and 'tacho' are not the speed of one rotor: their ratio changes by \d+ %"):
         run(TACHO, (speed(), 180.0 - SPEED))
 
 
