@@ -199,8 +199,7 @@ def _angle_of_channel(run: MeasuredRun, channel: Channel) -> RotorAngle:
         if change > _MAX_SPEED_CHANGE:
             notes.append(
                 f"{field}: the speed changes by up to {100.0 * change:.0f} % from one pulse to the next, and the angle between "
-                "them is "
-                "uncertain; use more pulses per turn"
+                "them is uncertain; use more pulses per turn"
             )
     grid = spline(np.linspace(time[0], time[-1], 4 * spline.c.shape[0]))[:, 1:]
     sizes = np.sqrt(np.mean(grid**2, axis=0))

@@ -211,6 +211,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         stuck = [] if np.max(np.abs(rotors)) > 1.0 else start_notes(self.scene)
         if not stuck and float(jnp.abs(self.omega)) < STILL_SHARE * float(self.scene.top_speed):
             stuck = [f"the {turning_masses(self.scene)} are almost at rest"]
+        if (creep := creep_text(self.scene, self.window)) and not stuck:
+            stuck = ["the loads creep, see below"]
         state = "settled" if bool(self.settled) else f"not settled: {stuck[0] if stuck else self._unsettled_text()}"
         state = "steady in the mean" if bool(self.status == RunStatus.beating) else state
         state = "balanced" if bool(self.status == RunStatus.creeping) else state
@@ -237,15 +239,13 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
                 *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
-                *([f"  {creep}"] if (creep := creep_text(self.scene, self.window)) else []),
+                *([f"  {creep}"] if creep else []),
                 *([] if unstable else self._pass_through_note()),
                 *self._detachment(),
             ]
         )
 
     def _unsettled_text(self) -> str:
-        if creep_text(self.scene, self.window):
-            return "the loads creep, see below"
         period = beat_period(self.scene, self._stored)
         if period is None:
             return "run longer"

@@ -298,9 +298,8 @@ def _shoot(problem: Problem, x: np.ndarray, linear: np.ndarray, starts: list[np.
             where = np.concatenate([np.arange(p), p + indices, [size, size + 1]])
             columns = weighted_columns(samples, at, at.columns)
             total[np.ix_(where, where)] += columns.T @ columns
-            total[size:, size:] += np.sum(
-                (at.gaps / (_GAP_SIZE * scale)) ** 2
-            )  # the last unknown is the closed share of the gaps
+            # The last unknown is the closed share of the gaps.
+            total[size:, size:] += np.sum((at.gaps / (_GAP_SIZE * scale)) ** 2)
             start_changes.append(at.start_changes)
         prior[:size, :size], gradient[:size] = prior_equations(problem, x, linear)
         cost = float(total[-1, -1]) + known_cost(problem, x, linear)

@@ -164,9 +164,9 @@ def _require_plate(rated: float, frequency: float, ratio: float, synchronous: fl
     if pole_pairs > _MAX_POLE_PAIRS + 0.5:
         problem = f"{speed}, which needs {pole_pairs:.0f} pole pairs; motors have 1 to {_MAX_POLE_PAIRS}"
         raise InputError("drive.rated_speed", f"{problem}; give the speed of the name plate, and the supply's frequency")
-    own = frequency / rated
-    if abs(own - np.round(own)) < 1e-6 * own:
-        problem = f"{speed}, the synchronous speed of {own:.0f} pole pairs, at which a motor has no torque"
+    pairs_at_rated_speed = frequency / rated
+    if abs(pairs_at_rated_speed - np.round(pairs_at_rated_speed)) < 1e-6 * pairs_at_rated_speed:
+        problem = f"{speed}, the synchronous speed of {pairs_at_rated_speed:.0f} pole pairs, at which a motor has no torque"
         raise InputError("drive.rated_speed", f"{problem}; give the speed at rated load, some percent below it, as '1440 rpm'")
     if not breakdown_slip < 1.0:
         slip = f"{100.0 * (1.0 - rated / synchronous):.3g} % below the synchronous speed of {speed_text(synchronous)}"

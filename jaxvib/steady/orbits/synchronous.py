@@ -114,8 +114,8 @@ class SynchronousOrbit(PathsOfPoints, Result):
       multiplier, that of a shift in time, whose exact value is 1. It is NaN if an ideal drive turns an unbalance, because a
       shifted motion is then not a solution
     - `residual` of the equations of motion, relative; `error`: estimated relative error of speed and displacements, and error
-      of angles in rad, due to the limited number of harmonics. A motion whose error is above 1 and that
-      is not at a fold is `not_converged`
+      of angles in rad, due to the limited number of harmonics. A motion that is not at a fold and whose error is above 1 is
+      `not_converged`
     - `deviation_harmonics` (bodies, K), rad: alpha_k + psi_k of each load or rotor, `displacement_harmonics` (nd, K), m (rad
       for rotations), and `force_harmonics` (directions, K), N, of the force on the foundation; orders 0, 1, 2, ...
     - `scene`
