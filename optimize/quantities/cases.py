@@ -274,7 +274,7 @@ def quantile(
 
     >>> from optimize import foundation_force, quantile
     >>> quantile(foundation_force(mode=3), 0.95, {"machine.stiffness": 0.05}).words
-    '95% quantile of foundation force, mode 3'
+    '95 % quantile of foundation force, mode 3'
     """
     if isinstance(level, bool) or not isinstance(level, (int, float)) or not 0.0 < level < 1.0 or math.isnan(level):
         raise InputError("level", f"is {quoted(level)}; it must be greater than 0 and less than 1")

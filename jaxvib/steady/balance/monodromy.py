@@ -116,7 +116,7 @@ def validate_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | 
         return count(steps, "steps", low=2, each=64.0)
     slowest = float(np.min(np.asarray(speeds), initial=np.inf))
     # An array, because a Python number would be a constant of the program, which would then be compiled for each speed.
-    speed = jnp.asarray(slowest, float_dtype())
+    speed = np.asarray(slowest, float_dtype())
     decay, needed_steps = (
         float(x) for x in _slowest_decay(eqx.tree_at(lambda s: s.drive.speed, at_constant_speed(scene), speed))
     )
