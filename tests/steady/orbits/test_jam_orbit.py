@@ -72,7 +72,8 @@ def test_summary_of_a_branch_leaves_out_points_without_a_jam():
         omega, stable = np.array([np.nan, 2.0, 3.0, np.nan]), np.array([False, True, True, False])
         scene = published().scene()
 
-    assert branch_summary(Branch, [], "here").startswith(f"4 points from {speed_text(np.array([2.0, 3.0]), 6, ' to ')}, 50.0 % ")
+    speeds = speed_text(np.array([2.0, 3.0]), 6, " to ")
+    assert branch_summary(Branch, [], "here").startswith(f"4 points from {speeds}, 50.0 % ")
 
 
 def test_swings_are_half_of_what_lies_between_the_extremes():
