@@ -36,7 +36,8 @@ from optimize.quantities.quantity import Demand, Pair, Quantity, Tier, walk
 from optimize.result import Limit, Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
 from optimize.search.find import Options, Searcher, SearchResult, choose, require_searcher
 from optimize.search.problem import Problem, evaluate_quantities, problem_of, scenes_of
-from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours, numbers_to_free
+from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours
+from optimize.search.suggestions import lines_to_free
 from optimize.space import DesignSpace
 
 _CONVERGED_DECREASE = 1e-6
@@ -116,7 +117,8 @@ def synthesize(
 
     - "no_feasible_start": in every random design at least one of the needed quantities (the objective, held quantities,
       quantities of demands) does not exist; the message names the quantities that do not exist
-    - "contradictory": no design meets all demands; the message states which demands are not met, and by how much
+    - "contradictory": no design meets all demands; the message states which demands are not met, and by how much, and has lines of a
+      design file that free further parameters with large effects on them
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -192,13 +194,13 @@ def _unmet(limits: Sequence[Limit], space: DesignSpace, scene: Scene, quantities
     """Return the error for a best design that does not meet all limits, the first of which are those of `quantities`."""
     unmet = "; ".join(f"{x.what}: {x.shortfall()}" for x in limits if x.violation)
     hint = f" (not met by the nearest machine: {unmet}); widen the bounds or relax a demand"
-    effects = [
-        f"on {quantity.words}: {numbers}"
+    wanted = [
+        (quantity, limit.limit)
         for limit, quantity in zip(limits, quantities, strict=False)
         if _MIN_SHOWN_SHORTFALL < limit.violation < math.inf
-        and (numbers := numbers_to_free(space, scene, quantity, limit.limit))
     ]
-    hint += f", or free other parameters (effects {'; '.join(effects)})" if effects else ""
+    if lines := lines_to_free(space, scene, wanted):
+        hint += "\n".join([", or free other parameters by lines of the design file, for example:", *lines])
     return failure(SynthesisStatus.contradictory, hint)
 
 

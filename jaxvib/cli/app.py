@@ -444,7 +444,7 @@ def _remedy_hint(arguments: list[str], error: InputError) -> str:
 
 def _report_error(wants_json: bool, code: int, error: dict[str, str | None]) -> int:
     """Print an error on stderr, with --json also on stdout, and return the exit `code`."""
-    note(legible(f"jaxvib: {error['message']}"))
+    note("\n".join(map(legible, f"jaxvib: {error['message']}".splitlines())))
     if wants_json:
         click.echo(json.dumps({"error": error}, indent=2))
     return code

@@ -66,14 +66,19 @@ def write_file(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8", errors="replace")
 
 
+_KEPT_LINES = '┏┃┡│└#["'
+"""First characters of lines of tables and of design files, which are not broken."""
+
+
 def _wrapped(text: str) -> str:
-    """Return a text whose lines fit on the terminal and break between words. Continued lines are indented; tables are kept."""
+    """Return a text whose lines fit on the terminal and break between words. Continued lines are indented; tables and lines of
+    files are kept."""
     columns = shutil.get_terminal_size().columns
     folded = []
     for line in text.splitlines():
         indent = line[: len(line) - len(line.lstrip())] + "    "
         options: dict[str, Any] = {"subsequent_indent": indent, "break_long_words": False, "break_on_hyphens": False}
-        folded.append(line if len(line) <= columns or line[:1] in "┏┃┡│└" else textwrap.fill(line, columns, **options))
+        folded.append(line if len(line) <= columns or line[:1] in _KEPT_LINES else textwrap.fill(line, columns, **options))
     return "\n".join(folded)
 
 

@@ -4,25 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax
 import numpy as np
 
 from jaxvib.display import shown_unit
-from jaxvib.machine.numbers.named import numbers_of, put_numbers
-from jaxvib.machine.scene import Scene
-from optimize.quantities.quantity import Demand, Quantity
+from optimize.quantities.quantity import Demand
 from optimize.result import Influence, Limit, Machine
 from optimize.search.find import SearchResult
 from optimize.search.polish import ACTIVE_DISTANCE, MAX_VIOLATION
-from optimize.search.problem import Problem, evaluate_quantities
-from optimize.space import DesignSpace
+from optimize.search.problem import Problem
 
 _STEP = 0.01
 """Relative change for which effects on the objective are stated: of a free parameter (`Influence`), or of a limit (`Limit`)."""
-
-
-_MIN_SHOWN_EFFECT, _MAX_SHOWN_NUMBERS = 0.05, 3
-"""Smallest effect, percent, of a change of a fixed parameter by 1 % that is shown, and largest number of such parameters."""
 
 _EDGE = 2.0 * ACTIVE_DISTANCE
 """Distance from a bound, relative to the range, within which a free parameter counts as at its bound if the multiplier of the
@@ -97,24 +89,6 @@ def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]
         return ()
     change = 100.0 * (values[1:] - values[0]) / abs(values[0])
     return tuple(Influence(word, float(change[k]), float(change[d + k])) for k, (word, _) in enumerate(problem.space.words()))
-
-
-def numbers_to_free(space: DesignSpace, scene: Scene, quantity: Quantity, wanted: float) -> str:
-    """Return a text with the fixed parameters of a scene that change a quantity most, and their effects; "" without such ones.
-
-    **Arguments**: `wanted`: value of the quantity that a design needs; the text states in which direction each parameter must
-    change.
-    """
-    changed = (*space.free, *(each.target for each in (*space.columns, *space.ties)))
-    free = set().union(*(each.entries for each in changed))
-    fixed = [each for each in numbers_of(scene).values() if not each.entries & free and each.path[-1] != "g"]
-    scenes = [scene, *(put_numbers(scene, (each,), (1.0 + _STEP) * each.read(scene)) for each in fixed)]
-    now, *values = evaluate_quantities((quantity,), jax.tree.map(lambda *x: np.stack(x), *scenes))[:, 0]
-    effects = [(100.0 * (value - now) / abs(now), each.name) for value, each in zip(values, fixed, strict=True)]
-    large = sorted((each for each in effects if abs(each[0]) > _MIN_SHOWN_EFFECT), key=lambda each: -abs(each[0]))
-    up = np.sign(wanted - now)
-    shown = [f"{name} (1 % {'more' if x * up > 0.0 else 'less'}: {up * abs(x):+.2g} %)" for x, name in large]
-    return ", ".join(shown[:_MAX_SHOWN_NUMBERS])
 
 
 def machines_of(problem: Problem, result: SearchResult, same: float) -> tuple[Machine, ...]:

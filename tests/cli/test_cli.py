@@ -13,6 +13,7 @@ from scenes import scene
 
 import jaxvib as jv
 import jaxvib.cli
+from jaxvib.cli.app import _report_error
 from jaxvib.cli.output import Output, _wrapped
 from jaxvib.machine.files import SCREENS, TEMPLATES
 from jaxvib.machine.validation import implausible_numbers
@@ -487,6 +488,13 @@ def test_sentences_on_a_terminal_break_between_words(monkeypatch):
         and second == "      573.172 rpm) goes on"
         and wide == "┃ a wide table ┃" * 5
     )
+
+
+def test_lines_of_a_design_file_in_an_error_are_kept(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    line = '"machine.supports[0].stiffness[1]" = ["63 N/mm", "252 N/mm"]'
+    _report_error(False, 1, {"message": f"contradictory: free other parameters:\n[free]\n{line}"})
+    assert capsys.readouterr().err.splitlines()[-2:] == ["[free]", line] == _wrapped(f"[free]\n{line}").splitlines()
 
 
 @pytest.mark.parametrize("command", [("simulate", "--until", "1s"), ("settle",)])

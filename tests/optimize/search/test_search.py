@@ -75,7 +75,7 @@ def test_contradictory_demands_are_named_with_their_excess():
         found(space, NEAREST, subject_to=demands)
 
 
-@pytest.mark.parametrize(("limit", "advice"), [("150 N/mm", "1 % less: +1.8 %"), ("5 N/mm", "1 % more: -1.8 %")])
+@pytest.mark.parametrize(("limit", "advice"), [("150 N/mm", "1 % less: share +1.8 %"), ("5 N/mm", "1 % more: share -1.8 %")])
 def test_contradictory_demands_name_parameters_that_would_help(limit, advice):
     """The quantity is k1 / m^1.8, with the mass relative to that of the scene."""
     mass = SCENE.machine.mass[0]
@@ -83,7 +83,7 @@ def test_contradictory_demands_name_parameters_that_would_help(limit, advice):
     demand = quantity > limit if limit == "150 N/mm" else quantity < limit
     with pytest.raises(jv.ComputationError) as error:
         found(DesignSpace(SCENE, FREE), NEAREST, subject_to=[demand])
-    assert str(error.value).endswith(f"or free other parameters (effects on share: machine.mass ({advice}))")
+    assert str(error.value).splitlines()[1:] == ["[free]", f"# {advice}", '"machine.mass[0]" = ["60 kg", "240 kg"]']
 
 
 def both_ways(name, function):
