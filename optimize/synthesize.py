@@ -117,8 +117,8 @@ def synthesize(
 
     - "no_feasible_start": in every random design at least one of the needed quantities (the objective, held quantities,
       quantities of demands) does not exist; the message names the quantities that do not exist
-    - "contradictory": no design meets all demands; the message states which demands are not met, and by how much, and has lines of a
-      design file that free further parameters with large effects on them
+    - "contradictory": no design meets all demands; the message states which demands are not met, and by how much, and has lines
+      of a design file that free further parameters with large effects on them
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
