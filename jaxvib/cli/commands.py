@@ -110,4 +110,4 @@ def _is_long(scene: jv.Scene, until: str) -> bool:
     with a progress bar cannot be stored."""
     from jaxvib.units import number
 
-    return bool(number(until, "s", "until") * scene.drive.speed > 1e6)
+    return bool(number(until, "s", "until") * scene.top_speed > 1e6)

@@ -22,8 +22,8 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
     """Write all quantities of a result along an axis into a CSV file, a row for each point of the axis.
 
     The header of a column consists of the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have
-    9 digits. Complex numbers have one column for the real part and one for the imaginary part. A point at which two pieces of a
-    curve meet has one row.
+    9 digits. Complex numbers have one column for the real part and one for the imaginary part. A point of a curve that the
+    result has twice, because two pieces meet there, has one row.
 
     **Arguments**
 
@@ -45,7 +45,7 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
     ['rotor_speed (rad/s)', 'speed 1 (rad/s)', 'speed 2 (rad/s)', 'decay 1 (1/s)']
     """
     table = table_along(result, axis, display=display)
-    return write_table(table, path, decimal_comma=decimal_comma, unique=axis == "point")
+    return write_table(table, path, decimal_comma=decimal_comma, unique=axis in ("point", "speed"))
 
 
 def write_table(

@@ -101,6 +101,14 @@ def test_equal_entries_have_separate_rows(tmp_path):
     assert table(numbers, "load", tmp_path / "equal.csv")["version"].tolist() == ["a", "a", "a"]
 
 
+def test_each_speed_of_a_response_has_one_row(tmp_path):
+    machine = jv.one_mass(mass=200.0, stiffness=8e5, damping=600.0)
+    motor = jv.DCMotor(157.0, stall_torque=12.0, inertia=0.1)
+    curve = jv.response(jv.Scene(machine, exciters=[jv.Exciter(drive=motor, unbalance=0.2)]), points=40)
+    speeds = table(curve, "speed", tmp_path / "curve.csv")["speed (rad/s)"].astype(float)
+    assert np.all(np.diff(speeds) > 0.0) and speeds.size > 30
+
+
 def test_decimal_commas_are_in_numbers_only(tmp_path):
     columns = table(
         Readings(np.array([1.5 + 0j]), np.array([0.5]), np.array(["v1.2"])), "load", tmp_path / "comma.csv", decimal_comma=True

@@ -91,6 +91,10 @@ def _modes_of(run: jv.Run) -> list[int] | None:
     return [mode]
 
 
+_SAMPLES = 4000
+"""Number of saved states of an averaged run: enough for a figure in which fast beats are bands."""
+
+
 @command("envelope")
 @click.option("--until", required=True, help="End time, such as 20s or '10 min'.")
 @_START
@@ -106,7 +110,7 @@ def envelope(
 ) -> None:
     """Integrate the averaged equations of SCENE, with steps of many turns, for long run-ups; --out saves envelope.npz."""
     loaded = loaded_scene(scene, without)
-    run = jv.envelope(loaded, stepsize_controller=chosen_steps(tolerance), **_with_start(options))
+    run = jv.envelope(loaded, stepsize_controller=chosen_steps(tolerance), samples=_SAMPLES, **_with_start(options))
     output.figure("envelope.png", run.plot)
     output.save_result("envelope.npz", run)
     output.csv(csv, run, "trajectory_time")
