@@ -216,8 +216,9 @@ class Synthesis(Result):
         if self.verified is None:
             return [f"not verified: {self.unverified}"]
         return [
-            "verified: the full equations keep this motion if they start near it; this does not show that",
-            "a start from rest reaches it: simulate the found machine with start rest and spin_up",
+            "verified: the full equations keep this motion if they start near it;",
+            "this does not show that a start from rest reaches it:",
+            "simulate the found machine with start rest and spin_up",
         ]
 
     def counts_text(self) -> str:

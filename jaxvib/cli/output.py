@@ -262,7 +262,7 @@ class Output:
             command=shlex.join(["jaxvib", *arguments]),
             document=document,
             units=units_of_document(document, result),
-            text=text(),
+            text=click.unstyle(text()),  # colours and bold print of the terminal
             scene=scene,
             sketch=None if scene is None or draw_sketch is None else draw_sketch(scene),
             figures=self.figures,

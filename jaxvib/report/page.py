@@ -19,6 +19,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Figure
 from jaxvib.errors import written
 from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.regime import Regime
 from jaxvib.report.tables import COMPLEX, Units, accuracy_table, escaped, in_display_units, parameter_tables, result_tables
 from jaxvib.results.fields import Plain, as_dict
 from jaxvib.results.result import Result
@@ -56,7 +57,8 @@ class Report:
             parts.append(f'<p class="command"><code>{escaped(self.command)}</code></p>')
         coordinate_units = () if self.scene is None else self.scene.machine.structure().units
         document, units = in_display_units(self.document, self.units, coordinate_units)
-        numbers = [_section("Accuracy", accuracy_table(document, units)), _section("Numbers", result_tables(document, units))]
+        tables = result_tables(document, units, has_text=bool(self.text))
+        numbers = [_section("Accuracy", accuracy_table(document, units)), _section("Numbers", tables)]
         if self.text:
             parts.append(_section("Results", f"<pre>{escaped(self.text)}</pre>"))
         parts.append(_section("Figures", "".join(_figure(name, figure) for name, figure in self.figures)))
@@ -120,7 +122,10 @@ def units_of_document(document: Mapping[str, Plain], result: eqx.Module | None) 
     and of numbers that commands add."""
     units = {} if result is None else units_of(result)
     units |= {"natural_frequencies": "rad/s", "rotor_speed": "rad/s", "largest_displacement": "m or rad", "largest_force": "N"}
-    units |= {"growth_of_free_loads": "1/s", "drag": "N s/m"}
+    units |= {"growth_of_free_loads": "1/s", "drag": "N s/m", "exact_up_to": "rad/s", "exact_balancing": "rad/s"}
+    units.setdefault("phases", "rad")
+    if "regime" in document:
+        units = {each.name: each.metadata.get("unit", "") for each in dataclasses.fields(Regime)} | units
     rows = [row for value in document.values() if isinstance(value, list) for row in value if isinstance(row, Mapping)]
     if any("measures" in each for each in (document, *rows)):
         of_measures = {each.name: each.metadata.get("unit", "") for each in dataclasses.fields(VibrationMeasures)}

@@ -29,6 +29,10 @@ _HIDDEN_FIELDS = ("scene", "toml", "before", "after", "verified")
 """Names of the fields that the page shows in another way. The last three are machines of a search, without units; its table has
 them as columns, with the unit of each row."""
 
+_FIELDS_OF_TEXT = ("tolerances", "table", "limits", "influences", "machines", "drawn", "same", "kkt")
+"""Names of the fields that the text of a result shows with the unit of each row; the last three are numbers of a search about
+which only a programmer asks."""
+
 _MAX_INLINE_ENTRIES = 12
 """Maximum number of entries of a list that fits into one cell."""
 
@@ -118,15 +122,22 @@ def _map_numbers(
 def accuracy_table(document: Mapping[str, Plain], units: Units) -> str:
     """Return a table of the fields of a document about accuracy and cost: status, error, steps, seconds."""
     return _pair_table(
-        [(name, document[name]) for name in ACCURACY_FIELDS if name in document and _fits_in_cell(document[name])], units
+        [(name, document[name]) for name in ACCURACY_FIELDS if document.get(name, "") != "" and _fits_in_cell(document[name])],
+        units,
     )
 
 
-def result_tables(document: Mapping[str, Plain], units: Units, inner: bool = False) -> str:
-    """Return a document as tables: one table for all single values, and a table with a heading for each list or mapping."""
+def result_tables(document: Mapping[str, Plain], units: Units, inner: bool = False, *, has_text: bool = False) -> str:
+    """Return a document as tables: one table for all single values, and a table with a heading for each list or mapping.
+
+    `has_text`: True if the page also has the text of the result; fields that the text shows better are left out.
+    """
     single, below = [], []
+    hidden = (*_HIDDEN_FIELDS, *_FIELDS_OF_TEXT) if has_text else _HIDDEN_FIELDS
     for name, value in document.items():
-        if name in _HIDDEN_FIELDS or (not inner and name in ACCURACY_FIELDS and _fits_in_cell(value)):
+        if name == "units" and "coordinates" in document:  # the SI units; the values have their display units
+            continue
+        if name in hidden or (not inner and name in ACCURACY_FIELDS and _fits_in_cell(value)):
             continue
         if _fits_in_cell(value):
             single.append((name, value))

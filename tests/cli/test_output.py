@@ -50,6 +50,16 @@ def test_a_report_has_the_requested_title(tmp_path, title, heading):
     assert "<code>jaxvib simulate</code>" in page
 
 
+def test_a_report_has_no_control_characters(tmp_path, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm-256color")
+    text = table("title", ["speed"], [["1"]])
+    with click.Context(click.Command("simulate")):
+        Output(True, None, tmp_path / "report.html").done({"a": 1.0}, lambda: text, "simulate")
+    page = (tmp_path / "report.html").read_text()
+    assert "\x1b" in text and "\x1b" not in page and "┃ speed ┃" in page
+
+
 @pytest.mark.parametrize("is_terminal", [True, False])
 def test_notes_fit_on_a_terminal(capsys, monkeypatch, is_terminal):
     monkeypatch.setattr("sys.stderr.isatty", lambda: is_terminal, raising=False)

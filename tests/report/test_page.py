@@ -134,6 +134,20 @@ def test_values_of_a_search_are_shown_with_their_units_only():
     assert page.count("104.4") == page.count("104.5") == page.count("rad/s") == 1 and "omega" not in page
 
 
+def test_a_page_with_a_text_has_no_numbers_without_units():
+    row = {"words": "speed", "unit": "rad/s", "design": 104.4}
+    document = {"tolerances": [row], "table": [row], "kkt": 1e-11, "drawn": 768, "coordinates": ["y1"], "units": ["m"]}
+    page = Report("", document | {"unverified": ""}, {}, text="speed 997 rpm").html()
+    assert "speed 997 rpm" in page and "y1" in page
+    assert not re.search("104.4|rad/s|kkt|768|unverified|<td>m</td>", page)
+
+
+def test_regimes_phases_and_exact_ranges_have_units():
+    document = {"regime": {"resonance_speed": 61.2, "ripple": 2.2}, "phases": [0.0, 1.0], "exact_balancing": [[24.8, 45.8]]}
+    page = Report("", document, units_of_document(document, None)).html()
+    assert all(shown in page for shown in ("584.417", "21.0085", "57.2958", "exact balancing, rpm"))
+
+
 @pytest.mark.parametrize("document", [{"measures": {"stroke": [0.002]}}, {"regimes": [{"measures": {"stroke": [0.002]}}]}])
 def test_measures_in_documents_of_commands_have_units(document):
     page = Report("", {**document, "natural_frequencies": [10.0]}, units_of_document(document, None)).html()
