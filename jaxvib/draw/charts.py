@@ -26,6 +26,7 @@ from jaxvib.draw.style import (
     numbered,
     panels,
     resonance_lines,
+    tilt_unit,
 )
 from jaxvib.errors import InputError, quoted
 
@@ -60,7 +61,7 @@ def branch_diagram(
 
     - `rotor_speed` (n,), `omega` (n,): rotor speed and load speed, rad/s, drawn in `unit`
     - `stable` (n,): True if stable; `stability_text`: how stability is determined, written below the figure
-    - `amplitude` (n, nd): amplitudes, m (drawn in mm or µm) or rad (drawn in mrad)
+    - `amplitude` (n, nd): amplitudes, m (drawn in mm or µm) or rad (drawn in mrad or µrad)
     - `units` (nd,): "m" or "rad" for each coordinate; None: all m
     - `force` (n,): foundation force, N
     - `resonances`: resonances, rad/s, drawn as horizontal lines
@@ -165,10 +166,11 @@ def scaled_amplitudes(
     >>> scaled_amplitudes(np.array([[0.01, 0.02]]), ("y1", "tilt"), ("m", "rad"))
     (['mm', 'mrad'], [('y1', array([10.])), ('tilt', array([20.]))])
     """
-    tilts = [units is not None and each == "rad" for each in units or names]
-    length, factor = length_unit(amplitude[:, ~np.asarray(tilts)])
-    scaled = [(name, (1e3 if tilts[k] else factor) * amplitude[:, k]) for k, name in enumerate(names)]
-    return ["mrad" if tilt else length for tilt in tilts], scaled
+    tilts = np.asarray([units is not None and each == "rad" for each in units or names])
+    length, tilt = length_unit(amplitude[:, ~tilts]), tilt_unit(amplitude[:, tilts])
+    kinds = [tilt if each else length for each in tilts]
+    scaled = [(name, factor * amplitude[:, k]) for k, (name, (_, factor)) in enumerate(zip(names, kinds, strict=True))]
+    return [unit for unit, _ in kinds], scaled
 
 
 def log_limits(

@@ -190,6 +190,18 @@ def length_unit(*values: np.ndarray) -> tuple[str, float]:
     return unit.replace("um", "µm"), factor
 
 
+def tilt_unit(values: np.ndarray) -> tuple[str, float]:
+    """Return the unit in which the axis of a figure shows the tilts `values`, given in rad, and the factor from rad to it.
+
+    >>> tilt_unit(np.array([0.02])), tilt_unit(np.array([3e-7]))
+    (('mrad', 1000.0), ('µrad', 1000000.0))
+    """
+    if shown_unit("rad", 1.0)[0] == "rad":  # SI units
+        return "rad", 1.0
+    size = float(np.max(np.abs(values), initial=0.0, where=np.isfinite(values)))
+    return ("µrad", 1e6) if 0.0 < size < 1e-6 else ("mrad", 1e3)
+
+
 def legend_above(axis: Axes, columns: int = 4, **options: Any) -> None:
     """Draw the legend of a panel above it, where it covers no data; draw nothing if no series has a label."""
     _, names = axis.get_legend_handles_labels()

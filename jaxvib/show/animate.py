@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
 from jaxvib.boundary import validated
+from jaxvib.draw.charts import scaled_amplitudes
 from jaxvib.draw.machine.animation import Animation
 from jaxvib.draw.machine.parts import Part, draw_part
 from jaxvib.draw.motion.histories import period_of
@@ -233,11 +234,11 @@ def _plot_histories(axes: tuple[Axes, Axes], scene: Scene, history: SampledMotio
     """Plot displacements and force over time, and return the time cursor of each plot."""
     upper, lower = axes
     structure = scene.machine.structure()
-    for k, name in enumerate(structure.coordinates):
-        label = name if structure.units[k] == "m" else f"{name} (mrad)"
-        look = {**series_look(k), "lw": 1.2}
-        upper.plot(history.time, 1e3 * history.displacement[:, k], label=label, **look)
-    upper.set_ylabel("mm, mrad" if "rad" in structure.units else "mm")
+    units, scaled = scaled_amplitudes(history.displacement, structure.coordinates, structure.units)
+    for k, ((name, values), unit) in enumerate(zip(scaled, units, strict=True)):
+        label = name if len(set(units)) == 1 else f"{name} ({unit})"
+        upper.plot(history.time, values, label=label, **{**series_look(k), "lw": 1.2})
+    upper.set_ylabel(", ".join(dict.fromkeys(units)))
     legend_above(upper, 6)
     for k, name in enumerate(structure.foundation_directions):
         look = {"color": "black" if k else COLORS[1], "ls": STROKES[k], "lw": 1.2}

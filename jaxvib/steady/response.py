@@ -227,7 +227,7 @@ class Response(AbstractResponse, Result):
             np.asarray(self.resonances),
             names=structure.coordinates,
             units=structure.units,
-            has_motor=not any(exciter.drive.ideal for exciter in self.scene.exciters),
+            motors=0 if any(exciter.drive.ideal for exciter in self.scene.exciters) else len(self.scene.exciters),
             unit=unit,
             show=show,
             ax=ax,

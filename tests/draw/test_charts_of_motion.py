@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import jaxvib as jv
 from jaxvib.draw.capture import torus_paths
 from jaxvib.draw.motion.histories import time_histories
 from jaxvib.draw.motion.regimes import DrawnRegime, TorqueCurves, regimes_chart
@@ -71,7 +72,7 @@ FOLDS = {"speed": np.array([15.0]), "torque": np.array([2.5])}
 
 
 def response(**options):
-    about = {"names": ["y", "tilt"], "units": ["m", "rad"], "unit": "rad/s", "has_motor": True}
+    about = {"names": ["y", "tilt"], "units": ["m", "rad"], "unit": "rad/s", "motors": 1}
     return response_chart(CURVE, POINTS, FOLDS, np.array([0.0, 9.0, 21.0]), **{**about, **options}).axes
 
 
@@ -97,7 +98,13 @@ def test_a_response_has_its_amplitudes_phases_and_force():
 )
 def test_the_torque_of_the_motor_bounds_the_axis(motor, top):
     curve = CURVE if motor is None else CURVE | {"motor_torque": np.asarray(motor)}
-    about = {"names": ["y"], "units": ["m"], "unit": "rad/s", "has_motor": motor is not None, "show": ["torque"]}
+    about = {
+        "names": ["y", "tilt"],
+        "units": ["m", "rad"],
+        "unit": "rad/s",
+        "motors": int(motor is not None),
+        "show": ["torque"],
+    }
     (axis,) = response_chart(curve, POINTS, FOLDS, np.zeros(0), **about).axes
     lines = named(axis)
     assert axis.get_ylim() == pytest.approx((-0.03 * top, 1.08 * top))
@@ -106,6 +113,28 @@ def test_the_torque_of_the_motor_bounds_the_axis(motor, top):
     if motor is not None:
         assert lines["fold: the speed jumps"] == [[15.0, 2.5]]
         assert lines["of the motor"] == np.stack([SPEED, motor], axis=1).tolist()
+
+
+def test_the_curve_of_several_motors_is_that_of_all():
+    (axis,) = response(motors=2, show=["torque"])
+    assert named(axis)["of all motors"] == [[0.0, 4.0], [10.0, 3.0], [20.0, 0.0]]
+
+
+def test_the_legend_of_the_torque_is_within_the_figure():
+    torque = response()[-1]
+    torque.figure.draw_without_rendering()
+    assert torque.get_legend().get_window_extent().x1 <= torque.figure.bbox.x1
+    assert torque.get_window_extent().width > 0.8 * torque.figure.bbox.width
+
+
+def test_amplitudes_of_a_response_are_in_si_units():
+    jv.display_units(si=True)
+    try:
+        lengths, tilts, *_ = response()
+    finally:
+        jv.display_units()
+    assert [axis.get_ylabel() for axis in (lengths, tilts)] == ["amplitude, m", "amplitude, rad"]
+    assert named(tilts)["tilt"] == [[0.0, 1e-2], [10.0, 3e-2], [20.0, 2e-2]]
 
 
 def regime(stable, torque, masses=(0, 1)):

@@ -8,7 +8,16 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
-from jaxvib.draw.style import color_of, legend_above, length_unit, load_names, panels, resonance_lines, series_look
+from jaxvib.draw.style import (
+    color_of,
+    legend_above,
+    length_unit,
+    load_names,
+    panels,
+    resonance_lines,
+    series_look,
+    tilt_unit,
+)
 
 _BINS = 300
 """Maximum number of intervals of a run. The run is drawn as a band between the minimum and the maximum of each interval."""
@@ -168,9 +177,8 @@ def _draw_coordinates(
 def _kinds(values: np.ndarray, units: Sequence[str], length: str, tilt: str) -> list[tuple[str, str, float]]:
     """Return the unit, the label and the factor of each kind of coordinates among signals (nt, nd): lengths and tilts."""
     unit, factor = length_unit(values[:, np.asarray(units) == "m"])
-    is_small = np.max(np.abs(values[:, np.asarray(units) == "rad"]), initial=0.0) < 1e-6
-    tilt_unit, tilt_factor = ("µrad", 1e6) if is_small else ("mrad", 1e3)
-    kinds = (("m", f"{length}, {unit}", factor), ("rad", f"{tilt}, {tilt_unit}", tilt_factor))
+    angle, angle_factor = tilt_unit(values[:, np.asarray(units) == "rad"])
+    kinds = (("m", f"{length}, {unit}", factor), ("rad", f"{tilt}, {angle}", angle_factor))
     return [kind for kind in kinds if kind[0] in units]
 
 

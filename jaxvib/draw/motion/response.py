@@ -9,7 +9,18 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, STROKES, Look, legend_above, log_ticks, panels, resonance_lines, series_look
+from jaxvib.draw.style import (
+    COLORS,
+    STROKES,
+    Look,
+    legend_above,
+    length_unit,
+    log_ticks,
+    panels,
+    resonance_lines,
+    series_look,
+    tilt_unit,
+)
 from jaxvib.errors import InputError, quoted
 
 Arrays: TypeAlias = Mapping[str, np.ndarray]
@@ -29,7 +40,7 @@ def response_chart(
     *,
     names: Sequence[str],
     units: Sequence[str],
-    has_motor: bool,
+    motors: int,
     unit: SpeedUnit | None = None,
     show: Sequence[str] = PARTS,
     ax: Onto = None,
@@ -43,8 +54,8 @@ def response_chart(
     - `points`: the same arrays for the operating points, and the Boolean array `stable`
     - `folds`: `speed` and `torque` of the folds
     - `resonances` (k,), rad/s, drawn as dotted lines
-    - `names` and `units` (nd,) of the coordinates; lengths are drawn in mm, angles in mrad
-    - `has_motor`: True to draw the curve of the motor
+    - `names` and `units` (nd,) of the coordinates; lengths are drawn in mm or µm, angles in mrad or µrad
+    - `motors`: number of motors, whose torques are added in one curve; 0 for an ideal drive, which has no such curve
     - `unit` of the speeds; `show`: names of panels; `ax`: axes to draw onto
 
     **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for an unknown panel.
@@ -56,7 +67,9 @@ def response_chart(
     last = float(np.max(curve["speed"]))
     resonances = scale * resonances
     resonances = resonances[(resonances > 0.0) & (resonances <= last)]
-    kinds = [kind for kind in ("m", "rad") if kind in units]
+    amplitude = curve["amplitude"]
+    unit_of = {"m": length_unit, "rad": tilt_unit}
+    kinds = {kind: unit_of[kind](amplitude[:, np.asarray(units) == kind]) for kind in ("m", "rad") if kind in units}
     drawn = [(name, kind) for name in show for kind in (kinds if name == "amplitude" else ("",))]
     figure, axes = panels(len(drawn), size=(7.2, 2.5), share_x=True, ax=ax)
     for axis, (name, kind) in zip(axes, drawn, strict=True):
@@ -70,18 +83,19 @@ def response_chart(
                     angle = np.rad2deg(np.unwrap(np.where(np.isfinite(values), values, 0.0)))
                     axis.plot(curve["speed"], angle, **look)
                 else:
-                    _line(axis, curve, points, 1e3 * values, 1e3 * points[name][:, number], look)
-            axis.set_ylabel(f"{name}, { ({'m': 'mm', 'rad': 'mrad', '': 'deg'}[kind]) }")
+                    factor = kinds[kind][1]
+                    _line(axis, curve, points, factor * values, factor * points[name][:, number], look)
+            axis.set_ylabel(f"{name}, {kinds[kind][0] if kind else 'deg'}")
         elif name == "force":
             look = {"color": COLORS[0], "label": "force on the foundation"}
             _line(axis, curve, points, curve["foundation_force"], points["foundation_force"], look)
             axis.set_ylabel("force, N")
         else:
-            _torque(axis, curve, points, folds, scale, has_motor=has_motor)
+            _torque(axis, curve, points, folds, scale, motors)
             axis.set_ylabel("torque, N m")
         if name in ("amplitude", "force"):
             _logarithmic(axis)
-        legend_above(axis)
+        legend_above(axis, columns=2 if name == "torque" else 4)  # four long names in one row are wider than the panel
     axes[-1].set(xlabel=f"speed of the exciter, {unit}", xlim=(0.0, last))
     return figure if ax is None else ax
 
@@ -93,8 +107,8 @@ def _line(axis: Axes, curve: Arrays, points: Arrays, line: np.ndarray, at_points
         axis.plot([x], [y], "o", ms=5.0, mfc=look["color"] if stable else "white", mec=look["color"], zorder=4)
 
 
-def _torque(axis: Axes, curve: Arrays, points: Arrays, folds: Arrays, scale: float, *, has_motor: bool) -> None:
-    """Draw the torque that the vibration needs, the torque of the motor, the operating points and the folds, whose speeds are
+def _torque(axis: Axes, curve: Arrays, points: Arrays, folds: Arrays, scale: float, motors: int) -> None:
+    """Draw the torque that the vibration needs, the torque of the motors, the operating points and the folds, whose speeds are
     drawn times `scale`."""
     look = {"color": COLORS[0], "label": "needed by the vibration"}
     _line(axis, curve, points, curve["torque"], points["torque"], look)
@@ -103,9 +117,10 @@ def _torque(axis: Axes, curve: Arrays, points: Arrays, folds: Arrays, scale: flo
         axis.plot([], [], "o", ms=5.0, color=COLORS[0], label=label)
     finite = curve["torque"][np.isfinite(curve["torque"])]
     top = float(np.max(finite, initial=0.0))
-    if has_motor:
+    if motors:
         motor = curve["motor_torque"]
-        axis.plot(curve["speed"], motor, color=COLORS[1], ls=STROKES[1], label="of the motor")
+        label = "of the motor" if motors == 1 else "of all motors"
+        axis.plot(curve["speed"], motor, color=COLORS[1], ls=STROKES[1], label=label)
         if np.any(np.isfinite(folds["speed"])):
             look = {"ms": 5.0, "mfc": "white", "mec": COLORS[4], "label": "fold: the speed jumps"}
             axis.plot(scale * folds["speed"], folds["torque"], "D", **look)
