@@ -315,7 +315,7 @@ def _exciter_bounds(scene: Scene, least: int, reach: Number) -> tuple[dict[str, 
         if exciter.unbalance is None or exciter.position is None:
             raise InputError(f"scene.exciters[{k}]", "needs an unbalance and a position `at` for this recipe")
         for j, value in enumerate(np.asarray(exciter.position).tolist()):
-            free[f"exciters[{k}].position[{j}]"] = (value - distance, value + distance)
+            free[f"exciters[{k}].at[{j}]"] = (value - distance, value + distance)
     first = float(np.asarray(scene.exciters[0].unbalance))
     free["exciters[0].unbalance"] = (first / 3.0, 3.0 * first)
     ties: dict[str, Source] = {

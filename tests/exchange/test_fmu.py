@@ -429,7 +429,7 @@ def test_forces_on_a_body_replace_the_forces_of_its_supports(opened):
 @needs_compiler
 def test_changed_places_equal_the_changed_scene(opened):
     found = exported("body with loads and an unbalance")
-    changed = {"exciters[1].position[0]": 0.5, "exciters[1].unbalance": 0.6, "machine.supports[0].at[0]": -0.9}
+    changed = {"exciters[1].at[0]": 0.5, "exciters[1].unbalance": 0.6, "machine.supports[0].at[0]": -0.9}
     first, second = found.scene.exciters
     moved = jv.Exciter(drive=second.drive, unbalance=0.6, at=(0.5, 0.4))
     body = jv.plane_body(mass=900.0, inertia=300.0, supports=[jv.support(at=(-0.9, -0.2), **SPRING), SUPPORTS[1]])

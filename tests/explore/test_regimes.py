@@ -46,7 +46,7 @@ def test_each_slider_of_a_screen_moves_one_number(linear):
         moved[each.name] = place, after[place] - before[place], after[place] / before[place] if before[place] else np.inf
     # Per exciter: speed, unbalance, x, y, torque; per support: two springs, two dampers, an angle; mass and inertia.
     assert len({place for place, _, _ in moved.values()}) == len(moved) == 2 * 5 + 2 * 5 + 2
-    assert moved["exciters[0].position[0]"][1] == pytest.approx(0.8, rel=1e-9)  # 80 steps of 10 mm
+    assert moved["exciters[0].at[0]"][1] == pytest.approx(0.8, rel=1e-9)  # 80 steps of 10 mm
     assert moved["machine.supports[1].angle"][1] == pytest.approx(np.pi, rel=1e-9)
     assert moved["exciters[1].unbalance"][2] == pytest.approx(10.0, rel=1e-3)
     assert moved["exciters[1].drive.speed"][2] == pytest.approx(3.0, rel=1e-3)
@@ -54,7 +54,7 @@ def test_each_slider_of_a_screen_moves_one_number(linear):
 
 def test_a_typed_position_or_angle_is_reached_exactly(linear):
     sliders = {each.name: each for each in sliders_of(linear)}
-    x, angle = sliders["exciters[0].position[0]"], sliders["machine.supports[0].angle"]
+    x, angle = sliders["exciters[0].at[0]"], sliders["machine.supports[0].angle"]
     assert (x.unit, typed_value(linear, x, "0.5 m"), typed_value(linear, x, "-20")) == ("mm", 500.0, -20.0)
     assert (angle.unit, typed_value(linear, angle, "0.1 rad")) == ("deg", pytest.approx(18.0 / np.pi, rel=1e-11))
     moved = scene_at(linear, {x.name: -20.0, angle.name: 30.0})

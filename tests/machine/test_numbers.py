@@ -70,7 +70,7 @@ ROTOR = jv.Scene(rotor_machine(0.1), jv.balls(count=2, mass=0.2, radius=0.08, dr
         (ROTOR, "machine.stiffness[1]", ["stiffness of support 2"]),
         (ROTOR, "loads.drag", ["drag of each ball"]),
         (SCREEN, "machine.supports[1].stiffness[1]", ["stiffness of support 2 along its axis"]),
-        (SCREEN, "exciters[1].position[0]", ["x of the position of exciter 2"]),
+        (SCREEN, "exciters[1].at[0]", ["x of the position of exciter 2"]),
         (SCREEN, "exciters[1].unbalance", ["unbalance of the rotor (exciter 2)"]),
         (SCREEN, "machine.supports[0].at[1]", ["y of the position of support 1"]),
     ],

@@ -31,7 +31,7 @@ def screen(**motor):
 
 def place(low=0.2, high=1.2):
     """Design space: the place of the second exciter."""
-    return {"exciters[1].position[0]": (low, high), "exciters[1].position[1]": (low, high)}
+    return {"exciters[1].at[0]": (low, high), "exciters[1].at[1]": (low, high)}
 
 
 def test_search_finds_the_position_without_rotation():
@@ -98,8 +98,8 @@ def test_wrong_recipes_in_files_are_refused(text, says, tmp_path):
 def test_sweep_measures_screens_and_names_those_without_regime(tmp_path):
     places = [0.6, 0.8]
     measure = {"spread": motion_spread(DECK), "force": foundation_force()}
-    found = jv.sweep(screen(), {"exciters[1].position[0]": places}, measure, tmp_path / "places.zarr")
-    space = DesignSpace(screen(), {"exciters[1].position[0]": (0.5, 1.0)})
+    found = jv.sweep(screen(), {"exciters[1].at[0]": places}, measure, tmp_path / "places.zarr")
+    space = DesignSpace(screen(), {"exciters[1].at[0]": (0.5, 1.0)})
     alone = [float(motion_spread(DECK)(space.scene_of(jnp.array([x])))) for x in places]
     np.testing.assert_allclose(found.data["spread"], alone, rtol=1e-9)
     apart = jv.sweep(screen(), {"exciters[1].drive.speed": ["1000 rpm", "2000 rpm"]}, measure, tmp_path / "speeds.zarr")

@@ -23,7 +23,7 @@ DECK = [(-1.5, 0.1), (1.5, 0.1)]
 TORQUES = 80.0, 60.0
 """Breakdown torques of the motors, N m; a margin of synchronization needs unequal ones."""
 
-PLACE = {"exciters[1].position[0]": (0.2, 1.2), "exciters[1].position[1]": (0.2, 1.2)}
+PLACE = {"exciters[1].at[0]": (0.2, 1.2), "exciters[1].at[1]": (0.2, 1.2)}
 LOW, HIGH = (0.2, 0.2, 3e5), (1.2, 1.2, 7e5)
 """Bounds of the position of the second motor, m, and of the stiffness of each spring up, N/m."""
 

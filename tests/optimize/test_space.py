@@ -144,12 +144,12 @@ def test_tie_to_a_parameter_of_zero_is_refused():
 
 def test_positions_can_be_mirrored_by_a_tie():
     screen = scene_from_toml(SCREENS["linear_screen"])
-    name = "exciters[0].position[0]"
-    space = DesignSpace(screen, {name: (0.0, 1.0, "even")}, ties={"exciters[1].position[0]": (name, -1.0)})
+    name = "exciters[0].at[0]"
+    space = DesignSpace(screen, {name: (0.0, 1.0, "even")}, ties={"exciters[1].at[0]": (name, -1.0)})
     np.testing.assert_allclose(space.at(jnp.array([0.25])).exciters[1].position[0], -0.25)
     for factor in (0.0, float("inf")):
         with pytest.raises(jv.InputError, match="give a number other than 0"):
-            DesignSpace(screen, {name: (0.0, 1.0)}, ties={"exciters[1].position[0]": (name, factor)})
+            DesignSpace(screen, {name: (0.0, 1.0)}, ties={"exciters[1].at[0]": (name, factor)})
 
 
 def test_absent_springs_stay_absent():

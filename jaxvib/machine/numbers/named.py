@@ -1,6 +1,7 @@
 """Parameters of a scene by name: "machine.stiffness[0]", "drive.inertia", "effects.stop[1].gap".
 
-Every floating-point parameter of a scene has a name. Its unit, bounds and label are defined in the package `numbers`.
+Every floating-point parameter of a scene has a name: its tables and its key in a scene file. Its unit, bounds and label are defined
+in the package `numbers`.
 """
 
 from __future__ import annotations
@@ -161,9 +162,27 @@ def numbers_of(scene: Scene) -> dict[str, NamedNumber]:
             if not _is_continuous(leaf) or not np.size(leaf) or (isinstance(part, Exciter) and len(steps) > 1):
                 continue  # loads, drive and effects of an exciter are separate parts
             inner, spec = _steps(part, steps)
-            whole = NamedNumber(prefix + jax.tree_util.keystr(steps), (*path, *inner), None, np.size(leaf), spec)
+            name = _in_file(prefix + jax.tree_util.keystr(steps))
+            whole = NamedNumber(name, (*path, *inner), None, np.size(leaf), spec)
             found |= {each.name: each for each in (whole.single(scene) if len(spec.units) > 1 else (whole,))}
     return found
+
+
+def _in_file(name: str) -> str:
+    """Return a name with the key of scene files in place of the field of the class, if they differ."""
+    return re.sub(r"(?<=^exciters)(\[\d+\])\.position\b", r"\1.at", name)
+
+
+def _short_name(scene: Scene, name: str) -> str:
+    """Return the name of a parameter that is given by its field, or by its tables in a file that has one table of a list: one of
+    `exciters`, or one effect of a kind."""
+    name = _in_file(name)
+    if len(scene.exciters) == 1:
+        name = re.sub(r"^exciters\[0\]\.(?=(loads|drive|effects)\.)", "", name)
+    for kind in {effect.kind for effect in scene.effects if effect.repeatable}:
+        if sum(effect.kind == kind for effect in scene.effects) == 1:
+            name = name.replace(f"effects.{kind}.", f"effects.{kind}[0].")
+    return name
 
 
 def _is_continuous(value: object) -> bool:
@@ -211,6 +230,7 @@ def find_number(scene: Scene, name: str, field: str) -> NamedNumber:
     named, field = numbers_of(scene), f"{field}.{name}"
     if not isinstance(name, str):
         raise InputError(field, f"is not the name of a parameter; {suggest_name(str(name), list(named))}")
+    name = _short_name(scene, name)
     if name in named:
         return named[name]
     array, index = m.groups() if (m := re.fullmatch(r"(.+)\[(\d+)\]", name)) else (name, None)
@@ -289,6 +309,7 @@ def spec_of(name: str) -> NumberSpec | None:
     """Return the specification of a parameter from its name alone; None if no kind of part has such a field. If several kinds
     have it, the specification of an array takes precedence."""
     part, _, last = re.sub(r"\[\d+\]", "", str(name)).rpartition(".")
+    last = "position" if (part, last) == ("exciters", "at") else last
     part = re.sub(r"(\.(motor|reference))+$", "", part.removeprefix("exciters."))  # a drive within a drive
     if part.startswith("effects."):
         known = EFFECTS.get(part.removeprefix("effects."))

@@ -236,7 +236,7 @@ def test_scene_file_round_trip_is_bit_for_bit():
 def test_numbers_of_supports_and_places_have_names():
     names = numbers_of(scene_of(2))
     assert names["machine.supports[1].stiffness[0]"].unit == "N/m" and "machine.inertia" in names
-    assert names["exciters[0].position"].unit == "m"
+    assert names["exciters[0].at"].unit == "m"
 
 
 @pytest.mark.parametrize(

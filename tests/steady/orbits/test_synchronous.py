@@ -372,7 +372,7 @@ def test_limit_of_synchronization_is_the_fold_of_the_motion(general, orbit):
         assert names == ["found", "not_converged"]
 
 
-@pytest.mark.parametrize(("over", "start"), [("exciters[1].unbalance", 1.0), ("exciters[1].position[0]", 0.9)])
+@pytest.mark.parametrize(("over", "start"), [("exciters[1].unbalance", 1.0), ("exciters[1].at[0]", 0.9)])
 def test_limit_over_unbalance_and_place_is_the_closed_form(over, start):
     """Soft supports: W = w^2 S_1 S_2 l_1 l_2 / (2 J) is at least half the difference of the torques."""
     machine = body((40.0, 40.0), (2.0, 2.0), places=((-1.0, 0.0), (1.0, 0.0)))
