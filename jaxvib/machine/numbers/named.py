@@ -1,7 +1,7 @@
 """Parameters of a scene by name: "machine.stiffness[0]", "drive.inertia", "effects.stop[1].gap".
 
-Every floating-point parameter of a scene has a name: its tables and its key in a scene file. Its unit, bounds and label are defined
-in the package `numbers`.
+Every floating-point parameter of a scene has a name: its tables and its key in a scene file. Its unit, bounds and label are
+defined in the package `numbers`.
 """
 
 from __future__ import annotations
@@ -174,8 +174,8 @@ def _in_file(name: str) -> str:
 
 
 def _short_name(scene: Scene, name: str) -> str:
-    """Return the name of a parameter that is given by its field, or by its tables in a file that has one table of a list: one of
-    `exciters`, or one effect of a kind."""
+    """Return the name of a parameter that is given by its field, or by its tables in a file with only one table in a list: one
+    exciter, or one effect of a kind."""
     name = _in_file(name)
     if len(scene.exciters) == 1:
         name = re.sub(r"^exciters\[0\]\.(?=(loads|drive|effects)\.)", "", name)
