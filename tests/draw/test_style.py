@@ -133,7 +133,8 @@ def test_band_contains_the_signal():
     arrays = (t, np.stack([y, -y], 1), np.ones((t.size, 2)), 2.0 * np.ones((t.size, 1)), y[:, None])
     figure = time_histories(arrays, arrays, names=("y1", "y2"), directions=("up",))
     left, right = figure.axes[:2]
-    assert len(left.collections) == 2 and [text.get_text() for text in left.get_legend().get_texts()] == ["y1", "y2"]
+    names = [text.get_text() for text in left.get_legend().get_texts()]
+    assert len(left.collections) == 2 and names == ["y1", "y2", "band: lowest to highest value"]
     x, shown = right.lines[0].get_data()
     np.testing.assert_allclose(shown, 1e3 * y[-x.size :])
     np.testing.assert_allclose(x[-1] - x[0], 0.3, rtol=0.02)  # three periods, in which antiphase is seen

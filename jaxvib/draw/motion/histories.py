@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patches import Patch
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
 from jaxvib.draw.style import (
@@ -28,6 +29,9 @@ _MAX_PLAIN_PERIODS = 40
 _MAX_BEATS, _SAMPLES_PER_INTERVAL, _MIN_SAMPLES = 20, 10, 1000
 """Maximum number of beats of an averaged history that is drawn as a curve. A history with more beats and at least
 `_MIN_SAMPLES` samples is drawn as a band between the minima and maxima of intervals of `_SAMPLES_PER_INTERVAL` samples."""
+
+_BAND_ALPHA = 0.22
+"""Opacity of a band."""
 
 _SHOWN_PERIODS = 3
 """Number of periods at the end that are drawn as curves."""
@@ -128,17 +132,15 @@ def time_histories(
     if high - low < (least := _MIN_SPEED_RANGE * max(abs(low), abs(high))):  # rounding errors of a constant speed
         right.set_ylim(0.5 * (low + high - least), 0.5 * (low + high + least))
     left.set_ylabel(f"speed, {unit}")
-    legend_above(left, 6)
+    _draw_legend(left)
     left, right = axes[-2:]
     for k, name in enumerate(directions):
         _draw_band(left, whole[0], whole[4][:, k], k, name, bins)
         right.plot(part[0], part[4][:, k], **series_look(k), lw=1.2)
     left.set_ylabel("foundation force, N")
-    if len(directions) > 1:
-        legend_above(left)
+    _draw_legend(left, 2)
     first, last = float(whole[0][0]), float(whole[0][-1])
     title = "the whole run" if first < 0.01 * last else f"the last part of the run, from {first:.4g} s"
-    title += "" if whole[0].size < 2 * bins else ": bands between peaks"
     for axis, text in zip(axes[:2], (title, f"its last {last - float(part[0][0]):.2g} s"), strict=True):
         axis.text(1.0, 1.02, text, transform=axis.transAxes, ha="right", va="bottom", fontsize="small", color="#555555")
     for axis in axes[-2:]:
@@ -169,7 +171,7 @@ def _draw_coordinates(
         look = series_look(k)
         right.plot(end[0], factor_at_end * end[1][:, k], lw=1.3, **look)
     left.set_ylabel(label)
-    legend_above(left, 6)
+    _draw_legend(left)
     if label_at_end != label:
         right.set_ylabel(label_at_end)
 
@@ -239,7 +241,16 @@ def _draw_band(
     axis.plot(middle, high, label=name, **look)
     if low is not high:
         axis.plot(middle, low, **look)
-        axis.fill_between(middle, low, high, color=look["color"], alpha=0.22, lw=0.0, zorder=look["zorder"])
+        axis.fill_between(middle, low, high, color=look["color"], alpha=_BAND_ALPHA, lw=0.0, zorder=look["zorder"])
+
+
+def _draw_legend(axis: Axes, least: int = 1) -> None:
+    """Draw the legend of a panel, with an entry for its bands, unless it has fewer than `least` entries."""
+    handles, _ = axis.get_legend_handles_labels()
+    if axis.collections:
+        handles.append(Patch(color="#555555", alpha=_BAND_ALPHA, lw=0.0, label="band: lowest to highest value"))
+    if len(handles) >= least:
+        legend_above(axis, 6, handles=handles)
 
 
 def _smoothed_peaks(values: np.ndarray) -> np.ndarray:
@@ -300,7 +311,7 @@ def amplitude_histories(
         of_kind = [k for k in range(len(names)) if units[k] == kind]
         lines(axis, factor * amplitude, of_kind, [names[k] for k in of_kind])
         axis.set_ylabel(label)
-        legend_above(axis, 6)
+        _draw_legend(axis)
     for k, name in _equal_loads(load_speed, load_speed[-(load_speed.shape[0] // 4) :]):
         lines(axes[-2], scale * load_speed, [k], [name])
     _draw_rotor_speeds(axes[-2], time, scale * rotor_speed)
@@ -308,11 +319,10 @@ def amplitude_histories(
     passed = [w for w in resonances if w < np.max(np.abs(rotor_speed), initial=0.0)]
     resonance_lines(axes[-2].axhline, scale * np.outer(signs, passed).ravel(), "resonances")
     axes[-2].set_ylabel(f"speed, {unit}")
-    legend_above(axes[-2], 6)
+    _draw_legend(axes[-2])
     lines(axes[-1], force, range(len(directions)), directions)
     axes[-1].set_ylabel("foundation force, N")
-    if len(directions) > 1:
-        legend_above(axes[-1])
+    _draw_legend(axes[-1], 2)
     axes[-1].set_xlabel("time, s")
     axes[0].text(1.0, 1.02, "zero to peak", transform=axes[0].transAxes, ha="right", va="bottom", fontsize="small")
     return figure if ax is None else ax
