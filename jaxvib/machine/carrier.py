@@ -302,8 +302,8 @@ class Machine(Part):
         [[0.0, 1.0]]
         """
         if place is not None:
-            problem = f"names a place on a machine of kind {quoted(self.kind)}, whose points all move together; leave it out"
-            raise InputError(name, problem)
+            problem = f"names a place on a machine of kind {quoted(self.kind)}, which has only the place of its exciter"
+            raise InputError(name, f"{problem}; leave it out")
         return self.mount().rows[0]
 
     def moment_rows(self, about: Array) -> Array:

@@ -475,6 +475,9 @@ def _fields_of_kind(section: str, part: Any, kinds: Mapping[str, Callable[..., o
     """Return the fields of a part. **Raises** `InputError` for a part of a kind from outside the package."""
     if part.kind not in kinds:
         problem = f"is {part.kind!r}, which scene files do not describe; build it in Python"
+        if not type(part).__module__.startswith("jaxvib."):  # a user's class
+            registry = {"machine": "MACHINES", "drive": "DRIVES"}.get(section, section.upper())
+            problem += f", or add an entry: jaxvib.machine.files.{registry}[{part.kind!r}] = {type(part).__name__}"
         raise InputError(f"{section}.kind", problem)
     return _fields(part, kinds[part.kind], write)
 

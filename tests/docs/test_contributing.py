@@ -115,6 +115,8 @@ def test_named_paths_and_constants_exist():
 
 IDEAS = [
     ("motion", "jaxvib/equations", "dynamics.py"),
+    ("equal steps", "jaxvib/motion", "batch.py"),
+    ("repr", "jaxvib/machine", "numbers/__init__.py"),
     ("averaged", "jaxvib/equations", "averaged.py"),
     ("sizes", "jaxvib/ode", "control.py"),
     ("Floquet", "jaxvib/steady", "orbits/stability.py"),
@@ -176,19 +178,27 @@ def test_part_of_a_recipe_answers_without_registration(part):
 
 @pytest.mark.parametrize("part", PARTS)
 def test_files_refuse_a_part_without_an_entry(part):
-    with pytest.raises(jv.InputError, match=r"kind is '\w+', which scene files do not describe; build it in Python"):
+    own = PARTS[part][1].__name__
+    remedy = rf"which scene files do not describe; build it in Python, or add an entry: (.*)\.([A-Z]+)\['(\w+)'\] = {own}$"
+    with pytest.raises(jv.InputError, match=remedy) as refusal:
         jv.scene_to_toml(scene_with(part))
+    module, registry, kind = re.search(remedy, str(refusal.value)).groups()
+    assert getattr(importlib.import_module(module), registry) is ENTRIES[part] and kind == part_of(scene_with(part), part).kind
 
 
+ENTRIES = {"machine": files.MACHINES, "load": files.LOADS, "drive": files.DRIVES, "effect": files.EFFECTS}
 SECTION = {"machine": "machine", "load": "loads", "drive": "drive", "effect": "effects"}
+
+
+def part_of(scene, part):
+    return scene.all_effects[0] if part == "effect" else getattr(scene, SECTION[part])
 
 
 @pytest.mark.parametrize("part", PARTS)
 def test_one_line_in_a_users_file_makes_the_entry(part, monkeypatch):
     scene = scene_with(part)
-    own = scene.all_effects[0] if part == "effect" else getattr(scene, SECTION[part])
-    entries = {"machine": files.MACHINES, "load": files.LOADS, "drive": files.DRIVES, "effect": files.EFFECTS}[part]
-    monkeypatch.setitem(entries, own.kind, type(own))
+    own = part_of(scene, part)
+    monkeypatch.setitem(ENTRIES[part], own.kind, type(own))
     read = jv.scene_from_toml(jv.scene_to_toml(scene))
     assert eqx.tree_equal(read, scene)
     assert any(argument.unit for argument in arguments_of(builder_of(f"{part}s", own.kind)))

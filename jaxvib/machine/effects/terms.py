@@ -191,7 +191,7 @@ class Friction(NamedTuple):
 @final
 @dataclass(frozen=True)
 class ContactFriction:
-    """Friction of each load against the rotor.
+    """Friction of each load against the rotor, or another torque of the rotor on each load.
 
     **Attributes**
 
@@ -239,7 +239,7 @@ class SupportForce:
 
     - `rows`: function of the machine that returns a matrix (k, nd); rows q are the k displacements x of the supported point,
       see `Machine.rows_at`
-    - `energy`, J: function of x
+    - `energy`, J: function of x that returns a scalar, of shape (); 0 without a spring
     - `resistance`: function of x and its rate that returns the dissipative force on the foundation, (k,) N; or None
     - `is_smooth`: True if the force has all derivatives
     - `stiffness`: largest stiffness of the support, N/m, whose vibration equal steps must resolve; None if the stiffness is
