@@ -30,6 +30,13 @@ def on_torus(count=2):
     return jv.Scene(jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0), loads, jv.ConstantSpeed(90.0))
 
 
+class BrakingTorque(SealFriction):
+    """A constant torque against the rotation of the loads, which increases their slip."""
+
+    def friction(self, loads, u, rate, speed, g):
+        return super().friction(loads, u, rate, speed, g)._replace(lever=jnp.full_like(rate[0], -self.torque))
+
+
 class QuadraticDrag(CircularLoads):
     """Balls whose drag grows with the square of the speed difference, which no balance of a viscous drag describes."""
 
@@ -62,6 +69,16 @@ def test_plugin_friction_runs_in_every_tier_with_friction():
     run = jv.simulate(scene, 100.0, start=jv.State(*orbit.at(0.0)), save="window", estimate=False)
     np.testing.assert_allclose(run.omega, orbit.omega, rtol=1e-8)
     np.testing.assert_allclose(run.amplitude, orbit.amplitude, rtol=1e-7)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_jams_include_constant_torques_of_either_sign(sign):
+    scene = with_friction()
+    braked = jv.Scene(scene.machine, scene.loads, scene.drive, (BrakingTorque(TORQUE, 1e-3),))
+    braked = eqx.tree_at(lambda s: s.all_effects[0].torque, braked, jnp.asarray(sign * TORQUE))
+    omega = jv.jam_modes(braked).select(3).omega
+    bare = jam_rotor_speed(jv.Scene(scene.machine, scene.loads, scene.drive), omega)
+    np.testing.assert_allclose(scene.drive.speed - bare, sign * TORQUE / scene.loads.drag_sum(), rtol=1e-9)
 
 
 def test_every_tier_answers_or_refuses_by_a_property():

@@ -137,10 +137,14 @@ def _speed_from_acceleration(model: ExcitedModel, omega: Array, acceleration: Ar
     if not has_term(effects, ContactFriction):
         return free
 
-    def residual(n: Array) -> Array:
-        return model.drag * (n - omega) + jnp.sum(friction_on_light_loads(model.loads, effects, omega, n)) - torque
+    def friction(n: Array) -> Array:
+        return jnp.sum(friction_on_light_loads(model.loads, effects, omega, n))
 
-    return bracketed_root(residual, omega, free)
+    # The root is between omega and `free` if the friction brakes the slip n - omega. The wider bracket also contains the root
+    # for any torque that does not fall as n rises, such as a constant one.
+    margin = 2.0 * jnp.abs(friction(free)) / model.drag
+    low, high = jnp.minimum(omega, free - margin), jnp.maximum(omega, free + margin)
+    return bracketed_root(lambda n: model.drag * (n - omega) + friction(n) - torque, low, high)
 
 
 def scanned_speed(model: ExcitedModel, omega: Array) -> Array:
