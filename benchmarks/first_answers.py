@@ -110,7 +110,7 @@ def process(command: list[str], cache: str) -> str:
 
     **Raises** `SystemExit` if the process fails.
     """
-    ours = ("XLA_FLAGS", "EQX_ON_ERROR", "JAX_COMPILATION_CACHE_DIR")
+    ours = ("XLA_FLAGS", "EQX_ON_ERROR", "JAX_COMPILATION_CACHE_DIR", "JAXVIB_AUTOMATIC")  # engine.py sets the last
     clean = {key: value for key, value in os.environ.items() if key not in ours} | {"XDG_CACHE_HOME": cache}
     done = subprocess.run(command, env=clean, cwd=EXAMPLE, capture_output=True, text=True, check=False)
     if done.returncode:

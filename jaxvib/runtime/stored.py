@@ -18,6 +18,7 @@ import os
 import tempfile
 import threading
 import weakref
+import zlib
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -52,13 +53,14 @@ therefore exceeds the limit of Linux (65530 areas) and crashes inside the compil
 MAX_PROGRAM_MEMORY = 768 * 2**20
 """Largest estimated memory, bytes, of all programs in memory. The whole process then needs less than 1.5 GB."""
 
-MEMORY_PER_PROGRAM, MEMORY_PER_STORED_BYTE = 2**20, 300
-"""Estimated memory of a program, bytes: a constant, and a factor of the size of its stored form. XLA does not report the memory
-of programs on the CPU. Measured growth of the resident memory: natural frequencies 2.0 MB (stored 4.3 kB), jam modes 13.6 MB
-(32 kB), branches 11 to 16 MB (40 kB), an exact jam 38 MB (146 kB), a run 29 to 46 MB (280 kB)."""
+MEMORY_PER_PROGRAM, MEMORY_PER_COMPRESSED_BYTE, MEMORY_PER_STORED_BYTE = 2**20, 700, 3
+"""Estimated memory of a program, bytes: a constant, and factors of the compressed and of the whole size of its stored form. XLA
+does not report the memory of programs on the CPU. The compressed size measures the operations: constants of a program, such as
+the incidence matrix of 200 platforms, compress to a few bytes. Measured growth of the resident memory: natural frequencies
+2.0 MB (compressed 3.3 kB), jam modes 13.6 MB (19 kB), of 50 platforms 44 MB (50 kB), an exact jam 38 MB (47 kB)."""
 
-UNKNOWN_STORED_SIZE = 100_000
-"""Assumed stored size, bytes, of programs that cannot be stored because of host callbacks, mostly runs with a progress bar."""
+UNKNOWN_MEMORY = 31 * 2**20
+"""Assumed memory, bytes, of programs that cannot be stored because of host callbacks, mostly runs with a progress bar."""
 
 _clock = itertools.count()
 _functions: weakref.WeakSet[StoredFunction] = weakref.WeakSet()
@@ -187,10 +189,10 @@ class StoredFunction(Generic[T]):
         except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers
             if not results:  # the function itself raised the error
                 raise
-            return _Program(jitted, results[0][1], UNKNOWN_STORED_SIZE)
+            return _Program(jitted, results[0][1], UNKNOWN_MEMORY)
         exported = export.deserialize(bytearray(stored))  # the former `exported` would keep its trace, 1 to 3 MB, in memory
         (structure, result), name = results[0], self.function.__name__
-        program = _Program(_compiled(name, exported, sharding), result, len(stored))
+        program = _Program(_compiled(name, exported, sharding), result, _estimated_memory(stored))
         if path is None or structure is None or code_state(compare=True) != state:  # the code changed during the trace
             return program
         head = json.dumps({"structure": structure}).encode() + b"\n"
@@ -218,18 +220,13 @@ def _skeleton(structure: Description) -> Skeleton:
 
 @dataclasses.dataclass
 class _Program:
-    """Function `run` of all arrays of the arguments, compiled by `jax.jit`; `result`: structure of the result; `size` of the
-    stored form, bytes; `used`: a counter that orders programs by their last use."""
+    """Function `run` of all arrays of the arguments, compiled by `jax.jit`; `result`: structure of the result; `memory`:
+    estimated, bytes; `used`: a counter that orders programs by their last use."""
 
     run: Callable[..., list[Array]]
     result: Skeleton
-    size: int = 0
+    memory: int = MEMORY_PER_PROGRAM
     used: int = dataclasses.field(default_factory=lambda: next(_clock))
-
-    @property
-    def memory(self) -> int:
-        """Estimated memory, bytes."""
-        return MEMORY_PER_PROGRAM + MEMORY_PER_STORED_BYTE * self.size
 
     def __call__(self, arrays: Iterable[Array | np.ndarray | np.generic]) -> Any:
         return self.result.filled(self.run(*arrays))
@@ -237,6 +234,12 @@ class _Program:
     def compile(self, arrays: Iterable[Array]) -> None:
         """Compile the program for arrays like these without running it; JAX stores the compiled form."""
         self.run.lower(*arrays).compile()  # pyright: ignore[reportFunctionMemberAccess]
+
+
+def _estimated_memory(stored: bytes) -> int:
+    """Return the estimated memory, bytes, of a program with this stored form."""
+    operations = len(zlib.compress(stored, level=1))
+    return MEMORY_PER_PROGRAM + MEMORY_PER_COMPRESSED_BYTE * operations + MEMORY_PER_STORED_BYTE * len(stored)
 
 
 _traces_lock = threading.Lock()
@@ -309,7 +312,7 @@ def _read(path: Path, sharding: Sharding) -> _Program | None:
         result = _skeleton(json.loads(head)["structure"])
     except (OSError, ImportError, Undescribable):
         return None
-    return _Program(_compiled(path.stem.rpartition("-")[0], exported, sharding), result, len(stored))
+    return _Program(_compiled(path.stem.rpartition("-")[0], exported, sharding), result, _estimated_memory(stored))
 
 
 def _compiled(name: str, exported: export.Exported, sharding: Sharding) -> Callable[..., list[Array]]:
