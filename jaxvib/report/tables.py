@@ -11,6 +11,7 @@ from typing import TypeAlias, TypeGuard, cast
 import equinox as eqx
 
 from jaxvib.display import GRAVITIES, quantity_text, shown_unit
+from jaxvib.errors import InputError
 from jaxvib.machine.files import EFFECTS, scene_to_toml
 from jaxvib.machine.numbers import number_specs
 from jaxvib.machine.scene import Exciter, Scene
@@ -152,8 +153,12 @@ def result_tables(document: Mapping[str, Plain], units: Units, inner: bool = Fal
 
 
 def parameter_tables(scene: Scene) -> str:
-    """Return the parameters of a scene with their units, in a table for each of its parts."""
-    tables = tomllib.loads(scene_to_toml(scene))
+    """Return the parameters of a scene with their units, in a table for each of its parts; the text of a scene with a part that
+    scene files do not describe."""
+    try:
+        tables = tomllib.loads(scene_to_toml(scene))
+    except InputError:
+        return f"<pre>{escaped(repr(scene))}</pre>"
     parts = []
     owners = [("", tables, scene.exciters[0])]
     if "exciters" in tables:

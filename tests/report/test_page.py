@@ -8,6 +8,7 @@ import re
 import matplotlib
 import pytest
 from matplotlib.figure import Figure
+from plugins.machine import Beam
 from scenes import scene
 from small_machine import small_run
 
@@ -103,6 +104,20 @@ def test_the_machine_is_that_of_the_run_or_of_the_argument(tmp_path):
     own = jv.html_report(run, tmp_path / "own.html", figures=[]).read_text()
     given = jv.html_report(run, tmp_path / "given.html", scene=other, figures=[]).read_text()
     assert f"<h3>machine: {run.scene.machine.kind.replace('_', ' ')}</h3>" in own and "<h3>machine: network</h3>" in given
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: jv.from_matrices([[52.5]], [[30.0]], [[4e4]], places=[[0]]),
+        lambda: Beam(52.5, 12.0, [4e4, 4e4], [-1.0, 1.0], 0.1),
+    ],
+    ids=["matrices", "plugin"],
+)
+def test_a_machine_that_no_scene_file_describes_is_shown(make, tmp_path):
+    scene = jv.Scene(make(), jv.balls(count=2, mass="410 g", radius=0.1, drag=1.0), jv.ConstantSpeed(90.0))
+    text = jv.html_report(RESULT, tmp_path / "r.html", scene=scene, figures=[]).read_text(encoding="utf-8")
+    assert "52.5" in text and "410 g" in text
 
 
 def test_figures_are_png_whatever_matplotlib_saves_by_default():
