@@ -11,6 +11,8 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.display import quantity_text, shown_unit
+from jaxvib.machine.files import TEMPLATES
+from jaxvib.show.wheel import value_text
 from jaxvib.units import Bounds, count, known_number, number, numbers
 from jaxvib.units.columns import unit_factor
 from jaxvib.units.reading import _FACTORS, in_own_unit, to_float, unit_ratio
@@ -412,6 +414,9 @@ def test_values_are_shown_in_si_on_request():
     try:
         jv.display_units(si=True)
         assert [shown_unit(unit, 0.02) for unit in ("m", "kg", "rad")] == [("m", 1.0), ("kg", 1.0), ("rad", 1.0)]
+        assert [value_text(5e4, "N/m"), value_text(0.12, "m"), value_text(0.05, "kg")] == ["50000 N/m", "0.12 m", "0.05 kg"]
+        texts = [text.get_text() for text in jv.sketch(jv.scene_from_toml(TEMPLATES["rotor"])).axes[0].texts]
+        assert "loads at -0.28, -0.25, +0.25, +0.28 m" in texts and not any("mm" in text for text in texts)
     finally:
         jv.display_units()
     assert shown_unit("m", 0.02) == ("mm", 1e3)

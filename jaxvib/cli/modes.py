@@ -328,22 +328,24 @@ def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None
     }
 
     def text() -> str:
-        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
+        from jaxvib.display import shown_unit, speed_text, speed_unit  # slow import, which --help does not need
 
         unit, scale = speed_unit()
-        names = scene.machine.structure().coordinates
+        structure = scene.machine.structure()
+        shown = [shown_unit(each, 0.1) for each in structure.units]
         rows = [
             [
                 f"{k}",
                 f"{scale * float(jam.omega):.6g}",
                 jam.judgement,
                 f"{float(jam.multiplier):.5g}",
-                *(f"{1e3 * float(a):.5g}" for a in jam.amplitude),
+                *(f"{factor * float(a):.5g}" for a, (_, factor) in zip(jam.amplitude, shown, strict=True)),
                 f"{float(jam.foundation_force):.5g}",
             ]
             for k, jam in existing.items()
         ]
-        head = ["mode", unit, "exactly", "multiplier", *(f"{name}, mm" for name in names), "foundation force, N"]
+        moves = [f"{name}, {each}" for name, (each, _) in zip(structure.coordinates, shown, strict=True)]
+        head = ["mode", unit, "exactly", "multiplier", *moves, "foundation force, N"]
         points = [[p.kind.replace("_", " "), f"{scale * p.omega:.6g}", f"{scale * p.rotor_speed:.6g}"] for p in diagram.special]
         lines = [
             f"rotor {speed_text(scene.drive.speed)}",

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxvib.display import shown_unit
 from jaxvib.draw.machine.parts import Part, Text, box, circle, ground
 from jaxvib.draw.style import GUIDE, Look, color_of
 from jaxvib.errors import InputError, quoted
@@ -318,18 +319,19 @@ class ShaftView(RotorView):
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Return mass, inertias and supports, and the positions of supports and stations from the centre of mass."""
         small: Look = {"fontsize": "small"}
+        length, factor = shown_unit("m", 0.1)
         gyroscopic = self.mount.gyroscopic
         inertia = f"M = {value_text(float(self.mass[0, 0]), 'kg')}\nA = {value_text(float(self.mass[2, 2]), 'kg m²')}"
         if gyroscopic is not None:
             inertia += f"\nC = {value_text(float(np.max(np.abs(np.asarray(gyroscopic)))), 'kg m²')}"
         texts = [Text(self._x(0.0), 0.45, inertia, {**small, "ha": "center", "va": "bottom"})]
         for s, k, c in self.shaft_supports:
-            text = f"{spring_text(k, c)}\nat {1e3 * s:+.4g} mm"
+            text = f"{spring_text(k, c)}\nat {factor * s:+.4g} {length}"
             right = s >= 0.0
             place = self._x(s) + (0.42 if right else -0.42)
             texts.append(Text(place, -1.55, text, {**small, "va": "center", "ha": "left" if right else "right"}))
-        stations = sorted({round(1e3 * float(s), 6) for s in self.stations})
-        label = ", ".join(f"{s:+.4g}" for s in stations) + " mm"
+        stations = sorted({round(float(s), 9) for s in self.stations})
+        label = ", ".join(f"{factor * s:+.4g}" for s in stations) + f" {length}"
         texts.append(Text(0.0, 1.3, f"loads at {label}", {**small, "ha": "center", "va": "bottom"}))
         texts.append(Text(self.front, -1.2, "along the axis", {**small, "ha": "center", "va": "top"}))
         return texts

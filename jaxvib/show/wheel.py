@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.display import speed_text
+from jaxvib.display import shown_unit, speed_text
 from jaxvib.draw.machine.parts import Part, Text, circle, sector, turning_arrow
 from jaxvib.draw.style import COLORS, GUIDE, Look, color_of
 from jaxvib.machine.effects.base import Effect
@@ -60,7 +60,8 @@ def value_text(value: float, unit: str) -> str:
     >>> value_text(5e4, "N/m"), value_text(0.12, "m"), value_text(0.05, "kg"), value_text(1.6e4, "kg m²")
     ('50 N/mm', '120 mm', '50 g', '16000 kg m²')
     """
-    choices = _UNITS[unit]
+    is_si = shown_unit("N/m", 1e3)[0] == "N/m"  # see `display_units`
+    choices = ((unit, 1.0),) if is_si else _UNITS[unit]
     name, factor = next((choice for choice in choices if abs(value) * choice[1] >= 1.0), choices[-1])
     return f"{float(f'{value * factor:.4g}'):g} {name}"  # four digits, without an exponent below a million
 

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import GRAVITIES, quantity_text
+from jaxvib.display import GRAVITIES, quantity_text, shown_unit
 from jaxvib.equations.jammed_bodies import friction_on_light_loads
 from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model, peak_force, rotating_direction
 from jaxvib.equations.torque_balance import resultant_of
@@ -191,9 +191,11 @@ class VibrationMeasures(Readable):
         The zone of ISO 20816-3 is shown for rotors only: the standard does not apply to platforms and decks that must vibrate.
         """
         of = "" if self.point is None else " of the centre of mass"
+        velocity_unit, factor = shown_unit("m/s", 0.1)  # mm/s for all values, as in ISO 20816
         lines = [
             f"{name}{of}: stroke {quantity_text(self.stroke[k], 'm', 4)} peak to peak, {float(self.acceleration[k]):.3g} g, "
-            f"{1e3 * float(self.velocity[k]):.4g} mm/s RMS{_zone_text(float(self.velocity[k])) if self._is_rotor else ''}"
+            f"{factor * float(self.velocity[k]):.4g} {velocity_unit} RMS"
+            f"{_zone_text(float(self.velocity[k])) if self._is_rotor else ''}"
             for k, name in enumerate(self.coordinates)
             if not float(self.stroke[k]) < _NEGLIGIBLE_FRACTION * float(np.max(self.stroke))
         ]

@@ -124,6 +124,8 @@ def test_exact_modes_json_has_the_promised_keys(typed):
     measured = jv.vibration_measures(jv.load_scene("machine.toml"), jv.jam_orbit(jv.load_scene("machine.toml"), mode=3))
     np.testing.assert_allclose(jams[3]["measures"]["stroke"], measured.stroke, rtol=1e-9)
     assert {k for k, each in jams.items() if "measures" in each} == {k for k, each in jams.items() if each["stable"]}
+    out = typed("modes", "machine.toml", "--exact", "--unit", "si")[1]
+    assert "y1, m " in out and " m/s RMS" in out and " mm" not in out
 
 
 def test_modes_note_that_an_imbalance_is_left_out(typed, tmp_path):
