@@ -89,25 +89,37 @@ WITHOUT = click.option(
 """Option of commands that do not support every effect."""
 
 
-class _SpeedType(click.ParamType):
-    """Speed with a unit: a plain number other than 0 could be in rpm or in rad/s."""
+class _TypeWithUnit(click.ParamType):
+    """Number with a unit: a plain number other than 0 could be in either of two `units`, such as rpm and rad/s.
 
-    name = "speed"
+    `several`: True for numbers that are separated by commas.
+    """
+
+    def __init__(self, name: str, *units: str, several: bool = False):
+        self.name, self.units, self.several = name, units, several
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the text. **Raises** `InputError` for a number without a unit."""
-        try:
-            plain = float(value)
-        except ValueError:
-            return value
-        if plain == 0.0:
-            return value
-        field = "speed" if param is None else param.opts[-1]
-        raise InputError(field, f"is {quoted(value)}, a number without a unit; write '{plain:g} rpm' or '{plain:g} rad/s'")
+        field = self.name if param is None else param.opts[-1]
+        for part in str(value).split(",") if self.several else [str(value)]:
+            try:
+                plain = float(part)
+            except ValueError:
+                continue
+            if plain != 0.0:
+                choices = " or ".join(f"'{plain:g} {unit}'" for unit in self.units)
+                raise InputError(field, f"is {quoted(part.strip())}, a number without a unit; write {choices}")
+        return value
 
 
-SPEED_TYPE = _SpeedType()
+SPEED_TYPE = _TypeWithUnit("speed", "rpm", "rad/s")
 """Type of options that are speeds."""
+
+ANGLE_TYPE = _TypeWithUnit("angle", "deg", "rad")
+"""Type of options that are angles."""
+
+ANGLES_TYPE = _TypeWithUnit("angles", "deg", "rad", several=True)
+"""Type of options that are angles, separated by commas."""
 
 SPEED = click.option("--speed", type=SPEED_TYPE, help="Constant rotor speed in place of the scene's drive, such as '1200 rpm'.")
 """Option of commands about motions at a constant rotor speed."""
@@ -350,6 +362,9 @@ def command(
 
             display_units(speed="rad/s" if unit == "SI" else unit, si=unit == "SI")  # pyright: ignore[reportArgumentType]
             path = rest.get(source or "")
+            for option, value in (("--title", title), ("--author", author)):
+                if value is not None and report is None:
+                    raise InputError(option, "is used only with --report; add --report FILE.html")
             heading = title if title or path is None else f"{name}: {path.stem}"
             output = Output(as_json, out, report, rest.get("scene"), title=heading, author=author)
             with output.waiting():

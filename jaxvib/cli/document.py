@@ -8,11 +8,13 @@ from typing import Any
 import click
 
 import jaxvib as jv
+from jaxvib.cli.app import ANGLE_TYPE
 from jaxvib.cli.output import fields_of, note
 from jaxvib.errors import InputError, quoted
 
 SEPARATION = click.option(
     "--separation",
+    type=ANGLE_TYPE,
     help="Initial angle between neighbouring loads, such as '3 deg' [at rest: side by side if the ball_radius is given, "
     "otherwise 1 deg; in a jam: 0, for `settle` 1 deg].",
 )

@@ -68,8 +68,13 @@ _MAX_NUMBERS = 10**7
 """Largest length of a list of numbers; more numbers must be passed as an array."""
 
 
-def _check_bounds(value: Array | np.ndarray, field: str, unit: str, bounds: Bounds, *, is_list: bool = False) -> None:
-    """Check values against bounds. The condition for a traced value is added to the list of `conditions_of_traced_values`."""
+def _check_bounds(
+    value: Array | np.ndarray, field: str, unit: str, bounds: Bounds, *, is_list: bool = False, text: str = ""
+) -> None:
+    """Check values against bounds. The condition for a traced value is added to the list of `conditions_of_traced_values`.
+
+    The message contains the `text` of a finite value if the bounds are the same in all units.
+    """
     if traced(value):
         collected = _COLLECTED_CONDITIONS.get()
         if collected is not None:
@@ -88,7 +93,11 @@ def _check_bounds(value: Array | np.ndarray, field: str, unit: str, bounds: Boun
         needed = "a finite number is needed"
     elif unit == "rad" and abs(entry) * precision > 1.0:
         needed = f"it must be below {1.0 / precision:.1e} rad, above which an angle is not resolved within one turn"
-    raise InputError(name, f"is {f'{entry:g} {unit}'.strip()}; {needed}")
+    shown = f"{entry:g} {unit}".strip()
+    is_same_in_all_units = {bounds.low, bounds.high} <= {-math.inf, 0.0, math.inf}
+    if is_same_in_all_units and np.isfinite(entry) and any(map(str.isalpha, text)):
+        shown = shown if text.replace(" ", "") == shown.replace(" ", "") else text
+    raise InputError(name, f"is {shown}; {needed}")
 
 
 def number(
@@ -122,7 +131,7 @@ def _number(value: Number, unit: str, field: str, bounds: Bounds) -> Array | np.
     if isinstance(value, (list, tuple)):
         problem = f"is a list of {len(value)} values; one {number_words(unit)} is needed"
         raise InputError(field, problem + _hint_of_parts(unit))
-    return _converted(to_float(value, unit, field), unit, field, (), bounds)
+    return _converted(to_float(value, unit, field), unit, field, (), bounds, value if isinstance(value, str) else "")
 
 
 def numbers(
@@ -193,7 +202,9 @@ def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], boun
     return jnp.asarray(_converted(value, unit, field, shape, bounds), dtype=float)  # as in `number`
 
 
-def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], bounds: Bounds) -> Array | np.ndarray:
+def _converted(
+    value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], bounds: Bounds, text: str = ""
+) -> Array | np.ndarray:
     """Return the checked value in SI. NumPy converts a value that is not a JAX array; JAX would compile a program for it."""
     try:
         if isinstance(value, jax.Array):
@@ -207,7 +218,7 @@ def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], 
         raise InputError(field, f"is {quoted(value)}, which is not a number; write a {number_words(unit)}") from error
     if array.shape != shape:
         raise InputError(field, f"has shape {array.shape}; one {number_words(unit)} is needed")
-    _check_bounds(array, field, unit, bounds, is_list=bool(shape))
+    _check_bounds(array, field, unit, bounds, is_list=bool(shape), text=text)
     return array
 
 

@@ -215,6 +215,10 @@ def test_wrong_scene_files_exit_2_with_a_clear_error(typed, tmp_path, change, sa
     [
         (("modes", "nothing.toml"), 2, "cannot be read"),
         (("modes", "machine.toml", "--speed", "5 kg"), 2, "is not in rad/s"),
+        (("modes", "machine.toml", "--speed", "-1200 rpm"), 2, "--speed is -1200 rpm; it must be greater than 0"),
+        (("modes", "machine.toml", "--title", "x"), 2, "--title is used only with --report; add --report FILE.html"),
+        (("settle", "machine.toml", "--separation", "3"), 2, "--separation is '3', a number without a unit; write '3 deg' or"),
+        (("response", "machine.toml", "--phases", "0, 180"), 2, "--phases is '180', a number without a unit; write '180 deg'"),
         (("modes",), 2, "Missing argument 'SCENE': a scene file, such as `jaxvib new two-mass"),
         (("mode", "machine.toml"), 2, "No such command 'mode'. Did you mean 'modes'?"),
         (("modes", "machine.toml", "--speed", "1200"), 2, "--speed is '1200', a number without a unit; write '1200 rpm' or"),

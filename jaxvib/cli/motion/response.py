@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, command, loaded_scene, table
+from jaxvib.cli.app import ANGLES_TYPE, SPEED_TYPE, WITHOUT, Output, command, loaded_scene, table
 from jaxvib.cli.document import deck_options, indented, measures_of
 from jaxvib.cli.output import csv_options
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 @click.option("--most", type=SPEED_TYPE, help="Highest speed, such as '2000 rpm' [4/3 of the working speed].")
 @click.option(
     "--phases",
+    type=ANGLES_TYPE,
     help="Fixed phases of the unbalances of several exciters, as if gears connected them, such as '0 deg, 180 deg' [those of "
     "the first stable synchronous regime].",
 )
