@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from jaxvib.cli.document import TypeWithUnit
 from jaxvib.cli.output import Output, note
 from jaxvib.errors import ComputationError, InputError, legible, quoted
 
@@ -89,37 +90,8 @@ WITHOUT = click.option(
 """Option of commands that do not support every effect."""
 
 
-class _TypeWithUnit(click.ParamType):
-    """Number with a unit: a plain number other than 0 could be in either of two `units`, such as rpm and rad/s.
-
-    `several`: True for numbers that are separated by commas.
-    """
-
-    def __init__(self, name: str, *units: str, several: bool = False):
-        self.name, self.units, self.several = name, units, several
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the text. **Raises** `InputError` for a number without a unit."""
-        field = self.name if param is None else param.opts[-1]
-        for part in str(value).split(",") if self.several else [str(value)]:
-            try:
-                plain = float(part)
-            except ValueError:
-                continue
-            if plain != 0.0:
-                choices = " or ".join(f"'{plain:g} {unit}'" for unit in self.units)
-                raise InputError(field, f"is {quoted(part.strip())}, a number without a unit; write {choices}")
-        return value
-
-
-SPEED_TYPE = _TypeWithUnit("speed", "rpm", "rad/s")
+SPEED_TYPE = TypeWithUnit("speed", "rpm", "rad/s")
 """Type of options that are speeds."""
-
-ANGLE_TYPE = _TypeWithUnit("angle", "deg", "rad")
-"""Type of options that are angles."""
-
-ANGLES_TYPE = _TypeWithUnit("angles", "deg", "rad", several=True)
-"""Type of options that are angles, separated by commas."""
 
 SPEED = click.option("--speed", type=SPEED_TYPE, help="Constant rotor speed in place of the scene's drive, such as '1200 rpm'.")
 """Option of commands about motions at a constant rotor speed."""

@@ -8,9 +8,38 @@ from typing import Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import ANGLE_TYPE
 from jaxvib.cli.output import fields_of, note
 from jaxvib.errors import InputError, quoted
+
+
+class TypeWithUnit(click.ParamType):
+    """Number with a unit: a plain number other than 0 could be in either of two `units`, such as rpm and rad/s.
+
+    `several`: True for numbers that are separated by commas.
+    """
+
+    def __init__(self, name: str, *units: str, several: bool = False):
+        self.name, self.units, self.several = name, units, several
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the text. **Raises** `InputError` for a number without a unit."""
+        field = self.name if param is None else param.opts[-1]
+        for part in str(value).split(",") if self.several else [str(value)]:
+            try:
+                plain = float(part)
+            except ValueError:
+                continue
+            if plain != 0.0:
+                choices = " or ".join(f"'{plain:g} {unit}'" for unit in self.units)
+                raise InputError(field, f"is {quoted(part.strip())}, a number without a unit; write {choices}")
+        return value
+
+
+ANGLE_TYPE = TypeWithUnit("angle", "deg", "rad")
+"""Type of options that are angles."""
+
+ANGLES_TYPE = TypeWithUnit("angles", "deg", "rad", several=True)
+"""Type of options that are angles, separated by commas."""
 
 SEPARATION = click.option(
     "--separation",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -296,6 +297,28 @@ def _phase_row(jam: jv.PhaseJam, scale: float) -> list[str]:
     ]
 
 
+def _exact_table(scene: jv.Scene, jams: Mapping[int, jv.Orbit]) -> list[list[str]]:
+    """Return the headers and the rows of the table of exact jams, given by their mode numbers."""
+    from jaxvib.display import shown_unit, speed_unit  # slow import, which --help does not need
+
+    unit, scale = speed_unit()
+    structure = scene.machine.structure()
+    shown = [shown_unit(each, 0.1) for each in structure.units]
+    moves = [f"{name}, {each}" for name, (each, _) in zip(structure.coordinates, shown, strict=True)]
+    rows = [
+        [
+            f"{k}",
+            f"{scale * float(jam.omega):.6g}",
+            jam.judgement,
+            f"{float(jam.multiplier):.5g}",
+            *(f"{factor * float(a):.5g}" for a, (_, factor) in zip(jam.amplitude, shown, strict=True)),
+            f"{float(jam.foundation_force):.5g}",
+        ]
+        for k, jam in jams.items()
+    ]
+    return [["mode", unit, "exactly", "multiplier", *moves, "foundation force, N"], *rows]
+
+
 def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None:
     """Print all exact jams, including those that do not exist for light loads, and the special points."""
     from jaxvib.steady.orbits.search import exact_mode_speeds  # slow import: it needs the time integrator
@@ -328,24 +351,10 @@ def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None
     }
 
     def text() -> str:
-        from jaxvib.display import shown_unit, speed_text, speed_unit  # slow import, which --help does not need
+        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
 
         unit, scale = speed_unit()
-        structure = scene.machine.structure()
-        shown = [shown_unit(each, 0.1) for each in structure.units]
-        rows = [
-            [
-                f"{k}",
-                f"{scale * float(jam.omega):.6g}",
-                jam.judgement,
-                f"{float(jam.multiplier):.5g}",
-                *(f"{factor * float(a):.5g}" for a, (_, factor) in zip(jam.amplitude, shown, strict=True)),
-                f"{float(jam.foundation_force):.5g}",
-            ]
-            for k, jam in existing.items()
-        ]
-        moves = [f"{name}, {each}" for name, (each, _) in zip(structure.coordinates, shown, strict=True)]
-        head = ["mode", unit, "exactly", "multiplier", *moves, "foundation force, N"]
+        head, *rows = _exact_table(scene, existing)
         points = [[p.kind.replace("_", " "), f"{scale * p.omega:.6g}", f"{scale * p.rotor_speed:.6g}"] for p in diagram.special]
         lines = [
             f"rotor {speed_text(scene.drive.speed)}",

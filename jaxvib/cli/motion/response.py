@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import ANGLES_TYPE, SPEED_TYPE, WITHOUT, Output, command, loaded_scene, table
-from jaxvib.cli.document import deck_options, indented, measures_of
+from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, command, loaded_scene, table
+from jaxvib.cli.document import ANGLES_TYPE, deck_options, indented, measures_of
 from jaxvib.cli.output import csv_options
 
 if TYPE_CHECKING:
