@@ -133,6 +133,7 @@ def _balance_text(states: jv.BalancedStates, stabilities: list[BalancedStability
     """Return the arrangements as a table, below lines with the answer."""
     from jaxvib.display import speed_text, speed_unit  # slow imports, which --help does not need
     from jaxvib.results.status import status_name
+    from jaxvib.steady.jams.patterns import images_text
     from jaxvib.steady.jams.phases import degrees
 
     unit, scale = speed_unit()
@@ -145,17 +146,21 @@ def _balance_text(states: jv.BalancedStates, stabilities: list[BalancedStability
         several = f"load{'s' if loads.size > 1 else ''} {', '.join(str(j + 1) for j in loads)}"
         plane = f" in plane {k + 1} ({several})" if len(states.share) > 1 else ""
         lines.append(f"imbalance{plane}: {100.0 * share:.4g} % of the unbalance of all loads{' there' if plane else ''}")
+    distinct = {each[0]: f"{each[0] + 1}{images_text(each)}" for each in states.distinct}
     rows = [
-        [str(k + 1), name, f"{stability.growth:.4g}", " ".join(f"{degrees(float(a)) % 360.0:.4g}" for a in angles)]
-        for k, (name, stability, angles) in enumerate(zip(names, stabilities, states.angles, strict=True))
+        [
+            number,
+            names[k],
+            f"{stabilities[k].growth:.4g}",
+            " ".join(f"{degrees(float(a)) % 360.0:.4g}" for a in states.angles[k]),
+        ]
+        for k, number in distinct.items()
     ]
     if rows:
         head = ["arrangement", "", "growth, 1/s", "angles of the loads in the rotor, degrees"]
         lines.append(table("arrangements (growth below 0: disturbances decay)", head, rows))
     if stable:
-        spans = [
-            [str(k + 1), *(f"{scale * end:.6g}" for end in span)] for k, stability in enumerate(stable) for span in stability
-        ]
+        spans = [[number, *(f"{scale * end:.6g}" for end in span)] for k, number in distinct.items() for span in stable[k]]
         lines.append(
             table("rotor speeds at which an arrangement is stable", ["arrangement", f"from, {unit}", f"to, {unit}"], spans)
             if spans

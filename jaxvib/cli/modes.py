@@ -255,14 +255,17 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     }
 
     def text() -> str:
-        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
+        from jaxvib.display import speed_text, speed_unit  # slow imports, which --help does not need
+        from jaxvib.steady.jams.patterns import images_text
 
         unit, scale = speed_unit()
-        rows = [_phase_row(jam, scale) for jam in jams]
+        distinct = result.distinct  # mirror images are one row
+        shown = [(jams[each[0]], measures[each[0]]) for each in distinct]
+        rows = [_phase_row(jam, scale, images_text(each)) for each, (jam, _) in zip(distinct, shown, strict=True)]
         rotor = speed_text(scene.drive.speed)
         head = [unit, "", "pattern of the loads", "phases, degrees", "foundation force, N"]
         title = f"light-load jams with unequal phases; rotor {rotor}"
-        stable_jams = [f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam in jams if jam.stable]
+        stable_jams = [f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam, _ in shown if jam.stable]
         reached = _reached_lines(scene, output, [f"the jam at {each}" for each in stable_jams], balanced)
         if not rows:
             return "\n".join([f"no jam at {rotor}", *reached, *_drag_lines(scene, limits, points=not is_gathered)])
@@ -273,7 +276,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
         )
         measure_texts = [
             indented(f"at {speed_text(jam.omega)}:", measures_of_jam)
-            for jam, measures_of_jam in zip(jams, measures, strict=True)
+            for jam, measures_of_jam in shown
             if measures_of_jam is not None
         ]
         drags = _drag_lines(scene, limits, points=not is_gathered)
@@ -283,15 +286,16 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     output.done(document, text, "modes", result)
 
 
-def _phase_row(jam: jv.PhaseJam, scale: float) -> list[str]:
-    """Return a jam as a row of the table; `scale` converts rad/s to the display unit."""
+def _phase_row(jam: jv.PhaseJam, scale: float, images: str) -> list[str]:
+    """Return a jam as a row of the table; `scale` converts rad/s to the display unit; `images`: number of mirror images as
+    text."""
     from jaxvib.results.status import sentence  # slow imports, which --help does not need
     from jaxvib.steady.jams.phases import degrees
 
     return [
         f"{scale * float(jam.omega):.5g}",
         "stable" if jam.stable else "unstable",
-        sentence(jam.pattern),
+        f"{sentence(jam.pattern)}{images}",
         " ".join(f"{degrees(float(a)):.4g}" for a in jam.phase),
         f"{float(jam.foundation_force):.4g}",
     ]

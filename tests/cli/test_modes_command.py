@@ -10,6 +10,7 @@ from scenes import scene
 import jaxvib as jv
 from jaxvib.cli.modes import _drag_lines, _imbalance_lines
 from jaxvib.machine.files import TEMPLATES
+from jaxvib.steady.jams.phase_search import PhaseJams
 
 
 def test_modes_json_has_the_promised_keys(typed):
@@ -74,7 +75,7 @@ def test_modes_name_a_resonance_without_a_peak(typed, tmp_path):
     assert "at no rotor speed" not in typed("modes", "machine.toml")[1] + jv.jam_modes(plain).summary()
 
 
-def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
+def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path, monkeypatch):
     machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     rotor = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
     jv.save_scene(rotor, tmp_path / "rotor.toml")
@@ -88,6 +89,10 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     out = typed("modes", "rotor.toml")[1]
     assert "loads can stay jammed at 1572.1 rpm (all together)" in out
     assert "several motions are stable: the jam at 1572.1 rpm (all together), balanced loads" in out
+    assert "│ 1904" in out and "images)" not in out
+    monkeypatch.setattr(PhaseJams, "distinct", [np.array([0, 1]), np.array([2])])
+    merged = typed("modes", "rotor.toml")[1]
+    assert "│ 1904" not in merged and "│ 1572" in merged and merged.count("images)") == 1
     assert "jaxvib simulate rotor.toml --until 100s --start spin_up" in out
     assert "zero to peak, root sum square of both directions\n  (sqrt(2) times" in out
     (tmp_path / "stations.toml").write_text(TEMPLATES["rotor"])

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxvib.errors import InputError
+from jaxvib.steady.jams.patterns import is_same_pattern, is_same_set
 
 
 class Arrangements(NamedTuple):
@@ -99,3 +100,29 @@ def neutral_directions(sides: np.ndarray, angles: np.ndarray, *, turns: bool = T
     common = np.full((n, 1), 1.0 / np.sqrt(n))
     basis, size, _ = np.linalg.svd(others - common @ (common.T @ others), full_matrices=False)
     return np.concatenate([common, basis[:, size > 0.5]], axis=1)
+
+
+def distinct_arrangements(
+    angles: np.ndarray, groups: list[np.ndarray], axis: float | None, *, can_turn: bool
+) -> list[np.ndarray]:
+    """Return the indices of arrangements (n, N) that are the same but for an exchange of equal loads or a reflection, in one
+    array for each distinct arrangement.
+
+    **Arguments**: `groups`: indices of equal loads; `axis`: angle of the axis of reflection, rad, None for none; `can_turn`:
+    True if a common rotation of all loads does not change an arrangement.
+    """
+
+    def is_image(first: np.ndarray, second: np.ndarray) -> bool:
+        images = [second] if axis is None else [second, 2.0 * axis - second]
+        if can_turn:
+            return any(is_same_pattern(first, each, groups) for each in images)
+        return any(all(is_same_set(np.exp(1j * first[g]), np.exp(1j * each[g])) for g in groups) for each in images)
+
+    found: list[list[int]] = []
+    for k, row in enumerate(angles):
+        same = next((indices for indices in found if is_image(angles[indices[0]], row)), None)
+        if same is None:
+            found.append([k])
+        else:
+            same.append(k)
+    return [np.array(indices) for indices in found]

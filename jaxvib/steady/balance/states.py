@@ -22,13 +22,14 @@ from jaxvib.machine.effects.terms import GravityField, LoadInteraction, RotorImb
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
+from jaxvib.machine.structures.rotor import PlanarRotor, Rotor
 from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.balance.arrangements import arrangements
+from jaxvib.steady.balance.arrangements import arrangements, distinct_arrangements
 from jaxvib.steady.balance.monodromy import (
     BATCH,
     at_constant_speed,
@@ -37,6 +38,7 @@ from jaxvib.steady.balance.monodromy import (
     monodromies,
     validate_steps,
 )
+from jaxvib.steady.jams.patterns import images_text
 from jaxvib.steady.jams.phases import degrees
 from jaxvib.units import Number, Numbers, count, number, numbers
 
@@ -151,9 +153,22 @@ class BalancedStates(Result):
             raise InputError("arrangement", f"is {quoted(arrangement)}; there are {len(self.angles)}, counted from 0")
         return self.angles[arrangement]
 
+    @property
+    def distinct(self) -> list[np.ndarray]:
+        """Indices of arrangements that differ only by an exchange of equal loads or, for a rotor whose supports are equal in
+        all directions, by a reflection, in one array for each distinct arrangement."""
+        planes = _planes(self.scene)
+        angles = {np.angle(plane.imbalance) % np.pi for plane in planes if plane.imbalance}
+        axis = min(angles, default=0.0)
+        one_axis = all(abs(np.sin(angle - axis)) < 1e-9 for angle in angles)
+        is_symmetric = one_axis and _is_isotropic(self.scene)
+        groups = _equal_loads(self.scene, [plane.loads for plane in planes])
+        return distinct_arrangements(self.angles, groups, axis if is_symmetric else None, can_turn=not angles)
+
     def summary(self) -> str:
-        """Return the arrangements and their neutral directions as text."""
-        rows = ["  " + ", ".join(f"{degrees(a) % 360.0:.4g}" for a in row) + " deg" for row in self.angles]
+        """Return the arrangements, see `distinct`, and their neutral directions as text."""
+        first = {each[0]: images_text(each) for each in self.distinct}
+        rows = [f"  {', '.join(f'{degrees(a) % 360.0:.4g}' for a in self.angles[k])} deg{text}" for k, text in first.items()]
         if not rows:
             pairs = [(abs(plane.imbalance), most) for plane, most in zip(_planes(self.scene), self.capacity, strict=True)]
             amounts = [
@@ -233,8 +248,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
     >>> imbalance = jv.StaticImbalance("50 g m", angle="90 deg")    # as much as each of the balls
     >>> print(jv.balanced_states(jv.Scene(machine, loads, jv.ConstantSpeed(100.0), (imbalance,))).summary())
     the loads of each plane cancel in one arrangement and its mirror image
-      210, 330 deg
-      330, 210 deg
+      210, 330 deg (2 mirror images)
     neutral directions: none
 
     Source: Filimonikhin et al. 2022, section 2 (families of three or more loads, including the common rotation); derived here.
@@ -325,6 +339,24 @@ def _planes(scene: Scene) -> list[_Plane]:
         is_zero = abs(imbalance) <= _rounding() * (abs(static) + abs(moment) / abs(here - other))
         planes.append(_Plane(np.flatnonzero(distances == here), 0j if is_zero else imbalance))
     return planes
+
+
+def _equal_loads(scene: Scene, planes: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the indices of the loads of each group of equal loads in one plane."""
+    loads = turning_loads(scene)
+    columns = [np.broadcast_to(np.asarray(leaf), (loads.count,)) for leaf in jax.tree.leaves(loads)]
+    _, which = np.unique(np.stack(columns), axis=1, return_inverse=True)
+    groups = (plane[which.ravel()[plane] == k] for plane in planes for k in range(loads.count))
+    return [group for group in groups if group.size]
+
+
+def _is_isotropic(scene: Scene) -> bool:
+    """Return True for a rotor on supports that are equal in all directions, without effects on the machine."""
+    machine = scene.machine
+    if scene.effects or not isinstance(machine, (Rotor, PlanarRotor)):
+        return False
+    pairs = ((machine.stiffness, machine.stiffness_up), (machine.damping, machine.damping_up))
+    return all(up is None or np.array_equal(np.asarray(across), np.asarray(up)) for across, up in pairs)
 
 
 def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int | None = None) -> BalancedStability:

@@ -13,7 +13,13 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text
 from jaxvib.equations.averaged import averaged_growth, decays
-from jaxvib.equations.torque_balance import TorqueBalance, assemble_for_search, assemble_torque_balance, response_of
+from jaxvib.equations.torque_balance import (
+    TorqueBalance,
+    assemble_for_search,
+    assemble_torque_balance,
+    influence_of,
+    response_of,
+)
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -24,6 +30,7 @@ from jaxvib.results.status import sentence, status_names
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.patterns import SAME_PHASE_DIFFERENCE, images_text, is_same_pattern
 from jaxvib.steady.jams.phase_starts import (
     LOAD_SPEEDS,
     distinct_rows,
@@ -35,6 +42,7 @@ from jaxvib.steady.jams.phase_starts import (
 )
 from jaxvib.steady.jams.phases import AbstractPhaseJam, PhaseJam, PhaseStatus, jam_from, loads_with_drag, phase_jam
 from jaxvib.steady.outcome import entry, require_index
+from jaxvib.steady.regimes.symmetry import Exchange, exchanges_of
 from jaxvib.units import count, random_numbers
 
 _SHOWN_DRAG_FACTOR = 30.0
@@ -53,8 +61,8 @@ _SAME_LINE_DIFFERENCE = 5e-3
 _JAMS_PER_PROGRAM = 64
 """Number of jams in one program; typical scenes have some tens."""
 
-_SAME_SPEED_DIFFERENCE, _SAME_PHASE_DIFFERENCE = 1e-6, 1e-5
-"""Differences of speed (relative) and of phase (rad) below which two jams count as one."""
+_SAME_SPEED_DIFFERENCE = 1e-6
+"""Relative difference of speed below which two jams count as one if their phases are the same, too."""
 
 
 class PhaseJams(AbstractPhaseJam):
@@ -86,9 +94,35 @@ class PhaseJams(AbstractPhaseJam):
         """
         return phase_branch(self.scene, self.select(index), omega)
 
+    @property
+    def distinct(self) -> list[np.ndarray]:
+        """Indices of jams that differ only by a mirror image or another exchange of loads that leaves the machine unchanged, in
+        one array for each distinct jam. Example: exchange of the loads of two planes of a rotor whose ends are equal."""
+        omega, phase = np.asarray(self.omega), np.asarray(self.phase)
+        if not omega.size:
+            return []
+        balance = assemble_torque_balance(self.scene)
+        groups = equal_loads(balance)  # one load stands for all equal loads of a station
+        one, sizes = np.array([group[0] for group in groups]), [len(group) for group in groups]
+        influence = np.asarray(_influences(balance, self.omega))[:, one[:, None], one]
+        parameters = np.stack([balance.unbalance, balance.drag, balance.averaged.inertia], axis=1)[one]
+        exchanges = exchanges_of(influence, np.column_stack([parameters, sizes]))
+        found: list[list[int]] = []
+        for k, each in enumerate(phase):
+            images = [_exchanged(each, groups, exchange) for exchange in exchanges]
+            for indices in found:
+                first = indices[0]
+                near = abs(omega[k] - omega[first]) < _SAME_SPEED_DIFFERENCE * omega[k]
+                if near and any(is_same_pattern(phase[first], image, groups) for image in images):
+                    indices.append(k)
+                    break
+            else:
+                found.append([k])
+        return [np.array(indices) for indices in found]
+
     def summary(self) -> str:
-        """Return a table in text; amplitudes zero to peak, phases in degrees."""
-        jams = [self.select(k).summary() for k in range(self.omega.shape[0])] or ["no jam"]
+        """Return a line for each jam, see `distinct`; phases in degrees."""
+        jams = [self.select(each[0]).summary() + images_text(each) for each in self.distinct] or ["no jam"]
         as_points = "loads count as points: jams at free phases do not include their ball_radius"
         return "\n".join([*jams, *([] if getattr(self.scene.loads, "ball_radius", None) is None else [as_points])])
 
@@ -225,8 +259,8 @@ def _distinct_jams(
     cells = np.concatenate(
         [
             np.log(omega)[:, None] / _SAME_SPEED_DIFFERENCE,
-            np.cos(phase) / _SAME_PHASE_DIFFERENCE,
-            np.sin(phase) / _SAME_PHASE_DIFFERENCE,
+            np.cos(phase) / SAME_PHASE_DIFFERENCE,
+            np.sin(phase) / SAME_PHASE_DIFFERENCE,
         ],
         axis=1,
     )
@@ -239,13 +273,26 @@ def _distinct_jams(
         k = once[m]
         while near < len(places) and not abs(omega[places[near]] - omega[k]) < _SAME_SPEED_DIFFERENCE * omega[places[near]]:
             near += 1
-        place = next((i for i in range(near, len(places)) if _is_same_pattern(phase[places[i]], phase[k], groups)), None)
+        place = next((i for i in range(near, len(places)) if is_same_pattern(phase[places[i]], phase[k], groups)), None)
         if place is None:
             places.append(int(k))
             reached.append(int(starts[m]))
         else:
             reached[place] += int(starts[m])
     return places, np.asarray(reached, dtype=int)
+
+
+def _exchanged(phase: np.ndarray, groups: list[np.ndarray], exchange: Exchange) -> np.ndarray:
+    """Return phases (count,) after an exchange of the `groups` of equal loads."""
+    image = np.empty_like(phase)
+    for group, place, shift in zip(groups, exchange.permutation, exchange.shift, strict=True):
+        image[groups[place]] = phase[group] + shift
+    return image
+
+
+@cached
+def _influences(balance: TorqueBalance, omega: Array) -> Array:
+    return jax.vmap(lambda w: influence_of(balance, w))(omega)
 
 
 @cached
@@ -304,32 +351,6 @@ def _follow_pattern(scene: Scene, phase: Array, omega: Array, restart: Array) ->
         return jnp.where(good, angles, start), (factor, jnp.where(good, angles, jnp.nan), growth, good & decays(growth, w))
 
     return jax.lax.scan(step, phase, (omega, restart))[1]
-
-
-def _is_same_pattern(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bool:
-    """Return True if two sets of phases differ only by a common rotation and by an exchange of equal loads."""
-
-    def points(phase: np.ndarray, group: np.ndarray) -> np.ndarray:
-        return np.exp(1j * phase[group])
-
-    if np.max(np.abs(np.exp(1j * first) - np.exp(1j * second))) < _SAME_PHASE_DIFFERENCE:  # the common case
-        return True
-    lead = points(first, groups[0])[0]
-    for start in points(second, groups[0]):
-        turned = [points(second, g) * lead / start for g in groups]
-        if all(_is_same_set(points(first, g), other) for g, other in zip(groups, turned, strict=True)):
-            return True
-    return False
-
-
-def _is_same_set(first: np.ndarray, second: np.ndarray) -> bool:
-    """Return True if two sets of points are the same in some order."""
-    left = list(second)
-    for point in first:
-        near = int(np.argmin([abs(point - other) for other in left]))
-        if abs(point - left.pop(near)) > _SAME_PHASE_DIFFERENCE:
-            return False
-    return True
 
 
 _PHASE_JUMP = 0.3

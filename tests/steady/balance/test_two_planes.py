@@ -50,8 +50,9 @@ def test_summary_lists_angles_within_a_turn():
     states = jv.balanced_states(jv.Scene(rotor(), balls, jv.ConstantSpeed(450.0), effects))
     assert np.max(states.angles) > 2.0 * np.pi  # loads that cannot pass each other: angles ascend within a plane
     head, *rows, _ = states.summary().splitlines()
-    assert head == "the loads of each plane cancel in one arrangement and its mirror image" and len(rows) == 4
-    assert all(0.0 <= float(angle) < 360.0 for row in rows for angle in row.removesuffix(" deg").split(","))
+    assert head == "the loads of each plane cancel in one arrangement and its mirror image" and len(rows) == 1
+    angles = rows[0].removesuffix(" deg (4 mirror images)").split(",")
+    assert len(angles) == 4 and all(0.0 <= float(angle) < 360.0 for angle in angles)
 
 
 def test_stations_that_differ_by_rounding_are_in_one_plane():
@@ -137,3 +138,33 @@ def test_a_plane_without_enough_loads_is_named():
     lines = _balance_text(states, [], []).splitlines()
     heads = ("imbalance in plane 1 (loads 3, 4): ", "imbalance in plane 2 (loads 1, 2): ")
     assert all(any(line.startswith(head) for line in lines) for head in heads)
+
+
+ALONG_ONE_AXIS = (jv.StaticImbalance("3 g m", angle=0.4), jv.MomentImbalance(1e-4, angle=0.4))
+UNEQUAL = [0.05, 0.06, 0.04, 0.05]
+
+
+@pytest.mark.parametrize(
+    ("mass", "effects", "more", "distinct"),
+    [
+        (LOAD, EFFECTS, {}, [[0, 1, 2, 3]]),  # exchanges of equal loads need no symmetry of the rotor
+        (LOAD, EFFECTS, {"stiffness_up": (9e5, 5e5)}, [[0, 1, 2, 3]]),
+        (UNEQUAL, ALONG_ONE_AXIS, {}, [[0, 3], [1, 2]]),
+        (UNEQUAL, ALONG_ONE_AXIS, {"stiffness_up": (K1, K2)}, [[0, 3], [1, 2]]),
+        (UNEQUAL, ALONG_ONE_AXIS, {"stiffness_up": (9e5, 5e5)}, [[0], [1], [2], [3]]),
+        (UNEQUAL, EFFECTS, {}, [[0], [1], [2], [3]]),  # two imbalances at different angles
+    ],
+)
+def test_mirror_images_are_one_row(mass, effects, more, distinct):
+    balls = jv.balls(count=4, mass=mass, radius=R, drag=DRAG)
+    states = jv.balanced_states(jv.Scene(rotor(**more), balls, jv.ConstantSpeed(450.0), effects))
+    assert [each.tolist() for each in states.distinct] == distinct and len(states.angles) == 4
+    counts = [f" ({len(each)} mirror images)" if len(each) > 1 else "" for each in distinct]
+    assert [row.partition(" deg")[2] for row in states.summary().splitlines()[1:-1]] == counts
+    growth = [states.stability(k).growth for k in range(4)]
+    for each in distinct:
+        np.testing.assert_allclose([growth[k] for k in each], growth[each[0]], rtol=1e-6)
+    if distinct == [[0, 3], [1, 2]]:
+        assert abs(growth[0] - growth[1]) > 1e-3 * abs(growth[0])
+    text = _balance_text(states, [states.stability(k) for k in range(4)], [])
+    assert text.count("mirror images)") == sum(len(each) > 1 for each in distinct)

@@ -12,7 +12,8 @@ import jaxvib as jv
 from jaxvib.draw.style import COLORS
 from jaxvib.equations.torque_balance import assemble_torque_balance, influence_of, torques_at
 from jaxvib.numerics.linalg import eliminate
-from jaxvib.steady.jams.phase_search import _is_same_pattern, phase_branch
+from jaxvib.steady.jams.patterns import is_same_pattern
+from jaxvib.steady.jams.phase_search import phase_branch
 from jaxvib.steady.jams.phases import growth_of_free_loads, phase_jam, phase_pattern
 
 K1, K2, L1, L2 = 0.604e6, 0.555e6, 0.165, 0.155
@@ -247,8 +248,8 @@ def test_derivatives_are_the_implicit_function_theorems():
 def test_a_common_turn_and_equal_loads_make_no_new_jam():
     rng = np.random.default_rng(0)
     phase, groups = rng.uniform(-3.0, 3.0, 4), [np.array([0, 1]), np.array([2, 3])]
-    assert _is_same_pattern(phase, phase + 1.234, groups) and _is_same_pattern(phase, phase[[1, 0, 2, 3]] - 9.0, groups)
-    assert not _is_same_pattern(phase, phase[[2, 1, 0, 3]], groups) and not _is_same_pattern(
+    assert is_same_pattern(phase, phase + 1.234, groups) and is_same_pattern(phase, phase[[1, 0, 2, 3]] - 9.0, groups)
+    assert not is_same_pattern(phase, phase[[2, 1, 0, 3]], groups) and not is_same_pattern(
         phase, phase + np.array([0.0, 0.0, 0.0, 1e-3]), groups
     )
 
@@ -362,3 +363,25 @@ def test_an_undamped_motion_apart_from_the_loads_is_not_stable(stiffness):
     scene = jv.Scene(machine, exciters=[jv.Exciter(loads, jv.ConstantSpeed(460.0), at=1)])
     jam = jv.phase_jams(scene, near=(165.0, np.zeros(1)))
     assert abs(float(jam.growth)) < 1e-9 and not jam.stable
+
+
+@pytest.mark.parametrize(("second", "mirrored"), [(6e5, True), (6.1e5, False)])
+def test_exchanges_of_equal_planes_are_one_row(second, mirrored):
+    """The results keep all jams."""
+    machine = jv.rotor(
+        mass=37.0, transverse_inertia=0.5, polar_inertia=0.1, stiffness=(6e5, second), damping=(400.0, 400.0),
+        position=(0.15, -0.15), stations=(0.1, 0.1, -0.1, -0.1),
+    )  # fmt: skip
+    loads = jv.pendulums(count=4, mass=0.05, radius=0.08, drag=0.1)
+    jams = jv.phase_jams(jv.Scene(machine, loads, jv.ConstantSpeed(460.0)), starts=16)
+    several = [each for each in jams.distinct if len(each) > 1]
+    assert sorted(np.concatenate(jams.distinct).tolist()) == list(range(jams.omega.size)) and bool(several) == mirrored
+    rows = jams.summary().splitlines()
+    assert len(rows) == len(jams.distinct) and sum("(2 mirror images)" in row for row in rows) == len(several)
+    for first, other in several:
+        for name in ("omega", "growth", "foundation_force"):
+            np.testing.assert_allclose(getattr(jams, name)[first], getattr(jams, name)[other], rtol=1e-6)
+        swapped = jams.phase[other][jnp.array([2, 3, 0, 1])]
+        assert is_same_pattern(jams.phase[first], swapped, [np.array([0, 1]), np.array([2, 3])])
+    if mirrored:
+        assert len(several) >= 3
