@@ -27,6 +27,9 @@ _DOCUMENT = """{
 
 def main() -> None:
     """Run the command line. An interrupt ends the process with one line on stderr and exit code 1."""
+    # XLA writes a warning addressed to its developers on stderr if a program compiles in more than two minutes. Its other
+    # messages of this level are raised as exceptions too.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
         _end_at_interrupts()
     except KeyboardInterrupt:

@@ -136,7 +136,8 @@ def synthesize(
     options = _options(starts, seed, iterations, polishing, rate, searcher)
     demands = _validate_demands(space, objective, subject_to)
 
-    report = partial(_report, progress, _SEARCH_SHARE if verify else 0.9)
+    motion = _motion_of(space, objective, demands)
+    report = partial(_report, progress, _SEARCH_SHARE if verify and motion is not None else 0.9)
     if begin is not None:
         options = dataclasses.replace(options, begin=_designs_to_continue(space, begin), starts=len(begin.designs))
     initial_space = space
@@ -144,7 +145,6 @@ def synthesize(
     neighbour_scenes = scenes_of(problem, neighbours(problem, result))
     scene = validate_scene(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], neighbour_scenes)))
     status, why_unverified, searched = _describe_searches(result, space)
-    motion = _motion_of(space, objective, demands)
     named = _named_quantities(space, scene, objective, demands, motion)
     demand_sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
     reports = _values_of_all((*(q for _, q in named), objective, *demand_sides), initial_space.scene, neighbour_scenes, problem)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from jaxvib.cli.app import TOLERANCE, Output, command, require_tolerances, table, tolerance_table
-from jaxvib.cli.output import fields_of, note, write_file
+from jaxvib.cli.output import duration_text, fields_of, note, write_file
 
 if TYPE_CHECKING:
     from optimize import Demand, Design, Quantity, Synthesis, ToleranceRange
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 
 _MIN_SHARE_OF_MACHINES = 0.95
 """Share of the machines within tolerances that should meet a demand. A text states a smaller share."""
+
+_MIN_SHARE_OF_ESTIMATE = 0.1
+"""Smallest finished share of a search from which its remaining time is estimated."""
 
 
 @command("optimize", "design")
@@ -60,7 +64,7 @@ def optimize(
             subject_to=loaded.subject_to,
             begin=None if resume is None else Synthesis.load(resume),
             verify=not no_verify,
-            progress=progress,
+            progress=_with_time_left(progress),
             **options,
         )
     output.save_result("search.npz", best)
@@ -85,6 +89,17 @@ def optimize(
     if tolerances:
         parts += [tolerance_table(ranges, tolerances), *_few_machines_texts(ranges, loaded.subject_to)]
     output.done(document, lambda: "\n".join([_text(best), *parts]), "optimize", best)
+
+
+def _with_time_left(progress: Callable[[str, float], None]) -> Callable[[str, float], None]:
+    """Return a function that adds the estimated time left to the names of steps."""
+    begun = time.monotonic()
+
+    def report(what: str, share: float) -> None:
+        left = (time.monotonic() - begun) * (1.0 - share) / max(share, _MIN_SHARE_OF_ESTIMATE)
+        progress(f"{what}, about {duration_text(left)} left" if share >= _MIN_SHARE_OF_ESTIMATE else what, share)
+
+    return report
 
 
 def _draw_working_regime(output: Output, design: Design, best: Synthesis) -> None:

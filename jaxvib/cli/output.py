@@ -50,6 +50,13 @@ SECONDS_BETWEEN_LINES = 10.0
 """Time between lines of progress, s, if the output is not a terminal."""
 
 
+def duration_text(seconds: float) -> str:
+    """Return a duration in hours, minutes and seconds."""
+    total = round(seconds)
+    hours, rest = divmod(total, 3600)
+    return f"{hours} h {rest // 60} min" if hours else f"{rest // 60} min {rest % 60} s" if rest >= 60 else f"{rest} s"
+
+
 def fields_of(result: object, *names: str) -> dict[str, object]:
     """Return fields of a result by their names, for a document."""
     return {name: getattr(result, name) for name in names}
@@ -136,9 +143,12 @@ class Output:
     @contextlib.contextmanager
     def progress(self) -> Iterator[Callable[[str, float], None]]:
         """Show a bar on a terminal, or lines at intervals elsewhere; the yielded function takes the name of a step and the
-        finished share (0 to 1)."""
+        finished share (0 to 1). "compiling, once" follows the bar while a program is compiled."""
         from rich.console import Console  # slow imports, which --help does not need
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+        from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn
+        from rich.text import Text
+
+        from jaxvib.runtime.stored import is_compiling
 
         self.end_waiting()
         if not sys.stderr.isatty():
@@ -152,7 +162,12 @@ class Output:
 
             yield line
             return
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+
+        class CompilingColumn(TextColumn):
+            def render(self, task: Task) -> Text:
+                return Text("compiling, once" if is_compiling() else "")
+
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), CompilingColumn(""))
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task("", total=1.0)
             yield lambda what, share: bar.update(task, description=what, completed=share)

@@ -114,9 +114,10 @@ class StoredFunction(Generic[T]):
                 if program is _UNKNOWN:
                     with evaluating():  # inside a transformation JAX would trace these transfers
                         on_device = arrays_on_device(leaves)
-                        program = self._program(folder, on_device, treedef, sharding)
-                        if program is not None:
-                            program.compile(leaf for leaf in on_device if eqx.is_array(leaf))
+                        with _compilation():
+                            program = self._program(folder, on_device, treedef, sharding)
+                            if program is not None:
+                                program.compile(leaf for leaf in on_device if eqx.is_array(leaf))
                     self.ready[key] = program
             _evict_least_recently_used()
         return program
@@ -240,6 +241,24 @@ def _estimated_memory(stored: bytes) -> int:
     """Return the estimated memory, bytes, of a program with this stored form."""
     operations = len(zlib.compress(stored, level=1))
     return MEMORY_PER_PROGRAM + MEMORY_PER_COMPRESSED_BYTE * operations + MEMORY_PER_STORED_BYTE * len(stored)
+
+
+_compilations: list[None] = []
+"""An entry for each program that a thread is making ready."""
+
+
+@contextlib.contextmanager
+def _compilation() -> Iterator[None]:
+    _compilations.append(None)
+    try:
+        yield
+    finally:
+        _compilations.pop()
+
+
+def is_compiling() -> bool:
+    """Return True if a thread is tracing, compiling or reading a program."""
+    return bool(_compilations)
 
 
 _traces_lock = threading.Lock()

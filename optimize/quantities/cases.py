@@ -18,7 +18,7 @@ from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers, 
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import greatest
 from jaxvib.units import Number, count
-from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder
+from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, mapped
 from optimize.quantities.quantity import Quantity
 
 
@@ -157,7 +157,7 @@ class Robust(_DerivedQuantity):
             keys_found[:] = inner.speeds
             return value, tuple(inner.speeds.values())
 
-        values, speeds = jax.vmap(value_of)(scenes, near)
+        values, speeds = mapped(value_of, one_by_one=self.forward_only)(scenes, near)
         evaluation.speeds.update(zip(keys_found, speeds, strict=True))
         return values
 

@@ -18,6 +18,7 @@ from jaxvib.numerics.linalg import small_solve
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
+from optimize.quantities.evaluation import mapped
 from optimize.search.problem import Point, Problem, derive
 
 STEPS_PER_CALL = 25
@@ -144,7 +145,7 @@ def _extrapolate(speeds: Array, speed_slopes: Array, step: Array) -> Array:
 @cached
 def _run_steps(problem: Problem, states: _SearchState, rates: Array) -> tuple[_SearchState, Array]:
     def step(states: _SearchState, rate: Array) -> tuple[_SearchState, Array]:
-        return jax.vmap(lambda state: _step(problem, state, rate))(states)
+        return mapped(lambda state: _step(problem, state, rate), one_by_one=problem.forward_only)(states)
 
     states, history = jax.lax.scan(step, states, rates)
     return states, history.T
@@ -163,12 +164,12 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, report: Cal
     schedule = optax.cosine_decay_schedule(rate, steps, alpha=0.01)
     rates = np.asarray(jax.jit(schedule)(np.arange(steps)))
     rates = np.pad(rates, (0, -steps % STEPS_PER_CALL)).reshape(-1, STEPS_PER_CALL)
-    states = in_chunks(problem.batch_size, _initial_states, point, np.zeros((len(point.z), len(problem.demands))))
+    states = in_chunks(problem.designs_per_call, _initial_states, point, np.zeros((len(point.z), len(problem.demands))))
     history: list[np.ndarray] = []
     for k, part in enumerate(rates):
         part_rates = on_device(part)
         states, values = in_chunks(
-            problem.batch_size, lambda state, part_rates=part_rates: _run_steps(problem, state, part_rates), states
+            problem.designs_per_call, lambda state, part_rates=part_rates: _run_steps(problem, state, part_rates), states
         )
         history.append(values)
         report((k + 1) / len(rates), _point(states))

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
+from optimize.quantities.evaluation import mapped
 from optimize.search.problem import Point, Problem, Speeds, evaluate, find_speeds
 
 _VIOLATION_PENALTY = 10.0
@@ -59,7 +59,7 @@ def require_cma() -> None:
 
 @cached
 def _evaluate_designs(problem: Problem, z: Array, near: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
-    return jax.vmap(lambda x, w: problem.values(x, w))(z, near)
+    return mapped(lambda x, w: problem.values(x, w), one_by_one=problem.forward_only)(z, near)
 
 
 class PopulationValues:
@@ -96,7 +96,7 @@ class PopulationValues:
         return values
 
     def _at(self, z: np.ndarray, near: Speeds) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        values, speeds = in_chunks(self.problem.batch_size, lambda x, w: _evaluate_designs(self.problem, x, w), z, near)
+        values, speeds = in_chunks(self.problem.designs_per_call, lambda x, w: _evaluate_designs(self.problem, x, w), z, near)
         return np.array(values), tuple(np.array(each) for each in speeds)
 
 

@@ -25,6 +25,9 @@ _MAX_NODES = 400
 _STARTS_PER_BOUND = 8
 """Number of initial designs of each bounded problem."""
 
+_STARTS_WITH_RUNS = 8
+"""Number of initial designs from which a search descends if its quantities are computed by time integration."""
+
 Progress = Callable[[str, float], None]
 
 Searcher = Literal["gradients", "cma"]
@@ -167,6 +170,8 @@ def _search_from_starts(problem: Problem, options: Options, report: Progress) ->
         starts = draw_starts(problem, options.starts, options.seed, find_speeds)
         point = starts.point if starts.point is not None else starts.off_held
         drawn, existing = starts.drawn, starts.existing
+        if point is not None and problem.forward_only:
+            point = point.take(_distinct(point, violation(problem, point))[:_STARTS_WITH_RUNS])
     if point is None or len(point.z) == 0:
         return None
     history.append(point.values[None, :, 0])
@@ -181,12 +186,14 @@ def _search_from_starts(problem: Problem, options: Options, report: Progress) ->
 
         return report_point
 
+    selected, descent_end = _shares_of_phases(problem, options, drawn, len(point.z))
     try:
         if options.iterations:
-            descended = descend(problem, point, options.iterations, options.rate, progress_of("descending", 0.55, 0.7))
+            progress = progress_of("descending", selected, descent_end)
+            descended = descend(problem, point, options.iterations, options.rate, progress)
             history.append(descended.history)
             point = descended.point
-        polished = polish(problem, point, options.polishing, progress_of("polishing", 0.7, 0.9))
+        polished = polish(problem, point, options.polishing, progress_of("polishing", descent_end, 0.9))
     except KeyboardInterrupt:
         interrupted = True
         polished = polish(problem, last, 0, lambda *_: None)
@@ -197,6 +204,19 @@ def _search_from_starts(problem: Problem, options: Options, report: Progress) ->
     width = max(part.shape[1] for part in history)
     joined = np.concatenate([np.broadcast_to(part, (len(part), width)) for part in history])
     return SearchResult(*polished._replace(history=joined), drawn, existing, interrupted, bounds)
+
+
+def _shares_of_phases(problem: Problem, options: Options, drawn: int, begun: int) -> tuple[float, float]:
+    """Return the shares of a search that are finished when its `begun` initial designs are selected, and after their descent.
+
+    The time of a search with time integrations is proportional to the number of computed designs.
+    """
+    if not problem.forward_only:
+        return 0.55, 0.7
+    per_step = 2 * problem.space.size + 2  # second derivatives, and two trials
+    counts = np.cumsum([drawn, begun * options.iterations, begun * options.polishing * per_step])
+    selected, descent_end, _ = 0.9 * counts / counts[-1]
+    return float(selected), float(descent_end)
 
 
 def _restore_modes(problem: Problem, polished: Polished, initial: Point) -> Polished:
@@ -321,13 +341,17 @@ def _distance_to_catalogue(values: tuple[float, ...], x: float) -> float:
 
 def _best_distinct(result: SearchResult) -> np.ndarray:
     """Return the best distinct designs, (at most 7, d)."""
-    order = np.argsort(result.feasible_values)
-    distinct: list[np.ndarray] = []
-    for k in order:
-        z = result.point.z[k]
-        if np.isfinite(result.point.values[k, 0]) and all(np.max(np.abs(z - other)) > 1e-2 for other in distinct):
-            distinct.append(z)
-    return np.reshape(distinct[: _STARTS_PER_BOUND - 1], (-1, result.point.z.shape[1]))
+    return result.point.z[_distinct(result.point, result.violation)[: _STARTS_PER_BOUND - 1]]
+
+
+def _distinct(point: Point, violations: np.ndarray) -> np.ndarray:
+    """Return the indices of the distinct designs that exist: those that meet all demands by their objective, then the others by
+    their `violations` (s,)."""
+    distinct: list[int] = []
+    for k in np.lexsort((point.values[:, 0], np.where(violations < MAX_VIOLATION, 0.0, violations))):
+        if np.isfinite(point.values[k, 0]) and all(np.max(np.abs(point.z[k] - point.z[j])) > 1e-2 for j in distinct):
+            distinct.append(int(k))
+    return np.asarray(distinct, int)
 
 
 def _solve_in_bounds(

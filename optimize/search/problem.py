@@ -12,7 +12,7 @@ objective, q quantities. In a design z in [0, 1]^d, each free parameter is scale
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ from jaxvib.runtime.operations import program_digest
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import JamModes, jam_modes
-from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, speed_of_target
+from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, mapped, speed_of_target
 from optimize.quantities.quantity import BuiltinQuantity, Demand, Quantity, walk
 from optimize.space import DesignSpace, HeldQuantity
 
@@ -68,6 +68,11 @@ class Problem(eqx.Module):
     batch_size: int = eqx.field(static=True, default=_MAX_BATCH_SIZE)
     parts: int = eqx.field(static=True, default=1)
     program: str = eqx.field(static=True, default="")
+
+    @property
+    def designs_per_call(self) -> int:
+        """Number of designs that a compiled program computes in one call."""
+        return 1 if self.forward_only else self.batch_size
 
     @property
     def equalities(self) -> int:
@@ -123,7 +128,12 @@ class Problem(eqx.Module):
     def forward_only(self) -> bool:
         """True if the derivatives of a quantity exist in forward mode only."""
         quantities = [self.objective, *(q for d in self.demands for q in (d.quantity, d.limit))]
-        return any(q.forward_only for q in quantities) or any(h.quantity.forward_only for h in self.space.held)
+        return has_runs([*quantities, *(h.quantity for h in self.space.held)])
+
+
+def has_runs(quantities: Iterable[Quantity]) -> bool:
+    """Return True if one of the quantities is computed by time integration."""
+    return any(quantity.forward_only for quantity in quantities)
 
 
 def _targets_of_search(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> tuple[tuple[Key, ...], int, str]:
@@ -242,7 +252,7 @@ def derive(
 def _derive_all(
     problem: Problem, z: Array, near: tuple[Array, ...]
 ) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
-    return jax.vmap(lambda x, w: derive(problem, x, w, problem.parts > 1))(z, near)
+    return mapped(lambda x, w: derive(problem, x, w, problem.parts > 1), one_by_one=problem.forward_only)(z, near)
 
 
 @cached
@@ -288,7 +298,7 @@ def evaluate(problem: Problem, z: np.ndarray, near: Speeds) -> Point:
     """
     if len(z) == 0:
         raise ValueError("no designs")
-    values, slopes, speeds, speed_slopes = in_chunks(problem.batch_size, lambda x, w: _derive_all(problem, x, w), z, near)
+    values, slopes, speeds, speed_slopes = in_chunks(problem.designs_per_call, lambda x, w: _derive_all(problem, x, w), z, near)
     rows = 1 + problem.equalities + len(problem.demands)
     return Point(z, values[:, :rows], slopes[:, :rows], speeds, speed_slopes, values[:, rows:], slopes[:, rows:])
 
@@ -299,12 +309,13 @@ def find_speeds(problem: Problem, z: np.ndarray) -> Speeds:
     if not problem.keys:
         return ()
     numbers = problem.space.numbers(np.asarray(z))
-    return in_chunks(problem.batch_size, lambda scenes: _speeds_of_branches(problem.keys, scenes), scenes_of(problem, numbers))
+    scenes = scenes_of(problem, numbers)
+    return in_chunks(problem.designs_per_call, lambda batch: _speeds_of_branches(problem.keys, batch), scenes)
 
 
 def scenes_of(problem: Problem, numbers: np.ndarray) -> Scene:
     """Return the scenes with these free parameters (s, d), SI, as NumPy arrays with a leading axis."""
-    return in_chunks(problem.batch_size, lambda x: _scenes_of(problem.space, x), numbers)
+    return in_chunks(problem.designs_per_call, lambda x: _scenes_of(problem.space, x), numbers)
 
 
 class _Shapes(NamedTuple):
@@ -361,7 +372,7 @@ def _evaluate_all(
         evaluation = Evaluation(scene, dict(zip(keys, speeds, strict=True)))
         return jnp.stack([q.read(evaluation) for q in quantities])
 
-    return jax.vmap(values_of_scene)(scenes, near)
+    return mapped(values_of_scene, one_by_one=has_runs(quantities))(scenes, near)
 
 
 def evaluate_quantities(quantities: Sequence[Quantity], scenes: Scene, problem: Problem | None = None) -> np.ndarray:

@@ -436,6 +436,16 @@ def test_interrupts_end_a_search_whose_threads_compile():
     assert (done.returncode, done.stdout.strip(), done.stderr) == (1, "answered", "\njaxvib: interrupted\n")
 
 
+@pytest.mark.parametrize("chosen", [None, "0"])
+def test_the_command_hides_messages_for_developers_of_xla(monkeypatch, chosen):
+    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
+    if chosen is not None:
+        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", chosen)
+    script = "import os, jaxvib.cli, jaxvib_command as c; jaxvib.cli.main = lambda: print(os.environ['TF_CPP_MIN_LOG_LEVEL'])"
+    done = subprocess.run([sys.executable, "-c", f"{script}; c.main()"], capture_output=True, text=True, timeout=600.0)
+    assert done.stdout.strip() == (chosen or "3")
+
+
 LOST = """
 import signal, sys, time, weakref, jaxvib.cli.app
 from importlib.machinery import ExtensionFileLoader

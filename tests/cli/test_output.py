@@ -1,16 +1,21 @@
 """Files that commands write."""
 
+import contextlib
 import errno
 from pathlib import Path
+from types import SimpleNamespace
 
 import click
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 import jaxvib as jv
 from jaxvib.cli.app import run, table, tolerance_table
-from jaxvib.cli.optimize import _few_machines_texts, _quantities_with_ranges
+from jaxvib.cli.optimize import _few_machines_texts, _quantities_with_ranges, _with_time_left
 from jaxvib.cli.output import Output
+from jaxvib.runtime import stored
+from jaxvib.runtime.programs import cached
 from optimize import Design, DesignSpace, ToleranceRange, amplitude, foundation_force, worst
 
 
@@ -68,6 +73,38 @@ def test_notes_fit_on_a_terminal(capsys, monkeypatch, is_terminal):
     lines = capsys.readouterr().err.replace("\r\x1b[K", "").splitlines()
     assert lines[0].startswith("jaxvib: name is 'nothing like it'; allowed: machines,")
     assert (max(map(len, lines)) <= 80) == is_terminal == (len(lines) > 1)
+
+
+@pytest.mark.parametrize("compiling", [True, False])
+def test_the_progress_bar_shows_that_programs_are_compiled(capsys, monkeypatch, compiling):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("TERM", "xterm")
+    with stored._compilation() if compiling else contextlib.nullcontext(), Output(False, None).progress() as progress:
+        progress("descending", 0.5)
+    shown = capsys.readouterr().err
+    assert "descending" in shown and ("compiling, once" in shown) == compiling and not stored.is_compiling()
+
+
+def test_programs_count_as_compiling_until_they_are_ready():
+    seen = []
+
+    @cached
+    def twice(x):
+        seen.append(stored.is_compiling())
+        return 2.0 * x
+
+    assert twice(np.ones(3)).tolist() == [2.0, 2.0, 2.0] and seen == [True] and not stored.is_compiling()
+
+
+def test_time_left_of_a_search_follows_from_its_finished_share(monkeypatch):
+    clock, lines = iter([100.0, 101.0, 110.0, 300.0]), []
+    monkeypatch.setattr("jaxvib.cli.optimize.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    report = _with_time_left(lambda *line: lines.append(line))
+    for share in (0.0, 0.2, 0.5):
+        report("descending", share)
+    names = ["descending", "descending, about 40 s left", "descending, about 3 min 20 s left"]
+    assert lines == list(zip(names, (0.0, 0.2, 0.5), strict=True))
 
 
 def test_title_of_a_narrow_table_stays_on_one_line():

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from jaxvib.cli.app import Output, command, table
+from jaxvib.cli.output import duration_text
 from jaxvib.errors import InputError, optional_module, quoted
 
 if TYPE_CHECKING:
@@ -83,10 +84,4 @@ def _print_result(result: Sweep, output: Output, name: str) -> None:
 
 
 def _progress_text(now: Progress) -> str:
-    return f"{now.done} of {now.cases} cases, {now.rate:.3g} a second, {_duration_text(now.left)} left"
-
-
-def _duration_text(seconds: float) -> str:
-    total = round(seconds)
-    hours, rest = divmod(total, 3600)
-    return f"{hours} h {rest // 60} min" if hours else f"{rest // 60} min {rest % 60} s" if rest >= 60 else f"{rest} s"
+    return f"{now.done} of {now.cases} cases, {now.rate:.3g} a second, {duration_text(now.left)} left"

@@ -4,17 +4,20 @@ import dataclasses
 import itertools
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from two_springs import FREE, SCENE, plain, point_of
 
 from optimize import DesignSpace, expected, hold, jam_frequency, largest, support_frequency_squared, synthesize
+from optimize.quantities.quantity import BuiltinQuantity
 from optimize.search import find as find_module
 from optimize.search.find import (
     Options,
     SearchResult,
     _best_distinct,
     _distance_to_catalogue,
+    _distinct,
     _has_tolerances,
     _with_requested_modes,
     choose,
@@ -110,6 +113,28 @@ def test_search_reports_progress_and_history():
     assert begun.drawn == begun.existing == 2
     nowhere = problem_of(DesignSpace(SCENE, FREE), plain("no", lambda x, y: x * np.nan), [], 4)
     assert find(nowhere, OPTIONS, lambda *_: None) is None
+
+
+def test_searches_with_runs_descend_from_the_eight_best_starts():
+    def near(evaluation, tier):
+        return jnp.sum((evaluation.scene.machine.stiffness / 1e4 - jnp.array([6.0, 5.0])) ** 2) + 2.0
+
+    timed = BuiltinQuantity("timed", "", near, tier="time", tiers=("time",))
+    told = []
+    problem = problem_of(DesignSpace(SCENE, FREE), timed, [], 20)
+    found = find(problem, dataclasses.replace(OPTIONS, starts=20), lambda what, share: told.append((what, share)))
+    assert found.drawn == found.existing == 20 and found.history.shape[1] == 8
+    random = 1.0 + 8.0 * np.random.default_rng(0).uniform(size=(20, 2))
+    best = np.sort(np.sum((random - [6.0, 5.0]) ** 2, axis=1))[:8] + 2.0
+    np.testing.assert_allclose(found.history[0], best, rtol=1e-12)
+    np.testing.assert_allclose(found.point.values[:, 0], 2.0, rtol=1e-12)
+    # 20 designs are drawn; 8 take 25 steps of descent and 8 steps of polishing with 6 designs each.
+    np.testing.assert_allclose(told[1][1], 0.9 * 220.0 / 604.0, rtol=1e-12)
+
+
+def test_designs_nearest_to_their_demands_are_selected_last():
+    point = ended([3.0, 1.0, 2.0, 9.0], np.zeros(4)).point
+    np.testing.assert_array_equal(_distinct(point, np.array([0.0, 0.5, 0.1, 9e-8])), [0, 3, 2, 1])
 
 
 def test_costly_objectives_start_from_nominal_optima():

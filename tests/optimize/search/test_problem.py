@@ -11,6 +11,7 @@ import jaxvib as jv
 from jaxvib.steady.jams.jam import jam_modes
 from optimize import DesignSpace, Quantity, amplitude, expected, foundation_force, hold, jam_frequency, largest, total
 from optimize.quantities.quantity import BuiltinQuantity
+from optimize.search.evolve import PopulationValues
 from optimize.search.problem import (
     Point,
     derive,
@@ -191,6 +192,35 @@ def test_expensive_searches_begin_with_a_simplified_one(objective, held, demands
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(each, 3.0) for each in held]), objective, demands)
     assert (problem.simplified() is not None) == first
     assert problem.forward_only == (objective is TIMED or TIMED in held)
+    assert problem.designs_per_call == (1 if problem.forward_only else problem.batch_size)
+
+
+@pytest.mark.parametrize("tier", ["time", "leading"])
+def test_runs_are_never_computed_in_a_batch(tier):
+    """A run in a batch would take the steps of the slowest one, also when it is a sample of a tolerance."""
+    batches = []
+
+    @jax.custom_batching.custom_vmap
+    def first(x):
+        return x[0]
+
+    @first.def_vmap
+    def _(size, _, x):
+        batches.append(size)
+        return x[:, 0], True
+
+    one = BuiltinQuantity(
+        "one", "", lambda evaluation, tier: first(evaluation.scene.machine.stiffness), tier=tier, tiers=(tier,)
+    )
+    z = np.array([[0.25, 0.5], [0.75, 0.125], [0.5, 0.5]])
+    problem = problem_of(DesignSpace(SCENE, FREE), SUM, [], 4)
+    values = evaluate_quantities(
+        [one, expected(one, {"machine.stiffness": 1e-6}, samples=4)], scenes_of(problem, 1e4 + 8e4 * z)
+    )
+    np.testing.assert_allclose(values, np.repeat(1e4 + 8e4 * z[:, :1], 2, axis=1), rtol=1e-5)
+    evolved = PopulationValues(problem_of(DesignSpace(SCENE, FREE), one, [], 4)).of(z)
+    np.testing.assert_allclose(evolved, values[:, :1], rtol=1e-5)
+    assert bool(batches) == (tier == "leading")
 
 
 def test_evaluated_quantities_are_those_of_each_scene():
