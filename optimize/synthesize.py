@@ -93,7 +93,8 @@ def synthesize(
     - `objective`: the `Quantity` to minimize, such as `force_per_amplitude(mode=3)`; `-quantity` maximizes
     - `subject_to`: demands such as `[amplitude(mode=3) > "2 mm", power(mode=3) < 500.0]`
     - `starts`: number of random starts; typical: 32 to 256 (the default). With more starts the lowest minimum is found with a
-      higher probability. The computing time is proportional to this number
+      higher probability. The computing time is proportional to this number. If a quantity is computed by time integration, the
+      descent begins with the 8 best starts only
     - `seed` of these starts
     - `iterations` of the descent; typical: 50 to 200 (default 100)
     - `rate`: first step of the descent, relative to the range of a free parameter; typical: 0.01 to 0.1 (default 0.05)
