@@ -234,8 +234,8 @@ def mapped(function: Callable[..., T], *, one_by_one: bool) -> Callable[..., T]:
     """Return a function of one case as a function of many cases, along a leading axis, in a batch or `one_by_one`.
 
     Functions that integrate the equations of motion are evaluated one by one. In a batch every run would take as many steps as
-    the slowest one. Measured for two-mass machines, rotors and plane bodies: the derivatives of a batch of 64 runs take 2.5 to 5
-    times as long, and their program takes twice as long to compile.
+    the slowest one. Measured for two-mass machines, rotors and plane bodies: the derivatives of a batch of 64 runs take 2.5 to
+    5 times as long, and their program takes twice as long to compile.
     """
     return (lambda *cases: jax.lax.map(lambda each: function(*each), cases)) if one_by_one else jax.vmap(function)
 
