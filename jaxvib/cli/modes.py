@@ -272,7 +272,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
         conclusion = (
             f"loads can stay jammed at {', '.join(stable_jams)}"
             if stable_jams
-            else "none of them is stable: light loads cannot stay jammed"
+            else f"no stable jam ({len(rows)} unstable): light loads cannot stay jammed"
         )
         measure_texts = [
             indented(f"at {speed_text(jam.omega)}:", measures_of_jam)

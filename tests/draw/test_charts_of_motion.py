@@ -115,6 +115,15 @@ def test_the_torque_of_the_motor_bounds_the_axis(motor, top):
         assert lines["of the motor"] == np.stack([SPEED, motor], axis=1).tolist()
 
 
+def test_a_response_at_one_speed_is_a_point():
+    curve, points = ({name: values[:1] for name, values in each.items()} for each in (CURVE | {"speed": SPEED[1:]}, POINTS))
+    none = {name: values[:0] for name, values in points.items()}
+    about = {"names": ["y", "tilt"], "units": ["m", "rad"], "unit": "rad/s", "motors": 0}
+    lengths = response_chart(curve, none, {}, np.array([9.0]), **about).axes[0]
+    assert named(lengths)["y"] == [[10.0, 1.0]] and lengths.lines[-1].get_marker() == "."
+    assert lengths.get_ylim() == pytest.approx((0.5, 2.0))
+
+
 def test_the_curve_of_several_motors_is_that_of_all():
     (axis,) = response(motors=2, show=["torque"])
     assert named(axis)["of all motors"] == [[0.0, 4.0], [10.0, 3.0], [20.0, 0.0]]

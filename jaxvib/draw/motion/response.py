@@ -102,7 +102,7 @@ def response_chart(
 
 def _line(axis: Axes, curve: Arrays, points: Arrays, line: np.ndarray, at_points: np.ndarray, look: Look) -> None:
     """Draw the values `line` over the speeds of the curve, and the values `at_points` of the operating points."""
-    axis.plot(curve["speed"], line, **look)
+    axis.plot(curve["speed"], line, marker="" if curve["speed"].size > 1 else ".", **look)
     for x, y, stable in zip(points["speed"], at_points, points["stable"], strict=True):
         axis.plot([x], [y], "o", ms=5.0, mfc=look["color"] if stable else "white", mec=look["color"], zorder=4)
 
@@ -131,7 +131,8 @@ def _torque(axis: Axes, curve: Arrays, points: Arrays, folds: Arrays, scale: flo
 
 def _logarithmic(axis: Axes) -> None:
     """Set a logarithmic axis that covers at most `_DECADES` decades below the largest value."""
-    values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axis.get_lines() if np.size(line.get_xdata()) > 2])
+    lines = [line for line in axis.get_lines() if line.get_transform() == axis.transData]  # without those of resonances
+    values = np.concatenate([np.asarray(line.get_ydata(), float) for line in lines])
     positive = values[np.isfinite(values) & (values > 0.0)]
     if positive.size == 0:
         return
