@@ -138,16 +138,22 @@ def test_numbers_in_tables_of_plans_are_not_broken():
     from jaxvib.identification.further_runs.plan import RunPlan
 
     errors = np.array([[0.00012, 0.0071, 0.033, 0.25, 1.5, np.inf, 4.4e-4, 0.0005]])
-    names = tuple(f"machine.stiffness[{k}]" for k in range(8))
-    plan = RunPlan(
-        ("20 kg on the table, optimized speed",), names, errors, errors, errors, errors[0], np.ones(1), np.ones(1), None
-    )
-    lines = _text(plan).splitlines()
-    assert max(map(len, lines)) <= 80
+    names = tuple(f"machine.link_stiffness[{k}]" for k in range(8))
+    runs = ("20 kg on the table, optimized speed", *map(str, range(2, 6)))
+    many, low, high = (np.tile(x, (5, 1)) for x in (errors, errors, errors))
+    low[0, 1], high[0, :5] = 0.0012, [0.00012, 0.014, 0.039, 0.28, np.inf]
+    plan = RunPlan(runs, names, many, low, high, errors[0], np.full(5, 0.5), np.full(5, 16.0 * np.log(2.0)), None)
+    text = _text(plan)
+    assert max(map(len, text.splitlines())) <= 80
+    rows = [[each.strip() for each in line.split("│")][1:-1] for line in text.splitlines()]
     words = ["0.012", "0.71", "3.3", "25", "150", "-", "0.044", "0.05"]
-    rows = [[each.strip() for each in line.split("│")][1:-1] for line in lines]
-    assert ["so far", *words] in rows and ["1", *words] in rows
-    assert any("1 20 kg on the table, optimized speed" in line for line in lines)
+    firsts = ["0.012", "0.12 to 1.4", "3.3", "25", "150 to -", "-", "0.044", "0.05"]
+    for name, word, first in zip(names, words, firsts, strict=True):
+        assert [name, word, first, word, word, word] in rows and [name, word, word] in rows
+    assert any(row[1:] == ["30", "2", "11.1"] for row in rows)
+    assert "repeat the plan" in text and "No candidate determines machine.link_stiffness[5]: add" in " ".join(text.split())
+    sure = _text(RunPlan(runs, names, many, many, many, errors[0], np.full(5, 0.5), np.full(5, 2.0), None))
+    assert "repeat the plan" not in sure and "range" not in sure
 
 
 @pytest.mark.slow
@@ -160,10 +166,11 @@ def test_candidate_runs_are_ranked_from_the_command_line(typed, tmp_path):
     assert {"again", "heavier"} < set(document["candidates"]) and len(document["candidates"]) == 3
     assert document["benefit"] == sorted(document["benefit"], reverse=True) and document["minutes"] == [0.2] * 3
     assert len(document["profile"]["speeds"]) == 9 and max(document["profile"]["speeds"]) <= 100.0
+    assert np.all(np.asarray(document["errors_low"]) <= document["errors_high"])
     assert len(document["errors"]) == 3 and all(0.0 < error < 0.05 for row in document["errors"] for error in row)
     assert (tmp_path / "o" / "plan.png").stat().st_size > 5_000
     code, out, _ = typed("plan", "fit.toml", "--fit", "o/fit.npz")
-    assert code == 0 and "optimized speed" in out and "(1) machine.stiffness[0]" in out
+    assert code == 0 and "optimized speed" in out and "│ machine.stiffness[0] " in out
 
 
 @pytest.mark.parametrize(

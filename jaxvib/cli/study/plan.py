@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,9 @@ from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
     from jaxvib.identification.further_runs.plan import RunPlan
+
+_COLUMNS, _BORDERS, _SO_FAR = 80, 4, 9
+"""Widths in characters: of a table, of the borders of its first column, and of its column "so far" with a border."""
 
 
 @command("plan", "identification")
@@ -43,29 +47,74 @@ def plan(identification: Path, fit: Path | None, output: Output) -> None:
     output.save_result("plan.npz", plan)
     profile = plan.profile
     document = {"status": plan.status_name, "message": plan.message}
-    document |= fields_of(plan, "candidates", "numbers", "errors", "now", "minutes", "benefit")
+    document |= fields_of(plan, "candidates", "numbers", "errors", "errors_low", "errors_high", "now", "minutes", "benefit")
     document["profile"] = None if profile is None else fields_of(profile, "times", "speeds")
 
     output.done(document, lambda: _text(plan), "plan", plan)
 
 
 def _text(plan: RunPlan) -> str:
-    """Return the candidates of a plan, the expected errors in percent, and the optimized speed, as tables."""
+    """Return the candidates of a plan, the expected errors in percent, and the optimized speed, as tables and notes."""
     from jaxvib.display import speed_text  # slow import, which --help does not need
 
-    runs, errors = [], [["so far", *map(_percent, plan.now)]]
-    for k, (name, minutes, benefit) in enumerate(zip(plan.candidates, plan.minutes, plan.benefit, strict=True)):
-        runs.append([f"{k + 1} {name}", f"{minutes:.3g}", f"{benefit:.3g}"])
-        errors.append([str(k + 1), *map(_percent, plan.errors[k])])
-    lines = [table("candidate runs, the best one first", ["run", "minutes", "benefit per minute"], runs)]
-    lines += [f"({k + 1}) {name}" for k, name in enumerate(plan.numbers)]
-    heads = ["run", *(f"({k + 1})" for k in range(len(plan.numbers)))]
-    lines.append(table("expected relative standard errors after the run, %; -: not determined", heads, errors))
+    values = zip(plan.candidates, 60.0 * plan.minutes, plan.reduction, plan.benefit, strict=True)
+    runs = [
+        [f"{k} {name}", f"{t:.4g}", f"{ratio:.3g}", f"{benefit:.3g}"] for k, (name, t, ratio, benefit) in enumerate(values, 1)
+    ]
+    title = (
+        "candidate runs, the best one first; error ratio: error so far / error after the run, geometric mean over the "
+        "parameters; benefit: sum of the logarithms of these ratios; errors above 100 % count as 100 %"
+    )
+    lines = [table(title, ["run", "time, s", "error ratio", "benefit per minute"], runs)]
+    lines += [*_error_tables(plan), *_notes(plan)]
     if plan.profile is not None:
         points = zip(plan.profile.times.tolist(), plan.profile.speeds.tolist(), strict=True)
         rows = [[f"{t:.4g}", speed_text(speed, 4)] for t, speed in points]
         lines.append(table("optimized speed, linear between these times", ["time, s", "speed"], rows))
     return "\n".join(lines)
+
+
+def _error_tables(plan: RunPlan) -> list[str]:
+    """Return tables of the expected errors, with a line for each parameter and as many runs as fit into a table."""
+    title = "expected standard errors after each run, % of the parameter (-: not determined"
+    title += "; two numbers: range over the machines that the runs so far leave possible)" if plan.has_wide_range.any() else ")"
+    tables, empty = [], _COLUMNS - _BORDERS - _SO_FAR - max(map(len, plan.numbers))
+    first = [["parameter", *plan.numbers], ["so far", *map(_percent, plan.now)]]
+    columns = [
+        [f"run {run + 1}", *(_error_text(plan, run, k) for k in range(len(plan.numbers)))] for run in range(len(plan.errors))
+    ]
+    while columns:
+        shown, room = list(first), empty
+        while columns and (len(shown) == len(first) or max(map(len, columns[0])) + 3 <= room):
+            room -= max(map(len, columns[0])) + 3
+            shown.append(columns.pop(0))
+        heads, *rows = map(list, zip(*shown, strict=True))
+        tables.append(table(title, heads, rows))
+        title = "further runs"
+    return tables
+
+
+def _error_text(plan: RunPlan, run: int, k: int) -> str:
+    if not plan.has_wide_range[run, k]:
+        return _percent(plan.errors[run, k])
+    return f"{_percent(plan.errors_low[run, k])} to {_percent(plan.errors_high[run, k])}"
+
+
+def _notes(plan: RunPlan) -> list[str]:
+    """Return sentences about wide ranges and about parameters that no candidate determines."""
+    notes = []
+    if plan.has_wide_range.any():
+        notes.append("The runs so far leave the machine uncertain: record run 1, fit all runs again, and repeat the plan.")
+    undetermined = [
+        name for name, errors in zip(plan.numbers, plan.errors.T, strict=True) if not any(map(math.isfinite, errors))
+    ]
+    if undetermined:
+        advice = (
+            "add a candidate with another sensor, an added mass or a higher speed, give a value as known, or, if the fitted "
+            "value is near 0, fit again from another first value"
+        )
+        notes.append(f"No candidate determines {', '.join(undetermined)}: {advice}.")
+    return [textwrap.fill(each, _COLUMNS) for each in notes]
 
 
 def _percent(error: float) -> str:

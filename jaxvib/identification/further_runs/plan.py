@@ -27,7 +27,7 @@ from jaxvib.results.status import Computed
 from jaxvib.units import Number
 
 _MAX_SINGLE_RATIO = 1.2
-"""Ratio of the largest to the smallest expected error above which the summary states both."""
+"""Ratio of the largest to the smallest expected error above which texts state both."""
 
 
 class RunPlan(Result):
@@ -60,10 +60,20 @@ class RunPlan(Result):
     benefit: np.ndarray = eqx.field(metadata=in_unit("1/min", "candidate"))
     profile: SpeedProfile | None
 
+    @property
+    def has_wide_range(self) -> np.ndarray:
+        """True (c, k) for expected errors whose largest value is more than 20 % above the smallest one."""
+        return self.errors_high > _MAX_SINGLE_RATIO * self.errors_low
+
+    @property
+    def reduction(self) -> np.ndarray:
+        """Geometric mean (c,) of error now / error after the run over the parameters; an error above 1 counts as 1."""
+        return np.exp(self.benefit * self.minutes / len(self.numbers))
+
     def summary(self) -> str:
         """Return the candidates with their expected errors as text, the best one first."""
-        lines = [f"errors now: {self._row(self.now, self.now, self.now)}"]
-        rows = map(self._row, self.errors, self.errors_low, self.errors_high)
+        lines = [f"errors now: {self._row(self.now, self.now, self.now, np.zeros(len(self.now), bool))}"]
+        rows = map(self._row, self.errors, self.errors_low, self.errors_high, self.has_wide_range)
         for name, row, minutes, benefit in zip(self.candidates, rows, self.minutes, self.benefit, strict=True):
             lines.append(f"{name} ({minutes:.3g} min, benefit {benefit:.3g} per minute): {row}")
         if self.profile is not None:
@@ -71,11 +81,11 @@ class RunPlan(Result):
             lines.append("optimized speed: " + ", ".join(f"{speed_text(float(n), 4)} at {t:.4g} s" for t, n in points))
         return "\n".join(lines)
 
-    def _row(self, errors: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:
+    def _row(self, errors: np.ndarray, low: np.ndarray, high: np.ndarray, is_wide: np.ndarray) -> str:
         words = []
-        for name, *values in zip(self.numbers, errors, low, high, strict=True):
+        for name, *values, wide in zip(self.numbers, errors, low, high, is_wide, strict=True):
             error, least, most = (f"{each:.2g}" if np.isfinite(each) else "not determined" for each in values)
-            words.append(f"{name} {error}" + (f" ({least} to {most})" if values[2] > _MAX_SINGLE_RATIO * values[1] else ""))
+            words.append(f"{name} {error}" + (f" ({least} to {most})" if wide else ""))
         return ", ".join(words)
 
     @validated
