@@ -143,6 +143,18 @@ class Influence(NamedTuple):
     more: float
 
 
+class Unresolved(NamedTuple):
+    """Quantity of a run, named `what`, whose derivatives cannot be trusted.
+
+    **Attributes**: largest change of the quantity, percent, if all free parameters change by at most a millionth (`tiny`), and
+    if one of them is 1 % smaller or larger (`large`).
+    """
+
+    what: str
+    tiny: float
+    large: float
+
+
 class Machine(NamedTuple):
     """Distinct machine of a search.
 
@@ -169,6 +181,8 @@ class Synthesis(Result):
     - `table` of `Row`: every free parameter and quantity before and after, by the exact motion and by time integration
     - `limits` of `Limit`: demands, held quantities and active bounds, each with the gain from a change of its limit
     - `influences` of `Influence`: the influence of each free parameter
+    - `unresolved` of `Unresolved`: quantities of runs whose derivatives cannot be trusted at the best design, for example
+      because the motion is chaotic
     - `machines` of `Machine`: the distinct final designs, with the number of starts that ended at each
     - `kkt`: relative residual of the Karush-Kuhn-Tucker conditions at the best design
     - `starts`: number of searches; `drawn`: number of random designs from which their starts were chosen; `converged`: number
@@ -201,6 +215,7 @@ class Synthesis(Result):
     table: tuple[Row, ...] = ()
     limits: tuple[Limit, ...] = ()
     influences: tuple[Influence, ...] = ()
+    unresolved: tuple[Unresolved, ...] = ()
     machines: tuple[Machine, ...] = ()
 
     def summary(self) -> str:
@@ -243,8 +258,14 @@ class Synthesis(Result):
         return rows
 
     def findings(self) -> list[str]:
-        """Return lines of text with the limits, the five largest influences, and the distinct final designs."""
-        lines = []
+        """Return lines of text with unresolved quantities, the limits, the five largest influences, and the distinct final
+        designs."""
+        lines = [
+            f"  derivatives of this quantity cannot be trusted: {each.what} (changes of the parameters by a millionth "
+            f"change it by up to {each.tiny:.2g} %, changes by 1 % by up to {each.large:.2g} %: the motion is chaotic, or the "
+            "error of the run is large); use a shorter run, or the mean of several runs"
+            for each in self.unresolved
+        ]
         best = self.machines[0].value if self.machines else math.nan
         sign = -1.0 if objective_text(self.objective).startswith("greatest ") else 1.0  # changes of the maximized quantity
 

@@ -36,7 +36,7 @@ from optimize.quantities.quantity import Demand, Pair, Quantity, Tier, walk
 from optimize.result import Limit, Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
 from optimize.search.find import Options, Searcher, SearchResult, choose, require_searcher
 from optimize.search.problem import Problem, evaluate_quantities, problem_of, scenes_of
-from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours
+from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours, unresolved_of
 from optimize.search.suggestions import lines_to_free
 from optimize.space import DesignSpace
 
@@ -175,6 +175,7 @@ def synthesize(
         table=rows,
         limits=limits,
         influences=influences_of(problem, reports[1:, len(named)]),
+        unresolved=unresolved_of([q for _, q in named], reports[1:, : len(named)]),
         machines=machines_of(problem, result, _SAME_DESIGN_DISTANCE),
         **searched,
     )

@@ -40,7 +40,7 @@ from jaxvib.study.capture.curve import ThresholdCurve
 from jaxvib.study.maps.run_up_map import RunUpMap
 from jaxvib.study.maps.stability_onset import StabilityMap
 from optimize.pareto import Front
-from optimize.result import Influence, Limit, Machine, Outcome, Row, Synthesis, SynthesisStatus
+from optimize.result import Influence, Limit, Machine, Outcome, Row, Synthesis, SynthesisStatus, Unresolved
 
 MACHINE = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
 SCENE = jv.Scene(MACHINE, jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
@@ -98,6 +98,7 @@ def synthesis():
         table=(Row("stiffness of the support", "N/m", 4e4, 5e4, float("nan"), float("nan")),),
         limits=(Limit("power drawn, mode 1 at most 50 W", "W", 50.0, 50.0, 0.0, True, -0.1, -0.1),),
         influences=(Influence("stiffness of the support", -1.0, 1.0),),
+        unresolved=(Unresolved("largest foundation force of a run from rest", 0.1, 0.4),),
         machines=(Machine(1, 1e-3, (5e4,)), Machine(1, 2e-3, (4e4,))),
     )
     return Synthesis(scene=SCENE, before=outcome, after=outcome, verified=None, run=None, **rest, **found, **told)

@@ -151,7 +151,7 @@ def _document(best: Synthesis) -> dict:
         "after": best.after.as_dict(),
         "verified": None if best.verified is None else best.verified.as_dict(),
         **fields_of(best, "unverified", "starts", "drawn", "converged", "same", "kkt"),
-        **fields_of(best, "table", "limits", "influences", "machines"),
+        **fields_of(best, "table", "limits", "influences", "unresolved", "machines"),
     }
 
 

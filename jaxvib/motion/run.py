@@ -36,7 +36,7 @@ from jaxvib.motion.analysis.points import (
     vibration_of,
 )
 from jaxvib.motion.analysis.regime import STILL_SHARE, Regime, regime
-from jaxvib.motion.analysis.separation import has_overlap, would_separate
+from jaxvib.motion.analysis.separation import has_collision, has_overlap, would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
 from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.results.fields import in_unit, part
@@ -241,6 +241,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
                 *([f"  {creep}"] if creep else []),
                 *([] if unstable else self._pass_through_note()),
+                *([] if self.settled else self._collision_note()),
                 *self._detachment(),
             ]
         )
@@ -260,6 +261,11 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         if not has_overlap(self.scene, self._stored):
             return []
         return [f"  loads passed through each other on the way, which may change the result; {_CONTACT}"]
+
+    def _collision_note(self) -> list[str]:
+        if not has_collision(self.scene, self._stored):
+            return []
+        return ["  loads touch each other: derivatives of this run may be meaningless; test them by growth or check_gradients"]
 
     def _on_the_way(self) -> str:
         structure, window, stored = self.scene.machine.structure(), self.window, self._stored

@@ -1,4 +1,5 @@
-"""Sensitivities at the end of a search: active limits, influences of free parameters, distinct machines."""
+"""Sensitivities at the end of a search: active limits, influences of free parameters, quantities whose derivatives cannot be
+trusted, distinct machines."""
 
 from __future__ import annotations
 
@@ -7,14 +8,22 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxvib.display import shown_unit
-from optimize.quantities.quantity import Demand
-from optimize.result import Influence, Limit, Machine
+from optimize.quantities.quantity import Demand, Quantity, walk
+from optimize.result import Influence, Limit, Machine, Unresolved
 from optimize.search.find import SearchResult
 from optimize.search.polish import ACTIVE_DISTANCE, MAX_VIOLATION
 from optimize.search.problem import Problem
 
 _STEP = 0.01
 """Relative change for which effects on the objective are stated: of a free parameter (`Influence`), or of a limit (`Limit`)."""
+
+_TINY_STEPS = np.array([-1e-6, -3e-7, 3e-7, 1e-6])
+"""Relative changes of all free parameters by which a quantity of a run is tested. There are several, because the effect of a
+single change on a chaotic motion may be small by chance."""
+
+_MIN_TINY_SHARE, _MIN_TINY_CHANGE = 1e-2, 1e-4
+"""Smallest change of a quantity by `_TINY_STEPS` that shows a meaningless derivative, as a share of the largest change by
+`_STEP` (1e-4 for a linear quantity), and relative to the quantity. Errors of integration cause smaller changes."""
 
 _EDGE = 2.0 * ACTIVE_DISTANCE
 """Distance from a bound, relative to the range, within which a free parameter counts as at its bound if the multiplier of the
@@ -73,22 +82,46 @@ def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult,
 
 
 def neighbours(problem: Problem, result: SearchResult) -> np.ndarray:
-    """Return the free parameters (1 + 2 d, d), SI, of the best design and of its neighbours.
+    """Return the free parameters (5 + 2 d, d), SI, of the best design and of its neighbours.
 
-    In each neighbour one free parameter is 1 % smaller or larger.
+    In each neighbour one free parameter is 1 % smaller or larger; in the last four all of them change by at most a
+    millionth.
     """
     numbers = problem.space.within(*result.bounds).numbers(result.point.z[result.best])
     changes = np.diag(_STEP * numbers)
-    return numbers + np.concatenate([np.zeros((1, len(numbers))), -changes, changes])
+    return numbers + np.concatenate([np.zeros((1, len(numbers))), -changes, changes, _TINY_STEPS[:, None] * numbers])
 
 
 def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]:
-    """Return the influence of each free parameter, from the objective (1 + 2 d,) of the `neighbours`."""
+    """Return the influence of each free parameter, from the objective (5 + 2 d,) of the `neighbours`."""
     d = problem.space.size
     if not values[0]:
         return ()
     change = 100.0 * (values[1:] - values[0]) / abs(values[0])
     return tuple(Influence(word, float(change[k]), float(change[d + k])) for k, (word, _) in enumerate(problem.space.words()))
+
+
+def unresolved_of(quantities: Sequence[Quantity], values: np.ndarray) -> tuple[Unresolved, ...]:
+    """Return the quantities of runs whose derivatives cannot be trusted, from the `values` (5 + 2 d, q) of the `neighbours`.
+
+    Such a quantity changes by about as much if the free parameters change by a millionth as if they change by 1 %.
+    """
+    with np.errstate(invalid="ignore"):  # a quantity may be infinite
+        changes = np.abs(values[1:] - values[0])
+    parts = np.split(changes, [-_TINY_STEPS.size])
+    large, tiny = (np.max(part, axis=0, initial=0.0, where=np.isfinite(part)) for part in parts)
+    size = np.abs(values[0])
+    is_unresolved = tiny > np.maximum(_MIN_TINY_SHARE * large, _MIN_TINY_CHANGE * size)
+    return tuple(
+        Unresolved(quantity.words, float(100.0 * tiny[k] / size[k]), float(100.0 * large[k] / size[k]))
+        for k, quantity in enumerate(quantities)
+        if is_unresolved[k] and size[k] > 0.0 and _may_contain_run(quantity)
+    )
+
+
+def _may_contain_run(quantity: Quantity) -> bool:
+    """Return True if a run, or a function of the user, which may contain a run, is part of the quantity."""
+    return any(type(part) is Quantity or part.forward_only for part in walk(quantity))
 
 
 def machines_of(problem: Problem, result: SearchResult, same: float) -> tuple[Machine, ...]:

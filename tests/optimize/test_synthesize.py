@@ -5,6 +5,7 @@ import math
 import sys
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -176,6 +177,24 @@ def test_verification_without_exact_motion_starts_in_the_jam(monkeypatch):
     monkeypatch.setattr(sys.modules[synthesize.__module__], "jam_orbit", lambda *_, **__: SimpleNamespace(multiplier=math.nan))
     assert _run(SCENE, 3, True) == ("run", "")
     assert asked == [{"mode": 3}] * 2
+
+
+def test_meaningless_derivatives_of_runs_are_stated():
+    """x -> 4 x (1 - x): 60 times make 1e18 of a change; 5 times make 30, and derivatives are right."""
+
+    def search(steps):
+        def last(scene):
+            x = 0.3 + 1e-6 * scene.machine.stiffness[0]
+            return 1.0 + jax.lax.fori_loop(0, steps, lambda _, y: 4.0 * y * (1.0 - y), x)
+
+        space = DesignSpace(scene("two_mass"), {"machine.stiffness[0]": (1e4, 9e4)})
+        return synthesize(space, Quantity("last", "", last), starts=2, iterations=5, polishing=2, verify=False)
+
+    found = search(60)
+    (unresolved,) = found.unresolved
+    assert unresolved.what == "last" and unresolved.tiny > 0.01 * unresolved.large > 0.0
+    assert "derivatives of this quantity cannot be trusted: last (changes of the parameters by a millionth" in found.summary()
+    assert search(5).unresolved == ()
 
 
 def test_missing_quantities_of_all_starts_are_named():

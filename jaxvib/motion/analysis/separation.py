@@ -116,6 +116,11 @@ def has_overlap(scene: Scene, segment: Trajectory) -> bool:
     return not has_term(scene.all_effects, LoadInteraction) and smallest_distance(scene, segment) < MIN_DISTANCE
 
 
+def has_collision(scene: Scene, segment: Trajectory) -> bool:
+    """Return True if loads in contact with each other (`LoadContact`) touch at some time."""
+    return has_term(scene.all_effects, LoadInteraction) and smallest_distance(scene, segment) < 1.0
+
+
 def separation_rate(scene: Scene, segment: Trajectory, k: int = 0, pair: tuple[int, int] = (0, 1)) -> float:
     """Return the growth rate, 1/s, of small differences between the angles of a `pair` of loads of exciter `k` at nearly one
     angle in an evenly sampled `segment` of a run; negative for decay."""

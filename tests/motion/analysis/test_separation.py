@@ -1,5 +1,7 @@
 """Loads that start apart, and motions that only loads at exactly one angle keep."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -68,6 +70,17 @@ def test_loads_that_passed_each_other_are_in_the_summary():
     assert "loads passed through each other on the way" in crossed.summary() and "load_contact" in crossed.summary()
     touching = s.replace(effects=(*s.all_effects, jv.LoadContact(1e5)))
     assert not has_overlap(touching, crossed.trajectory) and not has_overlap(three_balls(), crossed.trajectory)
+
+
+def test_summary_warns_of_derivatives_after_collisions():
+    s = three_balls(ball_radius=0.011)
+    touching = s.replace(effects=(*s.all_effects, jv.LoadContact(1e5)))
+    apart = dataclasses.replace(jv.simulate(s, 0.2, separation=1.0, estimate=False, samples=3), scene=touching)
+    together = eqx.tree_at(lambda r: r.trajectory.state.angle[0], apart, jnp.asarray(np.tile([0.0, 0.2, 1.0], (3, 1))))
+    words = "derivatives of this run may be meaningless; test them by growth or check_gradients"
+    assert words in together.summary() and words not in apart.summary()
+    assert words not in dataclasses.replace(together, scene=s).summary()
+    assert words not in dataclasses.replace(together, drift=jnp.zeros(())).summary()
 
 
 def at_speed(s):

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from two_springs import FREE, SCENE, plain, point_of
 
-from optimize import DesignSpace, hold
+from optimize import DesignSpace, hold, jam_frequency, peak_force
 from optimize.result import Machine
 from optimize.search.find import SearchResult
 from optimize.search.polish import ACTIVE_DISTANCE, Optimality
 from optimize.search.problem import problem_of
-from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours
+from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours, unresolved_of
 
 SUM, FIRST = plain("sum", lambda x, y: x + y), plain("first", lambda x, y: x)
 WISH = plain("wish", lambda x, y: x * y)
@@ -87,15 +87,38 @@ def test_gains_are_of_the_best_design():
     (limit,) = limits_of(problem, [], found, np.zeros((0, 2)))
     np.testing.assert_allclose(limit.gain, -3.0 * 9.0 / 8.0 / 2.0, rtol=1e-12)
     near = neighbours(problem, found)
+    near, tiny = near[:5], near[5:]
     np.testing.assert_allclose(near, [[9e4, 5e4], [8.91e4, 5e4], [9e4, 4.95e4], [9.09e4, 5e4], [9e4, 5.05e4]], rtol=1e-12)
+    shares = tiny / near[0] - 1.0
+    np.testing.assert_allclose(shares[:, 0], shares[:, 1], atol=1e-15)
+    np.testing.assert_allclose(shares[:, 0], [-1e-6, -3e-7, 3e-7, 1e-6], atol=1e-15)
 
 
 def test_influences_are_changes_of_the_objective():
     problem = problem_of(DesignSpace(SCENE, FREE), WISH, [])
-    first, second = influences_of(problem, np.array([-4.0, -3.0, -4.4, -5.0, -4.2]))
+    first, second = influences_of(problem, np.array([-4.0, -3.0, -4.4, -5.0, -4.2, *[-4.0] * 4]))
     assert first.what == "stiffness of support 1" and second.what == "stiffness of support 2"
     np.testing.assert_allclose([first.less, first.more, second.less, second.more], [25.0, -25.0, -10.0, -5.0])
-    assert influences_of(problem, np.zeros(5)) == ()
+    assert influences_of(problem, np.zeros(9)) == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "tiny", "is_unresolved"),
+    [
+        ([-0.3, 0.1, 0.4, np.nan], 0.2, True),  # chaotic
+        ([-0.3, 0.1, 0.4, 0.0], 3e-3, False),
+        ([-0.3, 0.1, 0.4, 0.0], 4e-5, False),  # smooth
+        ([-4e-4, 0.0, 4e-4, 0.0], 1e-4, False),  # errors of integration
+    ],
+)
+def test_unresolved_quantities_change_by_tiny_steps(changes, tiny, is_unresolved):
+    """The quantity of the run is 2 N, those without a run change in the same way."""
+    values = 2.0 + np.array([0.0, *changes, 0.0, tiny, 0.0, 0.0])[:, None] * np.ones(3)
+    quantities = [peak_force(until="2 s"), FIRST, jam_frequency(mode=1)]
+    found = unresolved_of(quantities, values)
+    assert [each.what for each in found] == ["largest foundation force of a run from rest", "first"] * is_unresolved
+    for each in found:
+        np.testing.assert_allclose([each.tiny, each.large], [10.0, 20.0])
 
 
 def test_machines_are_distinct_beyond_a_distance():
