@@ -157,7 +157,6 @@ def synthesize(
     run, unverified = (None, why_unverified) if why_unverified else _run(scene, motion, verify)
     report("computing the exact motion", 0.99)
     other_tiers = _other_tiers(scene, [q for _, q in named], verify, run, motion)
-    rows = _table(initial_space, scene, named, reports[:2, : len(named)], other_tiers)
     n = len(_standard_rows(scene, motion, objective.of))
     before, after = (_outcome(space, s, reports[k, :n]) for k, s in enumerate((initial_space.scene, scene)))
     verified = None if run is None else _outcome_of_run(space, run, motion, objective.of)
@@ -172,7 +171,7 @@ def synthesize(
         unverified=unverified,
         objective=objective.name,
         unit=objective.unit,
-        table=rows,
+        table=_table(initial_space, scene, named, reports[:2, : len(named)], other_tiers),
         limits=limits,
         influences=influences_of(problem, reports[1:, len(named)]),
         unresolved=unresolved_of([q for _, q in named], reports[1:, : len(named)]),
