@@ -130,7 +130,7 @@ def test_animation_shows_each_rotor_at_its_angle(run, tmp_path):
 def test_histories_have_a_line_for_each_rotor(run):
     speeds = run.plot().axes[4]
     names = [text.get_text() for text in speeds.get_legend().get_texts()]
-    assert names == ["load 1", "load 2", "rotor 1", "rotor 2 (clockwise: negative)"]
+    assert names == ["load 1", "load 2", "rotor 1", "rotor 2 (clockwise: negative)", "band: lowest to highest value"]
 
 
 def test_deck_on_platforms_raises_a_clear_error(run):
