@@ -173,6 +173,14 @@ def test_criterion_json_has_the_promised_keys(typed, tmp_path, monkeypatch):
             assert np.min(np.abs(speed - w * (1.0 + share))) < 0.07 * abs(share) * w
 
 
+def test_criterion_text_has_the_speeds_of_the_damped_machine(typed):
+    document = json.loads(typed("criterion", "machine.toml", "--json")[1])
+    text = typed("criterion", "machine.toml", "--unit", "rad/s")[1]
+    free, damped = (document[name][0] for name in ("resonances", "damped_resonances"))
+    printed = re.findall(r"resonance 1[^\d]+([\d.]+)", text)
+    assert f"{free:.6g}" != f"{damped:.6g}" and printed == [f"{free:.6g}", f"{damped:.6g}"]
+
+
 def test_exact_balance_is_searched_from_below_all_resonances(typed, monkeypatch):
     asked = []
     monkeypatch.setattr("jaxvib.steady.balance.states.balanced_intervals", lambda scene, *ends: asked.append(ends) or [])

@@ -293,3 +293,9 @@ def test_equal_arrows_have_equal_lengths_in_the_title():
 def test_labels_of_speeds_that_would_overlap_are_left_out():
     axis = speeds_chart([("a", np.array([20.0, 10.1, 10.0, 12.0])), ("b", np.array([10.2]))], unit="rad/s").axes[0]
     assert [text.get_text() for text in axis.texts] == ["10", "12", "20", "10.2"]
+
+
+def test_bars_of_changes_lie_inside_their_axis():
+    (axis, *_) = before_after([("force, N", 100.0, 2.0), ("power, W", 1.0, 30.0)]).axes
+    low, high = axis.get_xlim()
+    assert low < 0.02 and high > 30.0

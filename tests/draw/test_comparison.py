@@ -115,3 +115,14 @@ def test_differences_of_a_derivative_are_ringed_at_the_best_step():
     assert points_of(axis, "None") == [[[1e-5, EPS]], [[1e-4, 1e-7]]]
     assert points_of(axis, ":") == [[[0.0, 1e-6], [1.0, 1e-6]]]
     assert axis.get_ylabel() == "differences against reverse mode"
+
+
+@pytest.mark.parametrize(("longest", "labels"), [(0.02, ["1 ms", "2 ms", "5 ms", "10 ms"]), (5.0, ["1 ms", "10 ms"])])
+def test_times_over_many_decades_have_a_label_each_decade(longest, labels):
+    points = np.array([[1e-3, 1e-3], [longest, 1e-9]])
+    panel = CostPanel({"runs": points}, 1e-12, "amplitude", np.zeros((0, 2)))
+    figure = cost_chart({"runs": panel}, ())
+    axis = figure.axes[0]
+    ticks = axis.xaxis.get_major_locator().tick_values(*axis.get_xlim())
+    inside = [axis.xaxis.get_major_formatter()(x) for x in ticks if 0.9e-3 < x < 0.011]
+    assert inside == labels

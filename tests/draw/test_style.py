@@ -11,7 +11,7 @@ from jaxvib.draw.charts import before_after, branch_diagram, solid_and_dashed
 from jaxvib.draw.comparison import audit_chart
 from jaxvib.draw.motion.histories import band, time_histories
 from jaxvib.draw.results import shapes_chart, speeds_chart
-from jaxvib.draw.style import COLORS, legend_above, numbered, panels
+from jaxvib.draw.style import COLORS, legend_above, load_names, numbered, panels
 from jaxvib.draw.sweeps import tornado_chart
 
 # Machado, Oliveira, Fernandes 2009: what readers without one kind of cones see, of linear RGB.
@@ -194,3 +194,8 @@ def test_diagram_of_no_rotor_speed_is_refused():
     )
     with pytest.raises(jv.InputError, match=r"most is -1 rad/s; the branches begin at"):
         jv.branches(scene, points=50).plot(most=-1.0)
+
+
+def test_loads_are_numbered_from_two_and_up_to_eight():
+    assert load_names(1) == ["load"] and load_names(2) == ["load 1", "load 2"]
+    assert load_names(8)[-1] == "load 8" and load_names(9) == ["9 loads", *[None] * 8]

@@ -163,6 +163,15 @@ def test_coverage_of_runs_in_words(frequency, until, words):
     assert (len(found) > 0) == (len(words) > 0) and all(word in found[0] for word in words)
 
 
+def test_runs_far_from_a_resonance_state_all_their_speeds():
+    slow, fast = (
+        runs_of(np.linspace(0.0, 10.0, 2001), np.linspace(*ends, 2001)).problem for ends in ((10.0, 12.0), (40.0, 50.0))
+    )
+    both = SimpleNamespace(problem=SimpleNamespace(times=fast.times + slow.times, angles=fast.angles + slow.angles))
+    (found,) = coverage_notes(both, np.array([30.0]), np.array([0.1]))
+    assert "no run passes through a resonance: the rotors turn at 10 to 50 rad/s" in found
+
+
 def test_a_mode_without_decay_asks_for_its_damping():
     time = np.linspace(0.0, 10.0, 2001)
     (found,) = coverage_notes(runs_of(time, np.linspace(10.0, 50.0, 2001)), np.array([30.0, 40.0]), np.array([0.1, 0.0]))

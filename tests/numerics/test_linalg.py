@@ -13,6 +13,7 @@ from jaxvib.numerics.linalg import (
     hermitian_error,
     hermitian_modes,
     relative_to,
+    root_or_zero,
     small_inverse,
     small_solve,
     solve_definite,
@@ -137,3 +138,14 @@ def test_eigenvalues_have_second_derivatives():
     np.testing.assert_allclose(largest(1.5), 4.0, rtol=1e-14)
     np.testing.assert_allclose(jax.grad(largest)(1.5), 0.5, rtol=1e-14)
     np.testing.assert_allclose(jax.hessian(largest)(1.5), -0.125, rtol=1e-13)
+
+
+@pytest.mark.parametrize("n", [2, 5])
+def test_root_of_rounding_is_zero_with_derivative_zero(n):
+    eps = np.finfo(float).eps
+
+    def roots(small):
+        return root_or_zero(jnp.concatenate([jnp.array([small]), jnp.full(n - 1, 4.0)]))
+
+    assert roots(3.0 * n * 4.0 * eps)[0] == 0.0 and jax.jacfwd(roots)(3.0 * n * 4.0 * eps)[0] == 0.0
+    assert np.allclose(roots(5.0 * n * 4.0 * eps)[0], (20.0 * n * eps) ** 0.5, rtol=1e-15)
