@@ -117,13 +117,13 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
         head, *rows = modes_table(modes_found, growth)
         lines = [
             f"rotor {speed_text(scene.drive.speed)}; resonances {speed_text(modes_found.resonances)}",
-            table("jam modes (light loads)", head, rows) if rows else "no jam mode at this speed",
+            table("jam modes (light loads)", head, rows) if rows else "no jam mode was found at this speed",
         ]
         if rows:
             lines.append("amplitudes and foundation force are zero to peak")
         if any(row[2].startswith("no") for row in rows):
             lines.append("not stable: after a small disturbance the loads (balls, rollers, pendulums) leave this jam")
-        lines += [text] if (text := modes_found.unresolved_text()) else []
+        lines += [text] if (text := modes_found.missing_text()) else []
         if tolerances:
             lines.append(tolerance_table(ranges, tolerances))
         lines += _reached_lines(scene, output, [f"mode {mode}" for mode in measures], balanced)

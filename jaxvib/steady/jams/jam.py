@@ -27,7 +27,7 @@ from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import known_root
 from jaxvib.results.fields import in_unit, names_along, part
 from jaxvib.results.result import Result
-from jaxvib.results.status import status_names
+from jaxvib.results.status import failure, sentence, status_names
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import (
     Folds,
@@ -63,6 +63,10 @@ class JamStatus(eqx.Enumeration):
     )
     unbounded = "the loads turn at an undamped resonance: the vibration grows without bounds"
     refused = REFUSED
+    ambiguous = (
+        "the resistance of the loads falls as the rotor speed rises, and jams may therefore be missed; use simulate, or a "
+        "friction that does not fall"
+    )
 
 
 class AbstractJam(Result):
@@ -132,6 +136,8 @@ class JamModes(AbstractJam):
 
     - A mode that does not exist has NaN values, except for `rotor_speed`, and the status `absent`. Its derivatives are 0 in
       place of NaN, which keeps the derivatives of a batch finite: test the status, not the gradient
+    - All values are NaN, and the status is `ambiguous`, if dry friction with a falling radial load makes the resistance of the
+      loads fall as the rotor speed rises
     - A mode at an undamped resonance has NaN amplitudes and the status `unbounded`
 
     **Additional attributes**: `resonances` (nd,), rad/s, and the `folds` of the branch.
@@ -145,7 +151,7 @@ class JamModes(AbstractJam):
     @property
     def exists(self) -> Array:
         """Existence of each mode, (2 nd + 1,) Booleans."""
-        return self.status != JamStatus.absent
+        return (self.status != JamStatus.absent) & (self.status != JamStatus.ambiguous)
 
     @property
     def unresolved(self) -> list[int]:
@@ -158,8 +164,10 @@ class JamModes(AbstractJam):
         numbers = np.asarray(_modes_of_pieces(self.folds, self.resonances))
         return [int(k) for k in np.asarray(self.mode) if k not in numbers]
 
-    def unresolved_text(self) -> str:
-        """Return a sentence about the modes in `unresolved`; empty if there are none."""
+    def missing_text(self) -> str:
+        """Return a sentence about modes that are ambiguous or in `unresolved`; empty if there are none."""
+        if "ambiguous" in status_names(self.status):
+            return sentence(JamStatus.ambiguous)
         if not (modes := self.unresolved):
             return ""
         resonances = sorted({(mode + 1) // 2 for mode in modes})
@@ -168,7 +176,8 @@ class JamModes(AbstractJam):
 
     def mode_numbers(self) -> list[int]:
         """Return the numbers of the modes that exist, from 1 to 2 nd + 1."""
-        return [int(k) for k, name in zip(np.asarray(self.mode), status_names(self.status), strict=True) if name != "absent"]
+        names = zip(np.asarray(self.mode), status_names(self.status), strict=True)
+        return [int(k) for k, name in names if name not in ("absent", "ambiguous")]
 
     @validated
     def row(self, mode: int, *, throw: bool = False) -> int:
@@ -182,7 +191,10 @@ class JamModes(AbstractJam):
         return int(mode) - 1
 
     def _require_mode(self, mode: int) -> None:
-        if status_names(self.status)[mode - 1] == "absent":
+        name = status_names(self.status)[mode - 1]
+        if name == "ambiguous":
+            raise failure(JamStatus.ambiguous)
+        if name == "absent":
             there, rotor = ", ".join(map(str, self.mode_numbers())), speed_text(np.asarray(self.rotor_speed)[0], 6)
             why = f": resonance {(mode + 1) // 2} has {_UNRESOLVED}" if mode in self.unresolved else ""
             raise ComputationError(
@@ -193,9 +205,9 @@ class JamModes(AbstractJam):
     def select(self, mode: int, *, throw: bool = True) -> Jam:
         """Return the jam mode with number `mode`.
 
-        **Raises** `InputError` for a number outside 1 .. 2 nd + 1, and `ComputationError` (status "absent") for a mode that
-        does not exist at this rotor speed. With `throw=False`, and under a JAX transformation, only the status shows that the
-        mode does not exist.
+        **Raises** `InputError` for a number outside 1 .. 2 nd + 1, and `ComputationError` for a mode that does not exist at
+        this rotor speed (status "absent") or is not determined ("ambiguous"). With `throw=False`, and under a JAX
+        transformation, only the status shows this.
         """
         return entry(self, Jam, self.row(mode, throw=throw))
 
@@ -211,7 +223,7 @@ class JamModes(AbstractJam):
         lines = modes_table(self, growth)
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         rows = ("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in lines)
-        notes = [text] if (text := self.unresolved_text()) else []
+        notes = [text] if (text := self.missing_text()) else []
         is_known = any(map(math.isfinite, growth.values()))
         notes += [f"stable: {STABILITY_OF_FREE_LOADS if is_known else STABILITY_CRITERION}"]
         notes += ["(summary(scene) computes whether they stay together)"] if scene is None else []
@@ -353,7 +365,7 @@ def jam_modes(scene: Scene) -> JamModes:
 
 def _from_jams(jams: JamModes, scene: Scene) -> JamModes:
     """Return jams with all fields computed from their load speeds, without resonances and folds."""
-    n, model, exists = scene.drive.speed, jammed_model(scene).decomposed(), jams.status != JamStatus.absent
+    n, model, exists = scene.drive.speed, jammed_model(scene).decomposed(), jams.exists
     omega = jax.vmap(lambda root: known_root(lambda w: rotor_speed_at(model, w) - n, root))(jnp.where(exists, jams.omega, n))
     fields = _fields(model, jnp.where(exists, omega, n), exists, jams.status == JamStatus.at_fold)
     return dataclasses.replace(jax.tree.map(lambda _: None, jams), **fields)
@@ -385,6 +397,10 @@ def jams_of(scene: Scene) -> JamModes:
 def _fields(model: JammedModel, omega: Array, exists: Array, at_fold: Array) -> dict[str, Any]:
     """Return the fields of `JamModes` from load speeds, rad/s, existence flags and fold flags."""
     n = model.scene.drive.speed
+    missing = JamStatus.absent
+    if has_term(model.scene.all_effects, ContactFriction):
+        falls = _resistance_falls(model, n)
+        missing, exists = JamStatus.where(falls, JamStatus.ambiguous, missing), exists & ~falls
 
     def jam(number: Array, w: Array, has_mode: Array, has_fold: Array) -> Jam:
         solved = jam_at(model, number, w, n, has_fold)
@@ -394,7 +410,7 @@ def _fields(model: JammedModel, omega: Array, exists: Array, at_fold: Array) -> 
         return eqx.tree_at(
             lambda j: (j.status, j.stable, j.rotor_speed),
             values,
-            (JamStatus.where(has_mode, solved.status, JamStatus.absent), has_mode & solved.stable, n),
+            (JamStatus.where(has_mode, solved.status, missing), has_mode & solved.stable, n),
         )
 
     jams = jax.vmap(jam)(jnp.arange(1, omega.shape[0] + 1), omega, exists, at_fold)
@@ -421,12 +437,16 @@ def jam_at(
     status = JamStatus.where(at_fold, JamStatus.at_fold, JamStatus.found)
     can_stay = _can_stay_together(model, omega, rotor_speed, displacement)
     status = JamStatus.where(can_stay, status, JamStatus.cannot_stay_together)
+    is_unique = True
+    if has_term(model.scene.all_effects, ContactFriction):
+        is_unique = ~_resistance_falls(model, rotor_speed)
+        status = JamStatus.where(is_unique, status, JamStatus.ambiguous)
     return Jam(
         mode=number,
         status=JamStatus.where(bounded, status, JamStatus.unbounded),
         omega=omega,
         rotor_speed=rotor_speed,
-        stable=can_stay & (slope > 0.0),
+        stable=can_stay & is_unique & (slope > 0.0),
         slope=slope,
         displacement=displacement,
         amplitude=magnitude(displacement),
@@ -452,6 +472,20 @@ def _can_stay_together(model: JammedModel, omega: Array, rotor_speed: Array, dis
     if has_term(effects, ContactFriction):
         needed = needed + friction_on_light_loads(loads, effects, omega, rotor_speed)
     return jnp.all(~(available < (1.0 - 1e-6) * needed))
+
+
+def _resistance_falls(model: JammedModel, speed: Array) -> Array:
+    """Return True if the torque of drag and dry friction falls as the rotor speed rises, at this `speed` and any load speed.
+
+    A load speed then belongs to several rotor speeds, of which `rotor_speed_at` returns one. Example: the radial load of
+    `DryFriction` with `reaction="run_up"`, which is negative at large slips.
+    """
+
+    def resistance(omega: Array, n: Array) -> Array:
+        return model.drag * n + jnp.sum(friction_on_light_loads(model.loads, model.scene.all_effects, omega, n))
+
+    slopes = jax.vmap(jax.grad(resistance, argnums=1), in_axes=(0, None))(speed * np.linspace(0.01, 0.99, 16), speed)
+    return jnp.any(slopes <= 0.0)
 
 
 def branch_points(model: JammedModel, omega: Array) -> tuple[Jam, Folds]:

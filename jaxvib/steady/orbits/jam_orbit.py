@@ -25,11 +25,12 @@ from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.fourier import grid_of
+from jaxvib.results.status import sentence, status_names
 from jaxvib.runtime.devices import array_module, numpy_if_known, on_device
 from jaxvib.runtime.parallel import in_background
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import light_rotor_speed
-from jaxvib.steady.jams.jam import jams_of
+from jaxvib.steady.jams.jam import JamStatus, jams_of
 from jaxvib.steady.orbits.describe import Orbit, OrbitStatus, differentiable_fields, orbits
 from jaxvib.steady.orbits.search import exact_mode_speeds
 from jaxvib.steady.orbits.solve import Parameter, periodic_motion
@@ -133,7 +134,14 @@ def jam_orbit(
     if plan.mode is not None and not abs(float(orbit.omega) / float(plan.problem.start) - 1.0) < _MAX_SPEED_DIFFERENCE:
         # The mode does not exist in leading order, or its exact load speed is far from that of leading order.
         orbit = _solve_accurately(_plan_from_search(plan, plan.mode))
-    return outcome(orbit, throw=throw, failures=("absent", "not_converged"))
+    return outcome(orbit, throw=throw, failures=("absent", "not_converged"), hint=partial(_advice, plan))
+
+
+def _advice(plan: OrbitPlan, status: str) -> str:
+    """Return the advice that follows the message of a failed search."""
+    if status != "absent" or plan.mode is None or "ambiguous" not in status_names(jams_of(plan.problem.scene).status):
+        return ""
+    return f", or this search does not find it: {sentence(JamStatus.ambiguous)}"
 
 
 class JamProblem(NamedTuple):

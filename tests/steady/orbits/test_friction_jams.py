@@ -194,3 +194,31 @@ def test_exact_branch_of_a_gyroscopic_rotor():
     n = jax.vmap(lambda w: periodic_motion(assembled(scene), grid, "omega", w, jnp.asarray(fold.rotor_speed)).rotor_speed)(at)
     assert n[0] > n[1] and n[2] < n[3]
     np.testing.assert_allclose(n[1:3], fold.rotor_speed, rtol=1e-7)
+
+
+def falling(coefficient):
+    """Friction of run_up, whose radial load m R (Omega^2 - 2 n (n - Omega)) is negative at large slips."""
+    loads = jv.pendulums(count=2, mass=0.5, radius=0.1, drag=0.3)
+    machine = jv.two_mass(
+        mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0
+    )  # fmt: skip
+    return scene_of(loads, jv.DryFriction(coefficient, diameter=0.012, reaction="run_up"), speed=90.0, machine=machine)
+
+
+def test_a_resistance_that_falls_with_the_speed_is_a_status():
+    """Drag 0.003 N m s per load against 4 n m R mu2 d/2 = 0.0054 N m s at 90 rad/s; mode 4 came as 70.031 for 70.058 rad/s."""
+    modes = jv.jam_modes(falling(0.05))
+    assert modes.mode_numbers() == [] and not np.any(np.isfinite(modes.omega)) and not np.any(modes.stable)
+    assert "the resistance of the loads falls as the rotor speed rises" in modes.summary()
+    with pytest.raises(jv.ComputationError, match="ambiguous: the resistance of the loads falls"):
+        modes.select(4)
+    with pytest.raises(jv.ComputationError, match="or this search does not find it: the resistance of the loads falls"):
+        jv.jam_orbit(falling(0.05), mode=4)
+    assert modes.select(4, throw=False).summary().startswith("mode 4: the resistance of the loads falls")
+
+
+def test_jams_with_a_resistance_that_rises_are_found():
+    modes = jv.jam_modes(falling(0.0015))
+    assert modes.mode_numbers() == [1, 2, 3, 4, 5]
+    for mode in (3, 4):
+        assert abs(jam_rotor_speed(falling(0.0015), modes.select(mode).omega) / 90.0 - 1.0) < 0.02
