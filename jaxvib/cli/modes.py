@@ -81,7 +81,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
 
     from jaxvib.machine.effects.base import has_term
     from jaxvib.machine.effects.terms import ContactFriction
-    from jaxvib.steady.jams.jam import STABILITY_CRITERION, growth_of_modes
+    from jaxvib.steady.jams.jam import STABILITY_CRITERION, STABILITY_OF_FREE_LOADS, growth_of_modes
 
     modes_found = jax.device_get(jv.jam_modes(scene))  # NumPy arrays, because indexing JAX arrays would compile programs
     output.figure("branches.png", lambda: jv.branches(scene).plot())
@@ -99,7 +99,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
     document = {
         "rotor_speed": scene.drive.speed,
         "resonances": modes_found.resonances,
-        "judged": STABILITY_CRITERION,
+        "judged": STABILITY_OF_FREE_LOADS if any(map(math.isfinite, growth.values())) else STABILITY_CRITERION,
         "modes": [_mode_document(jam, growth[int(jam.mode)]) for jam in jams],
         "balanced_motion_stable": balanced,
         "unresolved": modes_found.unresolved,
@@ -202,8 +202,9 @@ def _drag_lines(scene: jv.Scene, limits: jv.DragLimits | None, *, points: bool |
 
 
 def _mode_document(jam: jv.Jam, growth: float) -> dict[str, Any]:
-    beginning, end = fields_of(jam, "mode", "omega", "stable"), fields_of(jam, "amplitude", "foundation_force")
-    return {**beginning, "growth_of_free_loads": growth, "status": jam.message, **end}
+    beginning, end = fields_of(jam, "mode", "omega"), fields_of(jam, "amplitude", "foundation_force")
+    stable = bool(jam.stable) and not growth > 0.0  # as in the table
+    return {**beginning, "stable": stable, "growth_of_free_loads": growth, "status": jam.message, **end}
 
 
 def _imbalance_lines(scene: jv.Scene) -> list[str]:
