@@ -181,6 +181,15 @@ def run_text(run: jv.Run, measures: jv.VibrationMeasures | None) -> str:
     return "\n".join([run.summary(measures), *peaks])
 
 
+def force_lines(scene: jv.Scene) -> list[str]:
+    """Return lines about the foundation force of a table."""
+    from jaxvib.motion.analysis.measure import ROOT_SUM_SQUARE  # slow import, which --help does not need
+
+    if len(scene.machine.structure().foundation_directions) == 1:
+        return ["foundation force: zero to peak"]
+    return [f"foundation force: zero to peak, {ROOT_SUM_SQUARE}", "  (sqrt(2) times a force that rotates)"]
+
+
 def indented(title: str, measures: jv.VibrationMeasures) -> str:
     """Return a title, and below it the measures as indented text."""
     return "\n".join([title, *(f"  {line}" for line in measures.summary().splitlines())])

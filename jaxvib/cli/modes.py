@@ -22,7 +22,7 @@ from jaxvib.cli.app import (
     table,
     tolerance_table,
 )
-from jaxvib.cli.document import indented, measures_of
+from jaxvib.cli.document import force_lines, indented, measures_of
 from jaxvib.cli.output import csv_options, fields_of
 from jaxvib.errors import InputError
 
@@ -217,15 +217,6 @@ def _imbalance_lines(scene: jv.Scene) -> list[str]:
     return ["amplitudes and forces are those of the loads only:", f"  {adds}"] if named else []
 
 
-def _force_lines(scene: jv.Scene) -> list[str]:
-    """Return lines about the foundation force of a table."""
-    from jaxvib.motion.analysis.measure import ROOT_SUM_SQUARE  # slow import, which --help does not need
-
-    if len(scene.machine.structure().foundation_directions) == 1:
-        return ["foundation force: zero to peak"]
-    return [f"foundation force: zero to peak, {ROOT_SUM_SQUARE}", "  (sqrt(2) times a force that rotates)"]
-
-
 def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     """Print the jams of light loads at any phases."""
     import jax  # slow imports, which --help does not need
@@ -281,7 +272,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
             if measures_of_jam is not None
         ]
         drags = _drag_lines(scene, limits, points=not is_gathered)
-        rows_of_force = [table(title, head, rows), *_force_lines(scene)]
+        rows_of_force = [table(title, head, rows), *force_lines(scene)]
         return "\n".join([conclusion, *reached, *rows_of_force, *measure_texts, *drags, *_imbalance_lines(scene)])
 
     output.done(document, text, "modes", result)

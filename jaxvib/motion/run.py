@@ -60,6 +60,9 @@ def _detachment_times(scene: Scene, trajectory: Trajectory) -> Array:
 _CONTACT = "add load_contact = { stiffness = 1e5, restitution = 0.6 } to [effects], or LoadContact(1e5, restitution=0.6)"
 
 
+_LARGE_ERROR = 1.0
+"""Error of the states above which the summary states that the phase is not determined."""
+
 _MIN_PEAK_RATIO = 1.02
 """Smallest ratio of the largest value during a run to that of its window for which the summary states the time."""
 
@@ -206,7 +209,10 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
             cost = f"{int(self.evaluations)} evaluations in {float(self.seconds):.3g} s"
             return f"{self.message}: amplitudes, speeds and forces are unknown after {int(self.steps)} steps\n  {cost}"
         error = f"estimated error of the states in the window, phase included, {float(self.error):.1e}"
-        error = "error not estimated" if np.isnan(self.error) else error
+        if np.isnan(self.error):
+            error = "error not estimated"
+        elif self.error > _LARGE_ERROR:
+            error = f"the phase of the motion is not determined (estimated error of the states in the window {self.error:.1e})"
         rotors = [w[-1] for w in self.window.rotor_speeds]
         stuck = [] if np.max(np.abs(rotors)) > 1.0 else start_notes(self.scene)
         if not stuck and float(jnp.abs(self.omega)) < STILL_SHARE * float(self.scene.top_speed):

@@ -2,7 +2,9 @@
 
 import types
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_machine import small_run
@@ -59,6 +61,12 @@ def test_summary_and_plot_show_the_run(run):
     assert run.summary().startswith("the run reached its end: 20 s") and "zero to peak: y1" in run.summary()
     assert "detached" not in run.summary()
     assert len(run.plot().axes) == 6  # three quantities, each as a whole and its last periods
+
+
+def test_summary_states_that_the_phase_is_not_determined(run):
+    said = [eqx.tree_at(lambda r: r.error, run, jnp.asarray(error)).summary() for error in (0.9, 5.4)]
+    assert "phase included, 9.0e-01" in said[0] and "the phase of the motion is not determined" not in said[0]
+    assert "the phase of the motion is not determined (estimated error of the states in the window 5.4e+00)" in said[1]
 
 
 def test_window_alone_measures_the_same(run, window):

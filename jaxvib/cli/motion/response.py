@@ -9,7 +9,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, command, loaded_scene, table
-from jaxvib.cli.document import ANGLES_TYPE, deck_options, indented, measures_of
+from jaxvib.cli.document import ANGLES_TYPE, deck_options, force_lines, indented, measures_of
 from jaxvib.cli.output import csv_options
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def _text(
     if operating:
         points, is_bounded = result.operating, np.all(np.isfinite(result.operating.amplitude), axis=1)
         rows = [motion(points, k, "yes" if points.stable[k] else "no" if is_bounded[k] else "unbounded") for k in operating]
-        lines.append(table("operating points (zero to peak)", [unit, "stable", *moves, *end], rows))
+        lines += [table("operating points (zero to peak)", [unit, "stable", *moves, *end], rows), *force_lines(result.scene)]
         if several:
             rows = [
                 [f"{scale * points.speed[k]:.5g}", str(number), *(f"{x:.4g}" for x in (needed, motor, points.speed[k] * motor))]
