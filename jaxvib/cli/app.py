@@ -167,7 +167,8 @@ def tolerance_table(ranges: Sequence[ToleranceRange], tolerances: Sequence[str])
         values = [f"{factor * x:.4g}" for x in (entry.design, *span, entry.worst)]
         rows.append([f"{words}, {unit}".rstrip(", "), *values, f"{100.0 * entry.share:.3g} %"])
     head = ["leading order", "design", "95 % from", "to", "worst", "machines where it exists, or the demand is met"]
-    return table(f"machines with {', '.join(tolerances)}", head, rows)
+    worst = "worst: the largest value (the smallest if it is maximized or has a lower limit)"
+    return "\n".join([table(f"machines with {', '.join(tolerances)}", head, rows), worst])
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> str:

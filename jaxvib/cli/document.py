@@ -59,6 +59,10 @@ _NOTED_KEY = "jaxvib.noted_measures"
 """Key in the context of click. Its value is True if a note about implausible measures was printed."""
 
 
+_MAX_LAYER = 20.0
+"""Largest width or height of a layer of material on a deck, m."""
+
+
 def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options --deck, --slope and --layer, which `measures_of` reads, to a command."""
 
@@ -75,6 +79,8 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
             if parts is not None and len(parts) != 3:
                 problem = "give WIDTH,HEIGHT,DENSITY, such as '1.5 m, 55 mm, 1600 kg/m^3'"
                 raise InputError("--layer", f"is {quoted(value)}; {problem}")
+            if parts is not None:
+                _require_layer(parts)
             value = parts
         elif value is not None:
             from jaxvib.steady.points import read_slope  # slow import, which --help does not need
@@ -107,6 +113,17 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
         help="Layer of material on the deck, for the throughput, such as '1.5 m, 55 mm, 1600 kg/m^3'.",
     )
     return deck(slope(layer(command)))
+
+
+def _require_layer(parts: list[str]) -> None:
+    """**Raises** `InputError` for a width or height, as text, of more than `_MAX_LAYER` m, which is in another unit."""
+    from jaxvib.units import number  # slow import, which --help does not need
+
+    for part, name in zip(parts, ("width", "height"), strict=False):
+        size = number(part, "m", "--layer")
+        if size > _MAX_LAYER:
+            problem = f"has the {name} {float(size):g} m; numbers without a unit are metres"
+            raise InputError("--layer", f"{problem}; write for example '1.5 m, 55 mm, 1600 kg/m^3'")
 
 
 def measures_of(scene: jv.Scene, motion: jv.Jam | jv.PhaseJam | jv.Orbit | jv.Vibration) -> jv.VibrationMeasures:

@@ -108,6 +108,7 @@ def test_settle_shows_ranges_within_tolerances(typed, tmp_path):
     shown = ["jam frequency", "stroke of platform 1", "force on support 1", "foundation force", "shaft torque"]
     assert [entry["words"] for entry in ranges] == [f"{name}, mode 1" for name in shown]
     assert "machines with stiffness=5%" in typed(*words)[1]
+    assert "worst: the largest value (the smallest if" in typed(*words)[1]
     assert "--tolerance is 'stiffness'; write NAME=PERCENT" in typed(*words[:-1], "stiffness")[2]
     assert "material (mass on a platform)" in typed(*words[:-1], "load=0..20kg")[2]
     assert "repeat the option for each value: --tolerance ... --tolerance ..." in typed(*words, "damping=30%")[2]
@@ -444,6 +445,8 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     layer = ("--layer", "1.5 m, 55 mm, 1600 kg/m3")
     out = typed("regimes", "screen.toml", "--deck", "0.4, 0.1", "--slope", "-5 deg", *layer)[1]
     assert out.count(" t/h") == out.count("conveys ")
+    code, _, err = typed("regimes", "screen.toml", "--layer", "0.8, 150, 1600")
+    assert code == 2 and "--layer has the height 150 m; numbers without a unit are metres; write for example '1.5 m" in err
     assert "954.887" in out and "point (0.4, 0.1) m: stroke" in out and max(map(len, out.splitlines())) <= 80
     assert "rotation: exciter 1 anticlockwise, exciter 2 clockwise" in out and "margin: factor" in out
     assert "resonances: 42.706, 42.706, 51.247 rpm" in out and "stable, above all resonances:" in out

@@ -167,7 +167,8 @@ def _require_plate(rated: float, frequency: float, ratio: float, synchronous: fl
     pairs_at_rated_speed = frequency / rated
     if abs(pairs_at_rated_speed - np.round(pairs_at_rated_speed)) < 1e-6 * pairs_at_rated_speed:
         problem = f"{speed}, the synchronous speed of {pairs_at_rated_speed:.0f} pole pairs, at which a motor has no torque"
-        raise InputError("drive.rated_speed", f"{problem}; give the speed at rated load, some percent below it, as '1440 rpm'")
+        example = speed_text(0.96 * rated, 3)
+        raise InputError("drive.rated_speed", f"{problem}; give the speed at rated load, some percent below it, as '{example}'")
     if not breakdown_slip < 1.0:
         slip = f"{100.0 * (1.0 - rated / synchronous):.3g} % below the synchronous speed of {speed_text(synchronous)}"
         problem = f"{speed}, {slip}; with the breakdown_ratio {ratio:.4g} the breakdown slip is {breakdown_slip:.3g}"

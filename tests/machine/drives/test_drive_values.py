@@ -195,7 +195,7 @@ REFUSED = {
     "rated at 750 rpm": (
         lambda: jv.NamePlateMotor(4e3, "750 rpm", 2.0, 0.02),
         "drive.rated_speed is 750 rpm, the synchronous speed of 4 pole pairs, at which a motor has no torque; give the speed "
-        "at rated load",
+        "at rated load, some percent below it, as '720 rpm'",
     ),
     "breakdown slip": (
         lambda: jv.NamePlateMotor(4e3, "1200 rpm", 3.0, 0.02),
