@@ -1,6 +1,7 @@
 """`jaxvib sweep`, `jaxvib show`, `jaxvib new sweep` as a user types them."""
 
 import json
+import math
 import sys
 
 import pytest
@@ -9,6 +10,8 @@ from scenes import scene
 import jaxvib as jv
 from jaxvib.cli import output
 from jaxvib.cli.study import sweep as command
+from jaxvib.sweeps.seals import seal_of
+from jaxvib.sweeps.store import Store
 
 STUDY = """
 scene = "machine.toml"
@@ -52,6 +55,16 @@ def test_a_study_is_run_resumed_and_shown(typed, tmp_path):
     assert "results of the cases" in out and last == "900 1 4712"  # 50 kg at 900 rpm
     code, out, _ = typed("show", "study.zarr", "--json")
     assert json.loads(out)["cases"] == 10
+
+
+def test_a_store_without_a_computed_case_has_no_figures(typed, tmp_path):
+    assert typed("sweep", "study.toml")[0] == 0
+    store = Store(tmp_path / "study.zarr")
+    for chunk in range(math.prod(store.tiles)):
+        for file in (seal_of(store.path, chunk), *store._files(chunk).values()):
+            file.unlink()
+    code, out, err = typed("show", "study.zarr", "--out", "figures")
+    assert code == 0 and "no case was computed" in err and "has not been computed yet" in out
 
 
 def test_progress_is_lines_where_there_is_no_terminal(typed, monkeypatch):

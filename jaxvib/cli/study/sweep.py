@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from jaxvib.cli.app import Output, command, table
-from jaxvib.cli.output import duration_text
+from jaxvib.cli.output import duration_text, note
 from jaxvib.errors import InputError, optional_module, quoted
 
 if TYPE_CHECKING:
@@ -64,7 +64,9 @@ def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory:
     from jaxvib.sweeps.sweep import open_sweep
 
     result = open_sweep(store)
-    if output.folder is not None or output.report is not None:
+    if all(status == "missing" for status, _ in result.counts):
+        note("note: no figures, because no case was computed: continue the study with jaxvib sweep")
+    elif output.folder is not None or output.report is not None:
         from jaxvib.sweeps.figures import figures
 
         x, y = over or (None, None)
