@@ -62,7 +62,7 @@ def test_a_store_without_a_computed_case_has_no_figures(typed, tmp_path):
     store = Store(tmp_path / "study.zarr")
     for chunk in range(math.prod(store.tiles)):
         for file in (seal_of(store.path, chunk), *store._files(chunk).values()):
-            file.unlink()
+            file.unlink(missing_ok=True)
     code, out, err = typed("show", "study.zarr", "--out", "figures")
     assert code == 0 and "no case was computed" in err and "has not been computed yet" in out
 
