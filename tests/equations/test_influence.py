@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.equations.torque_balance import TorqueBalance, assemble_torque_balance, influence_of, unknowns_of
+from jaxvib.equations.linear import linear_model
+from jaxvib.equations.torque_balance import (
+    TorqueBalance,
+    assemble_torque_balance,
+    influence_of,
+    resultant_of,
+    unknowns_of,
+)
 from jaxvib.steady.regimes.local import margin_of
 from jaxvib.steady.regimes.search import all_regimes
 
@@ -100,3 +107,12 @@ def test_search_and_margin_in_modal_form_are_those_of_matrices():
     margins, slopes = jax.jit(jax.vmap(jax.value_and_grad(margin)))(jnp.array([1.0 - h, 1.0, 1.0 + h]))
     np.testing.assert_allclose(margins[1], margin_of_matrices(balance, x), rtol=1e-9)
     np.testing.assert_allclose(slopes[1], (margins[2] - margins[0]) / (2.0 * h), rtol=1e-5)
+
+
+def test_forces_that_cancel_have_the_resultant_zero():
+    """The phase pi is not exact in floating-point numbers: its sine is 1.2e-16."""
+    exciters = [jv.Exciter(drive=jv.ConstantSpeed(20.0), unbalance=0.3) for _ in range(2)]
+    model = linear_model(jv.Scene(jv.one_mass(mass=100.0, stiffness=2e4, damping=30.0), exciters=exciters))
+    opposite, equal = (np.asarray(resultant_of(model, jnp.exp(1j * jnp.array([0.0, a])))) for a in (np.pi, 0.0))
+    assert np.all(opposite == 0.0)
+    np.testing.assert_allclose(np.max(np.abs(equal)), 0.6, rtol=1e-15)
