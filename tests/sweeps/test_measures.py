@@ -129,7 +129,9 @@ def test_a_spin_up_in_a_sweep_is_that_of_simulate(tmp_path):
 @pytest.mark.parametrize("measure", ["run.regime", next(iter(RUN_MEASURES.values())), [], {}, 3.0])
 def test_measures_that_are_no_list_are_refused(measure):
     scene = jv.Scene(
-        jv.one_mass(mass=50.0, stiffness=4e4), jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0)
+        jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+        jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0),
+        jv.ConstantSpeed(60.0),
     )
     with pytest.raises(jv.InputError, match=r"measure is .*; give a list of quantities, such as"):
         study(scene, {"loads.drag": [0.5, 1.0]}, measure)
