@@ -199,6 +199,11 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """Stored states: the whole run, or the window if only the window was kept."""
         return self.window if self.trajectory is None else self.trajectory
 
+    @property
+    def _cost(self) -> str:
+        counted = f"{int(self.evaluations)} evaluations" if self.evaluations else "computed"
+        return f"{counted} in {float(self.seconds):.3g} s"
+
     def summary(self, measures: VibrationMeasures | None = None) -> str:
         """Return the outcome of the run as text; amplitudes zero to peak.
 
@@ -206,8 +211,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """
         self.require_single()
         if not self._has_end:
-            cost = f"{int(self.evaluations)} evaluations in {float(self.seconds):.3g} s"
-            return f"{self.message}: amplitudes, speeds and forces are unknown after {int(self.steps)} steps\n  {cost}"
+            return f"{self.message}: amplitudes, speeds and forces are unknown after {int(self.steps)} steps\n  {self._cost}"
         error = f"estimated error of the states in the window, phase included, {float(self.error):.1e}"
         if np.isnan(self.error):
             error = "error not estimated"
@@ -236,7 +240,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 *first,
                 f"{end}: {duration_text(self.scene, self.window.time[-1])}, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
-                f"  {error}; {int(self.evaluations)} evaluations in {float(self.seconds):.3g} s",
+                f"  {error}; {self._cost}",
                 *([] if self.window.time.dtype.itemsize >= 8 else [_SINGLE_PRECISION]),
                 *([] if self.settled else [self._window_text()]),
                 f"  {self.speeds_text(self.scene, self.window.rotor_speeds)}",

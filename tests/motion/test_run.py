@@ -1,5 +1,6 @@
 """Methods of a run."""
 
+import dataclasses
 import types
 
 import equinox as eqx
@@ -61,6 +62,11 @@ def test_summary_and_plot_show_the_run(run):
     assert run.summary().startswith("the run reached its end: 20 s") and "zero to peak: y1" in run.summary()
     assert "detached" not in run.summary()
     assert len(run.plot().axes) == 6  # three quantities, each as a whole and its last periods
+
+
+def test_summary_omits_a_number_of_evaluations_that_is_unknown(run):
+    assert f"; {int(run.evaluations)} evaluations in " in run.summary()
+    assert "; computed in " in dataclasses.replace(run, evaluations=jnp.array(0)).summary()
 
 
 def test_summary_states_that_the_phase_is_not_determined(run):
