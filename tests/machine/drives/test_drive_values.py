@@ -6,7 +6,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.machine.drives.drive import Directed, kloss_torque
-from jaxvib.machine.numbers import number_specs
+from jaxvib.machine.numbers import number_specs, read_numbers
 
 POSITIVE, NOT_NEGATIVE = "greater than 0", "at least 0"
 SPEED = ("rad/s", POSITIVE, "rotor speed", "", None)
@@ -142,17 +142,24 @@ def test_each_number_has_its_place_unit_bounds_and_label(kind):
             assert getattr(drive, name) is value or getattr(drive, name) == value
 
 
+def beside(bounds):
+    """For each bound in these words: a value just beyond it, and one just within it."""
+    for words in bounds.split(" and ") if bounds else ():
+        kind, _, last = words.rpartition(" ")
+        bound, inward = float(last), 1e-9 if kind in ("greater than", "at least") else -1e-9
+        yield (bound, bound + inward) if kind in ("greater than", "less than") else (bound - inward, bound)
+
+
 @pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, (_, _, expected) in PARTS.items() for name in expected])
-def test_values_beyond_the_bounds_are_refused(kind, name):
+def test_values_just_beyond_the_bounds_are_refused(kind, name):
     part, given, expected = PARTS[kind]
     unit, bounds = expected[name][:2]
-    if bounds:
-        low = float(bounds.split()[2])
-        bad = low if bounds.startswith("greater") else low - 1.0
-        value, place = ([bad, 5.0], "[0]") if expected[name][3] else (bad, "")
+    for beyond, within in beside(bounds):
+        bad, good, place = ([beyond, 5.0], [within, 5.0], "[0]") if expected[name][3] else (beyond, within, "")
         with pytest.raises(jv.InputError) as error:
-            part(**{**given, name: value})
-        assert str(error.value) == f"drive.{name}{place} is " + f"{bad:g} {unit}".strip() + f"; it must be {bounds}"
+            part(**{**given, name: bad})
+        assert str(error.value) == f"drive.{name}{place} is " + f"{beyond:g} {unit}".strip() + f"; it must be {bounds}"
+        np.testing.assert_array_equal(read_numbers(part, "drive", **{name: good})[name], good)
     with pytest.raises(jv.InputError) as error:
         part(**{**given, name: ["5 lm", "6 lm"] if expected[name][3] else "5 lm"})
     assert error.value.field.startswith(f"drive.{name}")
