@@ -10,7 +10,6 @@ This module is outside the package `jaxvib` because an interrupt must also end t
 
 import os
 import sys
-from typing import NoReturn
 
 _MESSAGE = "\njaxvib: interrupted\n"
 
@@ -60,7 +59,7 @@ def _end_at_interrupts() -> None:
     signal.signal(signal.SIGINT, lambda *_: None)  # the thread ends the process
 
 
-def _end() -> NoReturn:
+def _end() -> None:
     """End the process without cleanup: other threads may be compiling, and XLA must not be destroyed while they do."""
     if sys.stderr.isatty():  # remove a progress bar, and show the cursor that it hid
         os.write(2, b"\r\x1b[K\x1b[?25h")

@@ -416,6 +416,13 @@ def test_an_interrupt_ends_a_command_at_once(moment, options):
     assert json.loads(done.stdout) == {"error": error} if options else done.stdout == ""
 
 
+def test_command_imports_nothing_before_it_handles_interrupts():
+    """An interrupt during an import of the module itself would print a traceback."""
+    script = "import sys; before = {*sys.modules}; import jaxvib_command; print(*({*sys.modules} - before))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=600.0)
+    assert done.stdout.split() == ["jaxvib_command"]
+
+
 INTERRUPTED = """
 import signal, sys, threading, time, jaxvib.cli.app
 from jaxvib_command import main
