@@ -189,3 +189,29 @@ def test_a_step_uses_the_time_of_each_of_its_stages():
     term, control = diffrax.ODETerm(field), diffrax.ConstantStepSize()
     found = diffrax.diffeqsolve(term, LoopDopri8(), 0.5, 1.5, 0.5, 0.5**powers, stepsize_controller=control)
     np.testing.assert_allclose(found.ys[0], 1.5**powers, rtol=1e-13)
+
+
+def test_interpolated_states_move_with_time_or_field_alone():
+    """y' = -a y with equal steps: the fraction of the step is fixed if only a moves, the stages are if only the time does."""
+    term, control = diffrax.ODETerm(lambda t, y, rate: -rate * y), diffrax.ConstantStepSize()
+
+    def at(rate, t):
+        saved, method = diffrax.SaveAt(dense=True), LoopDopri8(tangents=True)
+        found = diffrax.diffeqsolve(
+            term,
+            method,
+            0.0,
+            1.0,
+            0.1,
+            jnp.ones(1),
+            rate,
+            saveat=saved,
+            stepsize_controller=control,
+            adjoint=diffrax.ForwardMode(),
+        )
+        return found.evaluate(t)[0]
+
+    right = np.exp(-0.5 * 0.73)
+    by_rate, by_time, by_both = (eqx.filter_jit(jax.jacfwd(at, argnums))(0.5, 0.73) for argnums in (0, 1, (0, 1)))
+    assert_close(by_both, (by_rate, by_time), rtol=1e-12)
+    assert_close((by_rate, by_time), (-0.73 * right, -0.5 * right), rtol=1e-9)
