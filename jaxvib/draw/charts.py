@@ -18,15 +18,14 @@ from jaxvib.draw.style import (
     UNSTABLE,
     WORKING,
     Look,
+    axis_unit,
     label_colors,
     legend_above,
     legend_outside,
-    length_unit,
     log_ticks,
     numbered,
     panels,
     resonance_lines,
-    tilt_unit,
 )
 from jaxvib.errors import InputError, quoted
 
@@ -61,7 +60,7 @@ def branch_diagram(
 
     - `rotor_speed` (n,), `omega` (n,): rotor speed and load speed, rad/s, drawn in `unit`
     - `stable` (n,): True if stable; `stability_text`: how stability is determined, written below the figure
-    - `amplitude` (n, nd): amplitudes, m (drawn in mm or µm) or rad (drawn in mrad or µrad)
+    - `amplitude` (n, nd): amplitudes, m (drawn in mm or µm) or rad (drawn in deg)
     - `units` (nd,): "m" or "rad" for each coordinate; None: all m
     - `force` (n,): foundation force, N
     - `resonances`: resonances, rad/s, drawn as horizontal lines
@@ -163,11 +162,11 @@ def scaled_amplitudes(
 
     **Arguments**: `amplitude` (n, nd), m or rad; `names` (nd,) of the coordinates; `units` (nd,), "m" or "rad"; None: all m.
 
-    >>> scaled_amplitudes(np.array([[0.01, 0.02]]), ("y1", "tilt"), ("m", "rad"))
-    (['mm', 'mrad'], [('y1', array([10.])), ('tilt', array([20.]))])
+    >>> scaled_amplitudes(np.array([[0.01, np.pi]]), ("y1", "tilt"), ("m", "rad"))
+    (['mm', 'deg'], [('y1', array([10.])), ('tilt', array([180.]))])
     """
     tilts = np.asarray([units is not None and each == "rad" for each in units or names])
-    length, tilt = length_unit(amplitude[:, ~tilts]), tilt_unit(amplitude[:, tilts])
+    length, tilt = axis_unit("m", amplitude[:, ~tilts]), axis_unit("rad", amplitude[:, tilts])
     kinds = [tilt if each else length for each in tilts]
     scaled = [(name, factor * amplitude[:, k]) for k, (name, (_, factor)) in enumerate(zip(names, kinds, strict=True))]
     return [unit for unit, _ in kinds], scaled

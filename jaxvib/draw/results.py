@@ -46,7 +46,7 @@ def modes_chart(
     - `mode` (k,): numbers of the modes
     - `omega` (k,): load speeds, rad/s, drawn in `unit`
     - `stable` (k,): stability by slope
-    - `amplitude` (k, nd): amplitudes, m, drawn in mm or µm (tilts: rad, drawn in mrad), with a marker and a colour for each
+    - `amplitude` (k, nd): amplitudes, m, drawn in mm or µm (tilts: rad, drawn in deg), with a marker and a colour for each
       coordinate
     - `resonances`: resonances, rad/s, drawn as horizontal lines
     - `names`, `units` (nd,): names of the coordinates and their units, "m" or "rad"; `units` None: all m

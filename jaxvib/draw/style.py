@@ -179,27 +179,15 @@ def log_ticks(axis: Axes, which: Literal["x", "y"] = "y") -> None:
     line.set_major_formatter("{x:g}" if is_short or high / low < 1e3 else LogFormatterSciNotation(labelOnlyBase=False))
 
 
-def length_unit(*values: np.ndarray) -> tuple[str, float]:
-    """Return the unit in which the axis of a figure shows the lengths `values`, given in m, and the factor from m to it.
+def axis_unit(unit: str, *values: np.ndarray) -> tuple[str, float]:
+    """Return the display unit of the axis of displacements or tilts `values` in the SI `unit`, and the factor to it.
 
-    >>> length_unit(np.array([0.02])), length_unit(np.array([3e-7]))
-    (('mm', 1000.0), ('µm', 1000000.0))
+    >>> axis_unit("m", np.array([0.02])), axis_unit("m", np.array([3e-7])), axis_unit("rad", np.ones(1))[0]
+    (('mm', 1000.0), ('µm', 1000000.0), 'deg')
     """
     size = max((float(np.max(np.abs(x), initial=0.0, where=np.isfinite(x))) for x in values), default=0.0)
-    unit, factor = shown_unit("m", min(max(size, 1e-12), 0.999))
-    return unit.replace("um", "µm"), factor
-
-
-def tilt_unit(values: np.ndarray) -> tuple[str, float]:
-    """Return the unit in which the axis of a figure shows the tilts `values`, given in rad, and the factor from rad to it.
-
-    >>> tilt_unit(np.array([0.02])), tilt_unit(np.array([3e-7]))
-    (('mrad', 1000.0), ('µrad', 1000000.0))
-    """
-    if shown_unit("rad", 1.0)[0] == "rad":  # SI units
-        return "rad", 1.0
-    size = float(np.max(np.abs(values), initial=0.0, where=np.isfinite(values)))
-    return ("µrad", 1e6) if 0.0 < size < 1e-6 else ("mrad", 1e3)
+    shown, factor = shown_unit(unit, min(max(size, 1e-12), 0.999))
+    return shown.replace("um", "µm"), factor
 
 
 def legend_above(axis: Axes, columns: int = 4, **options: Any) -> None:

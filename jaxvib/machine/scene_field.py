@@ -32,6 +32,7 @@ def axis_labels(scene: Scene) -> dict[str, tuple[str, ...]]:
     directions = structure.foundation_directions if len(structure.foundation_directions) > 1 else ()
     return {
         "coordinate": structure.coordinates,
+        "translation": tuple(n for n, unit in zip(structure.coordinates, structure.units, strict=True) if unit == "m"),
         "unit": structure.units,
         "load": masses,
         "mass": masses,

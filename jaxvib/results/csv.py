@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import csv
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import equinox as eqx
@@ -30,7 +30,8 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
     - `result`: result of any class
     - `axis`: name of the axis in the metadata of the fields, such as "time" or "point"
     - `path`: path of the file, which is overwritten
-    - `display`: True for the units of `display_units`; default: SI units
+    - `display`: True for the units of `display_units` and names in words, such as "rotor speed" for `rotor_speed`; default: SI
+      units and the names of the fields
     - `decimal_comma`: True for decimal commas, and semicolons between columns, as German and Russian spreadsheets expect;
       default: decimal points and commas
 
@@ -81,6 +82,7 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
     """
     labels = labels_of(result)
     units = labels.get("unit", ())
+    in_words: Callable[[str], str] = (lambda name: name.replace("_", " ")) if display else str
     table: dict[str, np.ndarray] = {}
     for name, axes, values, unit in columns(result):
         if values.ndim != len(axes):
@@ -93,7 +95,7 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
         for place in np.ndindex(values.shape[1:]):
             places = [_label(labels, a, k, n) for a, k, n in zip(axes[1:], place, values.shape[1:], strict=True)]
             column_unit = _own_unit(unit, axes, place, units)
-            head, column = " ".join([name, *filter(None, places)]), values[(slice(None), *place)]
+            head, column = " ".join([in_words(name), *filter(None, places)]), values[(slice(None), *place)]
             if display and column_unit and np.issubdtype(column.dtype, np.inexact):  # real and imaginary part have one unit
                 largest = float(np.max(np.abs(column), initial=0.0, where=np.isfinite(column)))
                 column_unit, factor = shown_unit(column_unit, largest)
@@ -109,7 +111,7 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
         raise InputError("axis", f"is {quoted(axis)}; the axes of {type(result).__name__} are: {', '.join(known) or 'none'}")
     named = (axis, "unit") if axis == "coordinate" and len(set(units)) > 1 else (axis,)
     rows = len(next(iter(table.values())))
-    return {name: np.array(labels[name]) for name in named if len(labels.get(name, ())) == rows} | table
+    return {in_words(name): np.array(labels[name]) for name in named if len(labels.get(name, ())) == rows} | table
 
 
 def _label(labels: Labels, axis: str, k: int, n: int) -> str:

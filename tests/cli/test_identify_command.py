@@ -29,7 +29,7 @@ def test_identify_from_the_command_line(typed, tmp_path):
     assert half > 0.03 * document["viscous"]["value"]
     assert (tmp_path / "o" / "record.png").stat().st_size > 10_000
     kept = np.loadtxt(tmp_path / "o" / "fit.csv", delimiter=",", skiprows=1)
-    assert kept.shape == (400, 3) and np.std(kept[:, 1] - kept[:, 2]) < 1.1e-3
+    assert kept.shape == (400, 3) and np.std(kept[:, 1] - kept[:, 2]) < np.rad2deg(1.1e-3)
 
     (tmp_path / "swing.csv").write_text((tmp_path / "swing.csv").read_text().replace(",", ";").replace(".", ","))
     words = [
@@ -48,7 +48,7 @@ def test_identify_from_the_command_line(typed, tmp_path):
     code, out, err = typed(*words)
     assert code == 0 and "mu1, N m s" in out and "found: the fit explains" in out
     lines = (tmp_path / "p" / "fit.csv").read_text().splitlines()
-    assert lines[0] == "time (s);angle (rad);fit (rad)" and lines[2].startswith("0,05") and lines[2].count(";") == 2
+    assert lines[0] == "time (s);angle (deg);fit (deg)" and lines[2].startswith("0,05") and lines[2].count(";") == 2
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def test_a_run_as_csv_is_its_trajectory(typed, tmp_path, monkeypatch):
     code, _, err = typed("simulate", "machine.toml", "--until", "0.5s", "--csv", "run.csv", "--json")
     assert code == 0 and err == ""
     head, *rows = read(tmp_path / "run.csv")
-    assert head[:3] == ["time (s)", "displacement y1 (mm)", "displacement y2 (mm)"] and "rotor_speed (rpm)" in head
+    assert head[:3] == ["time (s)", "displacement y1 (mm)", "displacement y2 (mm)"] and "rotor speed (rpm)" in head
     numbers = np.array(rows, dtype=float)
     np.testing.assert_allclose(numbers[:, 0], kept.trajectory.time, rtol=1e-8)
     np.testing.assert_allclose(
@@ -78,7 +78,7 @@ def test_an_envelope_as_csv_is_its_trajectory(typed, tmp_path):
     assert code == 0, err
     head, *rows = read(tmp_path / "run_up.csv")
     kept = jv.envelope(jv.load_scene("machine.toml"), "1s", samples=len(read(tmp_path / "run_up.csv")) - 1).trajectory
-    at = [head.index(f"trajectory_{name}") for name in ("time (s)", "amplitude y2 (mm)", "rotor_speed (rpm)")]
+    at = [head.index(f"trajectory {name}") for name in ("time (s)", "amplitude y2 (mm)", "rotor speed (rpm)")]
     numbers = np.array(rows, dtype=float)[:, at]
     np.testing.assert_allclose(
         numbers, np.stack([kept.time, 1e3 * kept.amplitude[:, 1], 30.0 / np.pi * kept.rotor_speed], axis=1), rtol=1e-8
@@ -89,7 +89,7 @@ def test_branches_as_csv(typed, tmp_path):
     assert typed("modes", "machine.toml", "--csv", "branches.csv")[0] == 0
     head, *rows = read(tmp_path / "branches.csv")
     at = {name: k for k, name in enumerate(head)}
-    numbers = [[float(row[at[name]]) for row in rows] for name in ("omega (rpm)", "rotor_speed (rpm)")]
+    numbers = [[float(row[at[name]]) for row in rows] for name in ("omega (rpm)", "rotor speed (rpm)")]
     branch = jv.branches(jv.load_scene("machine.toml"))
     points = [[f"{30.0 / np.pi * float(x):.9g}" for x in pair] for pair in zip(branch.omega, branch.rotor_speed, strict=True)]
     points = [point for k, point in enumerate(points) if k == 0 or point != points[k - 1]]

@@ -159,9 +159,9 @@ def test_small_motions_at_the_end_have_their_own_unit():
     whole = (t, np.hstack([2e-3 * wave, 1e-2 * wave]), one, one, wave)
     end = (t, np.hstack([7e-8 * wave, 3e-9 * wave]), one, one, wave)
     axes = time_histories(whole, end, names=("y", "theta"), units=("m", "rad"), directions=("up",)).axes
-    assert [axis.get_ylabel() for axis in axes[:4]] == ["displacement, mm", "displacement, µm", "tilt, mrad", "tilt, µrad"]
+    assert [axis.get_ylabel() for axis in axes[:4]] == ["displacement, mm", "displacement, µm", "tilt, deg", ""]
     assert np.max(axes[1].lines[0].get_ydata()) == pytest.approx(0.07, rel=1e-3)
-    assert np.max(axes[3].lines[0].get_ydata()) == pytest.approx(0.003, rel=1e-3)
+    assert np.max(axes[3].lines[0].get_ydata()) == pytest.approx(np.rad2deg(3e-9), rel=1e-3)
 
 
 def test_a_history_says_at_what_time_it_begins():

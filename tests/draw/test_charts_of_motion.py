@@ -78,8 +78,8 @@ def response(**options):
 
 def test_a_response_has_its_amplitudes_phases_and_force():
     lengths, tilts, phases, force, torque = response()
-    for axis, name, k in ((lengths, "y", 0), (tilts, "tilt", 1)):
-        np.testing.assert_allclose(named(axis)[name], np.stack([SPEED, 1e3 * CURVE["amplitude"][:, k]], axis=1))
+    for axis, name, k, factor in ((lengths, "y", 0, 1e3), (tilts, "tilt", 1, 180.0 / np.pi)):
+        np.testing.assert_allclose(named(axis)[name], np.stack([SPEED, factor * CURVE["amplitude"][:, k]], axis=1))
     np.testing.assert_allclose(named(phases)["y"], np.stack([SPEED, np.rad2deg([0.0, 3.0, 2.0 * np.pi - 3.0])], axis=1))
     np.testing.assert_allclose(named(phases)["tilt"], np.stack([SPEED, np.rad2deg([0.0, 1.0, 2.0])], axis=1))
     assert named(force)["force on the foundation"] == [[0.0, 1.0], [10.0, 4.0], [20.0, 2.0]]
@@ -89,7 +89,7 @@ def test_a_response_has_its_amplitudes_phases_and_force():
     assert points == [([[10.0, 4.0]], True), ([[20.0, 2.0]], False)]
     assert all(at_x(axis, ":") == [9.0] for axis in (lengths, tilts, phases, force, torque))
     labels = [axis.get_ylabel() for axis in (lengths, tilts, phases, force, torque)]
-    assert labels == ["amplitude, mm", "amplitude, mrad", "phase, deg", "force, N", "torque, N m"]
+    assert labels == ["amplitude, mm", "amplitude, deg", "phase, deg", "force, N", "torque, N m"]
     assert torque.get_xlim() == (0.0, 20.0)
 
 
@@ -166,14 +166,31 @@ def test_torques_of_equal_motors_are_one_line():
     assert points == [(1.0, True), (2.0, True), (3.0, False), (-2.0, False)]
     assert at_x(torques, ":") == [pytest.approx(12.0 * turn)]
     assert torques.get_xlim() == pytest.approx((0.0, 1.03 * 20.0 * turn)) and torques.get_ylim() == pytest.approx((-2.3, 4.6))
-    assert first.get_title().splitlines() == ["143.239 rpm, stable", "phases 0, 180 deg", "torques 3, -2 N m"]
+    assert first.get_title().splitlines() == [
+        "143.239 rpm, stable",
+        "phases in the direction of rotation",
+        "0, 180 deg",
+        "torques 3, -2 N m",
+    ]
     assert second.get_title().startswith("143.239 rpm, unstable")
 
 
 def test_regimes_of_many_masses_have_short_titles():
     many = DrawnRegime(15.0, np.arange(4), np.zeros(4), np.ones(4), True)
     figure = regimes_chart([many] * 5, None, np.zeros(0), names=[])
-    assert [axis.get_title() for axis in figure.axes] == ["143.239 rpm, stable"] * 5 + [""] * 3
+    assert [axis.get_title() for axis in figure.axes] == ["143.239 rpm, stable\nphases in the direction of rotation"] * 5 + [
+        ""
+    ] * 3
+
+
+@pytest.mark.parametrize(
+    ("needed", "torque", "limits"),
+    [(-1.0, [3.0, 1.0], (-1.15, 4.6)), (-9.0, [3.0, 1.0], (-4.6, 4.6)), (0.5, [6.0, 1.0], (-0.3, 6.9))],
+)
+def test_the_axis_of_torques_contains_negative_ones(needed, torque, limits):
+    curves = TorqueCurves(np.array([10.0, 20.0]), np.array([[4.0], [2.0]]), np.array([[1.0], [needed]]))
+    axis = regimes_chart([regime(True, torque)], curves, np.zeros(0), names=["motor 1"]).axes[0]
+    assert axis.get_ylim() == pytest.approx(limits)
 
 
 def test_whirls_have_a_line_for_each_sense():

@@ -25,7 +25,7 @@ def marks(axis):
 
 def test_jam_modes_are_filled_where_they_are_stable():
     mode, stable = np.array([1, 2, 3]), np.array([True, False, True])
-    omega, amplitude = np.array([1.0, 2.0, np.nan]), np.array([[1e-3, 2e-3], [4e-3, 0.0], [np.nan, np.nan]])
+    omega, amplitude = np.array([1.0, 2.0, np.nan]), np.array([[1e-3, np.deg2rad(2.0)], [4e-3, 0.0], [np.nan, np.nan]])
     about = {"names": ["y", "tilt"], "units": ["m", "rad"], "unit": "rad/s"}
     top, bottom = modes_chart(mode, omega, stable, amplitude, np.array([0.9, 2.1]), **about).axes
     filled, hollow = marks(top)[:2]
@@ -36,8 +36,8 @@ def test_jam_modes_are_filled_where_they_are_stable():
     assert [line.get_ydata()[0] for line in top.lines if line.get_linestyle() == ":"] == [0.9, 2.1]
     assert bottom.get_ylim() == pytest.approx((0.6, 6.8)) and bottom.get_xlim() == (0.5, 2.5)
     assert bottom.get_xticks().tolist() == [1.0, 2.0]
-    assert [text.get_text() for text in bottom.get_legend().get_texts()] == ["y, mm", "tilt, mrad"]
-    assert bottom.get_ylabel() == "amplitude, mm, mrad, zero to peak" and top.get_ylabel() == "load speed, rad/s"
+    assert [text.get_text() for text in bottom.get_legend().get_texts()] == ["y, mm", "tilt, deg"]
+    assert bottom.get_ylabel() == "amplitude, mm, deg, zero to peak" and top.get_ylabel() == "load speed, rad/s"
 
 
 def test_no_jam_mode_leaves_a_linear_axis():

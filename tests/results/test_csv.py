@@ -87,6 +87,15 @@ def test_real_and_imaginary_part_have_one_display_unit(tmp_path):
     assert columns["mass (g)"].tolist() == ["500", "250"]
 
 
+def test_display_headers_are_words_with_coordinates(tmp_path):
+    found = jv.response(jv.Scene(ROTOR, exciters=[jv.Exciter(None, jv.ConstantSpeed(60.0), unbalance=0.01)]), [30.0, 60.0])
+    shown, plain = (list(table(found, "speed", tmp_path / "r.csv", display=display)) for display in (True, False))
+    for head in ("acceleration y (g)", "velocity z (mm/s)", "exciter force (N)", "foundation force (N)"):
+        assert head in shown
+    assert "acceleration z (g0)" in plain and "exciter_force (N)" in plain
+    assert not any("_" in head for head in shown)
+
+
 @pytest.mark.parametrize(("segments", "forces"), [(1, ["force 1 (N)", "force 2 (N)"]), (2, [])])
 def test_table_of_one_segment_has_its_spectrum(segments, forces, tmp_path):
     spectra = Spectra(np.arange(3.0), np.arange(segments * 6.0).reshape(segments, 3, 2))

@@ -73,6 +73,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     figure and the fit (fit.csv)."""
     import numpy as np  # slow imports, which --help does not need
 
+    from jaxvib.display import shown_unit
     from jaxvib.machine.files import read_toml
     from jaxvib.results.table import read_table
     from jaxvib.study.bearing.identify import identify_bearing
@@ -88,8 +89,9 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     pendulum, swing, options = measurement_from_tables(_with_options(tables, given), record.parent)
     found = identify_bearing(pendulum, swing, **options)
     output.figure("record.png", found.plot)
-    columns = {"time (s)": swing.time, "angle (rad)": swing.angle, "fit (rad)": found.fitted}
-    output.table("fit.csv", {head: np.asarray(values) for head, values in columns.items()})
+    unit, factor = shown_unit("rad", 1.0)
+    angles = {f"{name} ({unit})": factor * np.asarray(x) for name, x in (("angle", swing.angle), ("fit", found.fitted))}
+    output.table("fit.csv", {"time (s)": np.asarray(swing.time), **angles})
     decrement = found.decrement
     document = {
         "status": found.status_name,

@@ -10,14 +10,13 @@ from matplotlib.patches import Patch
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
 from jaxvib.draw.style import (
+    axis_unit,
     color_of,
     legend_above,
-    length_unit,
     load_names,
     panels,
     resonance_lines,
     series_look,
-    tilt_unit,
 )
 
 _BINS = 300
@@ -87,7 +86,7 @@ def time_histories(
 ) -> Drawn:
     """Draw the histories of a run in two columns: the `whole` run as bands between its peaks, and its last periods as curves.
 
-    The rows are displacements in mm or µm, tilts in mrad or µrad if there are any, speeds of loads and rotor in `unit`, and the
+    The rows are displacements in mm or µm, tilts in deg if there are any, speeds of loads and rotor in `unit`, and the
     foundation force in N. If the last periods have another unit, it is beside their axis. Loads that move equally are one line.
 
     **Arguments** (nt times, nd coordinates, nb directions of the force)
@@ -101,7 +100,7 @@ def time_histories(
     >>> t, q, one = np.linspace(0.0, 1.0, 5), np.ones((5, 2)), np.ones((5, 1))
     >>> figure = time_histories(*[(t, q, one, one, one)] * 2, names=("y", "theta"), units=("m", "rad"))
     >>> [axes.get_ylabel() for axes in figure.axes][::2]
-    ['displacement, mm', 'tilt, mrad', 'speed, rpm', 'foundation force, N']
+    ['displacement, mm', 'tilt, deg', 'speed, rpm', 'foundation force, N']
     """
     units = ["m"] * len(names) if units is None else units
     unit, scale = speed_unit(unit)
@@ -178,8 +177,8 @@ def _draw_coordinates(
 
 def _kinds(values: np.ndarray, units: Sequence[str], length: str, tilt: str) -> list[tuple[str, str, float]]:
     """Return the unit, the label and the factor of each kind of coordinates among signals (nt, nd): lengths and tilts."""
-    unit, factor = length_unit(values[:, np.asarray(units) == "m"])
-    angle, angle_factor = tilt_unit(values[:, np.asarray(units) == "rad"])
+    unit, factor = axis_unit("m", values[:, np.asarray(units) == "m"])
+    angle, angle_factor = axis_unit("rad", values[:, np.asarray(units) == "rad"])
     kinds = (("m", f"{length}, {unit}", factor), ("rad", f"{tilt}, {angle}", angle_factor))
     return [kind for kind in kinds if kind[0] in units]
 
@@ -291,7 +290,7 @@ def amplitude_histories(
 
     **Arguments** (nt times, nd coordinates)
 
-    - `time` (nt,), s; `amplitude` (nt, nd), m or rad according to `units` (nd,), drawn in mm or µm, mrad or µrad
+    - `time` (nt,), s; `amplitude` (nt, nd), m or rad according to `units` (nd,), drawn in mm or µm, and in deg
     - `load_speed` (nt, count), `rotor_speed` (nt, exciters), rad/s, drawn in `unit`
     - `force` (nt, directions): foundation force, N
     - `resonances`: natural frequencies, rad/s; those below the largest rotor speed are dotted lines in the panel of the speeds

@@ -63,7 +63,7 @@ def regimes_chart(
     >>> curves = TorqueCurves(np.arange(3.0), np.ones((3, 2)), np.ones((3, 2)))
     >>> figure = regimes_chart([one], curves, np.ones(1), names=["motor 1", "motor 2"])
     >>> [axis.get_title().splitlines() for axis in figure.axes]
-    [[], ['954.93 rpm, stable', 'phases 0, 0 deg', 'torques 1, 1 N m']]
+    [[], ['954.93 rpm, stable', 'phases in the direction of rotation', '0, 0 deg', 'torques 1, 1 N m']]
     """
     unit, scale = speed_unit()
     count = len(regimes) + (curves is not None)
@@ -79,9 +79,12 @@ def regimes_chart(
     if not regimes:
         axes[0].text(0.5, 0.5, "no synchronous regime", ha="center", va="center", transform=axes[0].transAxes)
     for axis, regime in zip(circles, regimes, strict=False):
-        lines = [f"{scale * regime.speed:.6g} {unit}, {'stable' if regime.stable else 'unstable'}"]
+        lines = [
+            f"{scale * regime.speed:.6g} {unit}, {'stable' if regime.stable else 'unstable'}",
+            "phases in the direction of rotation",
+        ]
         if regime.phases.size <= _MAX_TITLE_MASSES:
-            lines.append(f"phases {', '.join(f'{a + 0.0:g}' for a in np.round(np.rad2deg(regime.phases), 1))} deg")
+            lines.append(f"{', '.join(f'{a + 0.0:g}' for a in np.round(np.rad2deg(regime.phases), 1))} deg")
             lines.append(f"torques {', '.join(f'{t:.3g}' for t in regime.torque)} N m")
         draw_circle(axis, "\n".join(lines), regime.phases, resultant=resultant, numbers=regime.masses, plural="masses")
     return figure if ax is None else ax
@@ -99,7 +102,8 @@ def _draw_torques(
 
     Equal curves are one line. An ideal drive has points of regimes but no curves.
     """
-    top = float(np.nanmax(curves.driving))
+    drawn = curves.driving[np.isfinite(curves.driving)], np.concatenate([regime.torque for regime in regimes])
+    top = float(max(np.max(np.abs(values)) for values in drawn))
     resonance_lines(axis.axvline, scale * resonances[(resonances > 0.0) & (resonances < curves.speed[-1])])
     for values, stroke, words in ((curves.driving, "-", "of {}"), (curves.needed, STROKES[1], "needed by {}")):
         groups: list[list[int]] = []
@@ -116,8 +120,9 @@ def _draw_torques(
             color = color_of(k)
             look = {"mec": color, "mfc": color if regime.stable else "white", "ms": 5.0, "zorder": 4}
             axis.plot([scale * regime.speed], [torque], marker_of(k), **look)
-    lowest = min(float(np.min(regime.torque)) for regime in regimes)
-    axis.set(xlim=(0.0, 1.03 * scale * float(curves.speed[-1])), ylim=(min(-0.05 * top, 1.15 * lowest), 1.15 * top))
+    needed = np.clip(curves.needed[np.isfinite(curves.driving)], -top, top)  # its peaks at resonances may be much larger
+    low, high = (float(each([each(values) for values in (*drawn, needed)])) for each in (np.min, np.max))
+    axis.set(xlim=(0.0, 1.03 * scale * float(curves.speed[-1])), ylim=(min(-0.05 * top, 1.15 * low), 1.15 * high))
     axis.plot([], [], "o", color="black", ms=5.0, label="regime; hollow: unstable")
     legend_above(axis, 2, handlelength=1.6, columnspacing=0.8)
 

@@ -13,13 +13,12 @@ from jaxvib.draw.style import (
     COLORS,
     STROKES,
     Look,
+    axis_unit,
     legend_above,
-    length_unit,
     log_ticks,
     panels,
     resonance_lines,
     series_look,
-    tilt_unit,
 )
 from jaxvib.errors import InputError, quoted
 
@@ -54,7 +53,7 @@ def response_chart(
     - `points`: the same arrays for the operating points, and the Boolean array `stable`
     - `folds`: `speed` and `torque` of the folds
     - `resonances` (k,), rad/s, drawn as dotted lines
-    - `names` and `units` (nd,) of the coordinates; lengths are drawn in mm or µm, angles in mrad or µrad
+    - `names` and `units` (nd,) of the coordinates; lengths are drawn in mm or µm, tilts in deg
     - `motors`: number of motors, whose torques are added in one curve; 0 for an ideal drive, which has no such curve
     - `unit` of the speeds; `show`: names of panels; `ax`: axes to draw onto
 
@@ -68,8 +67,7 @@ def response_chart(
     resonances = scale * resonances
     resonances = resonances[(resonances > 0.0) & (resonances <= last)]
     amplitude = curve["amplitude"]
-    unit_of = {"m": length_unit, "rad": tilt_unit}
-    kinds = {kind: unit_of[kind](amplitude[:, np.asarray(units) == kind]) for kind in ("m", "rad") if kind in units}
+    kinds = {kind: axis_unit(kind, amplitude[:, np.asarray(units) == kind]) for kind in ("m", "rad") if kind in units}
     drawn = [(name, kind) for name in show for kind in (kinds if name == "amplitude" else ("",))]
     figure, axes = panels(len(drawn), size=(7.2, 2.5), share_x=True, ax=ax)
     for axis, (name, kind) in zip(axes, drawn, strict=True):

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
 from jaxvib.display import Drawn, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, STROKES, color_of, legend_above, length_unit, panels, resonance_lines, series_look
+from jaxvib.draw.style import COLORS, STROKES, axis_unit, color_of, legend_above, panels, resonance_lines, series_look
 
 _LOWEST_AMPLITUDE = 1e-4
 """Lower end of the amplitude scale, relative to the largest amplitude."""
@@ -98,7 +98,7 @@ def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes |
     """Draw paths of points by name: horizontal and vertical coordinates (nt,), m, drawn in mm or µm, with a marker at the last
     point of each path."""
     figure, (axis,) = panels(1, size=(5.0, 4.8), ax=ax)
-    unit, factor = length_unit(*(each for path in paths.values() for each in path))
+    unit, factor = axis_unit("m", *(each for path in paths.values() for each in path))
     for k, (name, (x, y)) in enumerate(paths.items()):
         color = color_of(k)
         axis.plot(factor * x, factor * y, color=color, ls=STROKES[k % len(STROKES)], lw=1.2, label=name)

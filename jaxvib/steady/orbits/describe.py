@@ -183,7 +183,7 @@ def plot_period(
     """Plot a period over the angle Omega t from harmonics; `named`: names and units of the coordinates; `deviation`: orders and
     harmonics of the bodies' deviations, the title of their panel, and labels of each of several bodies and of a single body."""
     from jaxvib.draw.results import signals_chart  # slow imports
-    from jaxvib.draw.style import length_unit, tilt_unit
+    from jaxvib.draw.style import axis_unit
 
     theta = np.linspace(0.0, 2.0 * np.pi, 721)
 
@@ -197,8 +197,7 @@ def plot_period(
         signal(force, orders),
     )
     names, units = named
-    unit_of = {"m": length_unit, "rad": tilt_unit}
-    kinds = {unit: unit_of[unit](motion[:, np.asarray(units) == unit]) for unit in units}
+    kinds = {unit: axis_unit(unit, motion[:, np.asarray(units) == unit]) for unit in units}
     labels = [f"{name}, {kinds[unit][0]}" if len(set(units)) > 1 else name for name, unit in zip(names, units, strict=True)]
     numbered = [f"{one} {k + 1}" for k in range(angles_in_degrees.shape[1])]
     panels = [
