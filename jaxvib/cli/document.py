@@ -230,7 +230,13 @@ def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, o
         "coordinates": structure.coordinates,
         "units": structure.units,
         **fields_of(run, "amplitude", "foundation_force", "drift", "settled", "steps", "rejected"),
+        **stays_document(run),
     }
+
+
+def stays_document(run: jv.Run | jv.Envelope) -> dict[str, object]:
+    """Return, for a document, the resonances at which masses stayed before they passed them, if the run has a trajectory."""
+    return {} if run.trajectory is None else {"stays": [stay._asdict() for stay in run.stays]}
 
 
 def measures_document(run: jv.Run | jv.Envelope, measures: jv.VibrationMeasures | None) -> dict[str, object]:

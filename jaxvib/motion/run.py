@@ -24,7 +24,14 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import start_notes
 from jaxvib.motion.analysis.beat import beat_period
 from jaxvib.motion.analysis.creep import creep_text
-from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory, duration_text, turning_masses
+from jaxvib.motion.analysis.measure import (
+    AbstractMeasured,
+    Measured,
+    Trajectory,
+    duration_text,
+    turning_angles,
+    turning_masses,
+)
 from jaxvib.motion.analysis.points import (
     PointMotion,
     absent_vibration,
@@ -38,6 +45,7 @@ from jaxvib.motion.analysis.points import (
 from jaxvib.motion.analysis.regime import STILL_SHARE, Regime, regime
 from jaxvib.motion.analysis.separation import has_collision, has_overlap, would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
+from jaxvib.motion.analysis.stays import Stay, find_stays
 from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -247,6 +255,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 f"  {self.amplitude_text(self.scene)}",
                 *(f"  {line}" for line in measures_text(self.scene, self.no_vibration, self.vibration, measures)),
                 *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
+                *(f"  {stay.summary()}" for stay in self.stays),
                 *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
                 *([f"  {creep}"] if creep else []),
@@ -310,6 +319,17 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """Kind of motion at the end of the run, see `Regime`."""
         self.require_single()
         return regime(self.scene, self.window)
+
+    @property
+    def stays(self) -> list[Stay]:
+        """Times during which loads or motors stayed at a resonance before they passed it, see `find_stays`; empty for a run
+        that failed and for a run that kept only its window."""
+        self.require_single()
+        if self.trajectory is None or not self._has_end:
+            return []
+        time, state = self.trajectory.time, self.trajectory.state
+        speeds = turning_angles(self.scene, lambda: time, state)[1]
+        return find_stays(self.scene, np.asarray(time), np.asarray(speeds), self.trajectory.rotor_speeds)
 
     @property
     def detached(self) -> Array:

@@ -126,6 +126,8 @@ def units_of_document(document: Mapping[str, Plain], result: eqx.Module | None) 
     units.setdefault("phases", "rad")
     if "regime" in document:
         units = {each.name: each.metadata.get("unit", "") for each in dataclasses.fields(Regime)} | units
+    if document.get("stays"):
+        units |= {"speed": "rad/s", "start": "s", "end": "s", "resonance_speed": "rad/s"}
     rows = [row for value in document.values() if isinstance(value, list) for row in value if isinstance(row, Mapping)]
     if any("measures" in each for each in (document, *rows)):
         of_measures = {each.name: each.metadata.get("unit", "") for each in dataclasses.fields(VibrationMeasures)}

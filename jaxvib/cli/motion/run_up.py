@@ -9,7 +9,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import WITHOUT, Output, command, loaded_scene, table
-from jaxvib.cli.document import SEPARATION, chosen_steps
+from jaxvib.cli.document import SEPARATION, chosen_steps, stays_document
 from jaxvib.cli.output import csv_options, fields_of
 from jaxvib.errors import InputError
 
@@ -30,8 +30,8 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
     output.csv(csv, found.run, "trajectory_time")
     names = ("resonances", "speed", "caught_at", "peak_amplitude", "peak_force", "weight_error")
     optional_fields = {"least_torque": found.least_torque} if least else {}
-    document = {"status": found.status_name, "message": found.message, **fields_of(found, *names), **optional_fields}
-    output.done(document, found.summary, "run_up", found)
+    document = {"status": found.status_name, "message": found.message, **fields_of(found, *names), **stays_document(found.run)}
+    output.done(document | optional_fields, found.summary, "run_up", found)
 
 
 @command("run-up-map")

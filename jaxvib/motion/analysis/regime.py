@@ -248,7 +248,7 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
     )
     name = RegimeName.where(jnp.all(swings), RegimeName.swinging, name)
 
-    natural = _resonances(scene, rotor)
+    natural = excited_frequencies(scene, rotor)
     mean = jnp.mean(speed)
     nearest = jnp.argmin(jnp.abs(natural - mean))
     all_with_rotor = jnp.all(with_rotor)
@@ -264,13 +264,13 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
         imbalance=imbalance / size,
         resonance=nearest + 1,
         resonance_speed=natural[nearest],
-        mode=jnp.where(name == RegimeName.jammed, _mode(natural, mean, rotor), 0),
+        mode=jnp.where(name == RegimeName.jammed, estimated_mode(natural, mean, rotor), 0),
         caught=_is_rotor_caught(scene, natural, rotor),
         change=jnp.maximum(change, jnp.where(all_with_rotor, jnp.max(rotor_phase_change), 0.0)),
     )
 
 
-def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
+def estimated_mode(natural: Array, mean: Array, rotor: Array) -> Array:
     """Return the estimated jam mode of loads with the mean speed `mean`, rad/s, see `mode` of `Regime`; `natural`: natural
     frequencies, rad/s, ascending, infinite for missing ones."""
     ends = jnp.concatenate([jnp.zeros_like(natural[:1]), natural, jnp.full_like(natural[:1], jnp.inf)])
@@ -330,10 +330,10 @@ def _unbalance(scene: Scene, unbalances: Array, rotor_unbalance: Array, turn: Ar
     )
 
 
-def _resonances(scene: Scene, rotor_speed: Array) -> Array:
+def excited_frequencies(scene: Scene, rotor_speed: Array) -> Array:
     """Return the natural frequencies that turning loads excite, rad/s, ascending; for a gyroscopic rotor those of the whirls at
     the rotor speed that are not backward circles. Missing frequencies are infinite."""
-    if scene.mounting.gyroscopic is None:
+    if len(scene.exciters) > 1 or scene.mounting.gyroscopic is None:
         return estimated_frequencies(scene)
     whirls = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
     excited = (whirls.speed[0] > 0.0) & (whirls.directivity[0] > _MAX_BACKWARD_DIRECTIVITY)

@@ -22,6 +22,7 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, duration_text, only_exciter_value
 from jaxvib.motion.analysis.points import absent_vibration, measures_text, require_vibration
+from jaxvib.motion.analysis.stays import Stay, find_stays
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.readable import Readable
@@ -174,6 +175,14 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
             power=jnp.stack(powers),
         )
 
+    @property
+    def stays(self) -> list[Stay]:
+        """Times during which loads or motors stayed at a resonance before they passed it, see `Run.stays`."""
+        self.require_single()
+        if (run := self.trajectory) is None or not np.all(np.isfinite(self.amplitude)):
+            return []
+        return find_stays(self.scene, np.asarray(run.time), np.asarray(run.load_speed), run.rotor_speeds)
+
     def summary(self, measures: VibrationMeasures | None = None) -> str:
         """Return the outcome of the run as text; amplitudes zero to peak.
 
@@ -196,6 +205,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
                 f"  {self.amplitude_text(self.scene)}",
                 *([f"  {_OFFSET}"] if moves and _moves_without_spring(self.scene) else []),
                 *(f"  {line}" for line in measured),
+                *(f"  {stay.summary()}" for stay in self.stays),
                 f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
             ]
         )

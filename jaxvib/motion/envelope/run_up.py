@@ -107,6 +107,7 @@ class MotorRunUp(Result):
         for k, (speed, caught) in enumerate(zip(np.asarray(self.speed), np.asarray(self.caught_at).tolist(), strict=True), 1):
             at = f", caught by resonance {caught} at {speed_text(self.resonances[caught - 1])}" if caught else ""
             lines.append(f"  exciter {k}: {speed_text(speed)}{at}")
+        lines += [f"  {stay.summary()}" for stay in self.run.stays]
         structure = self.scene.machine.structure()
         named = zip(structure.coordinates, self.peak_amplitude, structure.units, strict=True)
         peaks = ", ".join(f"{name} {quantity_text(a, unit, 4)}" for name, a, unit in named)
