@@ -36,11 +36,10 @@ from jaxvib.motion.plan import (
     with_settled_drives,
 )
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
-from jaxvib.motion.simulate import last_state, prepare_run, run_planned
+from jaxvib.motion.simulate import join_segments, last_state, prepare_run, run_planned
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state, must_compile_jams, start_state
 from jaxvib.numerics.linalg import poles_of
 from jaxvib.results.status import member, status_name
-from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, count, number
@@ -118,7 +117,8 @@ def settle(
     (`separation=0`) and would separate after a small disturbance, the status is `would_separate` (see `Run`), `settled` is
     False, and no error is raised.
 
-    **Returns** the `Run` of the last segment, without a trajectory and without an estimate of its error.
+    **Returns** the `Run` of the last segment, without a trajectory and without an estimate of its error. Its times and its cost
+    (`steps`, `rejected`, `evaluations`, `seconds`) include all segments.
 
     **Raises** `ComputationError` (status "not_settled", or "left_mode" if the loads settled in another mode than `mode`),
     `InputError` for a rotor whose speed changes; and the errors of `simulate`.
@@ -131,7 +131,8 @@ def settle(
     True
     """
     plan = _plan_settle(scene, start, mode, separation, drift, periods, segments, stepsize_controller, throw=throw)
-    run, is_final = _integrate_until_settled(plan, throw=throw)
+    run, earlier, is_final = _integrate_until_settled(plan, throw=throw)
+    run = join_segments([run], earlier * float(plan.first.end))
     if throw and not is_final:
         raise ComputationError(
             "not_settled",
@@ -205,17 +206,16 @@ def _plan_settle(
     )
 
 
-def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
-    """Return the run of the last segment, and False if an error must be raised: if the motion has not settled and has neither
-    the status `would_separate` nor `overlapping`."""
+def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, int, bool]:
+    """Return the run of the last segment, whose times begin at 0, the number of earlier segments, and False if an error must be
+    raised: if the motion has not settled and has neither the status `would_separate` nor `overlapping`."""
     length, state = float(plan.first.end), plan.first.state
-    coincident, drifts, measured, regimes = True, [], [], []
+    joined, drifts, measured, regimes = [], [], [], []
     while True:
-        run = run_planned(dataclasses.replace(plan.first, state=state), throw=throw)
-        is_coincident, coincident = bool(run.coincident), coincident and bool(run.coincident)
-        run = dataclasses.replace(run, coincident=on_device(np.asarray(coincident)))
+        segment = run_planned(dataclasses.replace(plan.first, state=state), throw=throw)
+        joined = [run := join_segments([*joined, segment])]
         if status_name(run.status) != "done":
-            return run, False
+            return run, len(drifts), False
         drifts.append(float(run.drift))
         decay = plan.decay or (_slowest_decay(plan.first.scene, run.window) if plan.has_resistance else 0.0)
         if (
@@ -224,22 +224,22 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
         ):
             final = _with_final_status(run, "done")
             # If the loads are not at exactly one angle and would separate, the run continues until they have left this motion.
-            if is_coincident or status_name(final.status) == "done" or not would_separate(run.scene, run.window):
-                return final, True
+            if bool(segment.coincident) or status_name(final.status) == "done" or not would_separate(run.scene, run.window):
+                return final, len(drifts) - 1, True
         if plan.mean_segments is not None:
             force = float(np.nan_to_num(run.foundation_force))  # 0 if it is unknown
             lengths = plan.first.scene.machine.carrier().as_lengths(run.amplitude)
             measured.append([drifts[-1], float(run.omega), force, *np.asarray(lengths).tolist()])
             if len(measured) >= plan.mean_segments and _is_steady_in_the_mean(np.array(measured[-plan.mean_segments :])):
-                return _with_final_status(run, "beating"), True
+                return _with_final_status(run, "beating"), len(drifts) - 1, True
             is_plain = plan.first.scene.is_plain
             if is_plain and drifts[-1] < SETTLED_DRIFT and decay * length * len(measured) > -math.log(plan.default_drift):
                 regimes.append(run.regime)
                 if _is_creeping(regimes[-_CREEP_SEGMENTS:]):
-                    return _with_final_status(run, "creeping"), True
+                    return _with_final_status(run, "creeping"), len(drifts) - 1, True
         if len(drifts) == plan.segments:
             last = _with_final_status(run, "done") if drifts[-1] < SETTLED_DRIFT else run
-            return last, status_name(last.status) in ("would_separate", "overlapping")
+            return last, len(drifts) - 1, status_name(last.status) in ("would_separate", "overlapping")
         state = last_state(plan.first.scene, run)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from functools import partial
 from typing import Literal, cast
 
@@ -202,10 +203,6 @@ def _run_in_segments(plan: RunPlan, control: Control, *, is_measured: bool) -> R
     The time of each segment begins at 0. All segments except the last have a whole number of turns of the rotor, and the
     angles at the beginning of a segment are within one turn.
     """
-
-    def total(counts: list[Array]) -> Array:
-        return on_device(np.sum([np.asarray(step_count) for step_count in counts], dtype=counts[0].dtype))
-
     number, end = plan.segments, float(plan.end)
     if isinstance(control, StepControl) and control.steps is not None:
         control = StepControl(steps=np.asarray(np.ceil(control.steps / number), control.steps.dtype))
@@ -218,11 +215,20 @@ def _run_in_segments(plan: RunPlan, control: Control, *, is_measured: bool) -> R
         if status_name(run.status) != "done":
             break
         state = last_state(plan.scene, run)
+    return join_segments(runs, length * (len(runs) - 1))
+
+
+def join_segments(runs: Sequence[Run], start: float = 0.0) -> Run:
+    """Return the last of consecutive runs with the cost of all of them. `start`, s, is added to the times of its window."""
+
+    def total(counts: list[Array]) -> Array:
+        return on_device(np.sum([np.asarray(each) for each in counts], dtype=counts[0].dtype))
+
     last = runs[-1]
     return dataclasses.replace(
         last,
-        **{name: total([getattr(run, name) for run in runs]) for name in ("steps", "rejected", "evaluations")},
-        window=dataclasses.replace(last.window, time=last.window.time + length * (number - 1)),
+        **{name: total([getattr(run, name) for run in runs]) for name in ("steps", "rejected", "evaluations", "seconds")},
+        window=dataclasses.replace(last.window, time=last.window.time + start),
         coincident=on_device(np.all([numpy_if_known(run.coincident) for run in runs])),
     )
 

@@ -330,3 +330,20 @@ def test_creeping_loads_move_evenly_and_stay_balanced(change, creeping):
         regime.phase = np.angle(np.exp(1j * regime.phase))
     assert _is_creeping(regimes) is creeping
     assert not _is_creeping(regimes[:3])
+
+
+def test_settle_counts_the_cost_and_time_of_all_segments():
+    s = scene("one_mass", speed=60.0)
+    steps = jv.Tolerance(1e-9)
+    run = jv.settle(s, mode=1, periods=10, stepsize_controller=steps)
+    segment = float(whole_turns(s, 2.0 * np.pi * 10 / float(jv.natural_frequencies(s)[0])))
+    count = round(float(run.window.time[-1]) / segment)
+    state = jv.initial_state(s, "jam", mode=1, separation="1 deg")
+    single = [jv.simulate(s, segment, start=state, save="window", estimate=False, stepsize_controller=steps)]
+    while len(single) < count:
+        state = last_state(s, single[-1])
+        single.append(jv.simulate(s, segment, start=state, save="window", estimate=False, stepsize_controller=steps))
+    assert count > 1 and float(run.window.time[-1]) == pytest.approx(count * segment)
+    np.testing.assert_allclose(run.steps, sum(int(each.steps) for each in single), rtol=0.02)
+    np.testing.assert_allclose(run.evaluations, sum(int(each.evaluations) for each in single), rtol=0.02)
+    assert int(run.steps) > 1.5 * max(int(each.steps) for each in single) and f"{int(run.steps)} steps" in run.summary()
