@@ -46,8 +46,12 @@ def csv_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return click.option("--csv", type=path, help="Write the curves to this CSV file.")(DECIMAL_COMMA(command))
 
 
-SECONDS_BETWEEN_LINES = 10.0
-"""Time between lines of progress, s, if the output is not a terminal."""
+SECONDS_TO_FIRST_LINE = 10.0
+"""Time until the first line of progress, s, if stderr is not a terminal. The time doubles from line to line."""
+
+_MAX_SECONDS_BETWEEN_LINES = 600.0
+
+_COMPUTING = "computing, {} (new programs are compiled once, then stored)"
 
 
 def duration_text(seconds: float) -> str:
@@ -110,6 +114,7 @@ class Output:
         self.title = title
         self.author = author
         self._done = threading.Event()
+        self._step = ""
         self.folder = folder
         self.report = report
         self.scene = scene
@@ -124,17 +129,17 @@ class Output:
 
     @contextlib.contextmanager
     def waiting(self) -> Iterator[None]:
-        """Show the elapsed time on the last line of a terminal, from one second after the start until the command prints
-        something."""
-        if sys.stderr.isatty():
-            threading.Thread(target=self._show_elapsed_time, daemon=True).start()
+        """Show the elapsed time until the command prints something: on the last line of a terminal, from one second after the
+        start; elsewhere in lines at increasing intervals, with the progress of the command."""
+        show = self._show_elapsed_time if sys.stderr.isatty() else self._print_lines
+        threading.Thread(target=show, daemon=True).start()
         try:
             yield
         finally:
             self.end_waiting()
 
     def end_waiting(self) -> None:
-        """Remove the line of `waiting`. Commands with their own progress call this before they show it."""
+        """End the display of `waiting`. Commands with their own progress call this before they show it."""
         if not self._done.is_set():
             self._done.set()
             if sys.stderr.isatty():
@@ -142,31 +147,28 @@ class Output:
 
     @contextlib.contextmanager
     def progress(self) -> Iterator[Callable[[str, float], None]]:
-        """Show a bar on a terminal, or lines at intervals elsewhere; the yielded function takes the name of a step and the
-        finished share (0 to 1). "compiling, once" follows the bar while a program is compiled."""
+        """Show a bar on a terminal, elsewhere the progress in the lines of `waiting`; the yielded function takes the name of a
+        step and the finished share (0 to 1). "compiling, once" follows the bar while a program is compiled."""
         from rich.console import Console  # slow imports, which --help does not need
         from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn
         from rich.text import Text
 
         from jaxvib.runtime.stored import is_compiling
 
-        self.end_waiting()
         if not sys.stderr.isatty():
-            last = time.monotonic()
 
-            def line(what: str, share: float) -> None:
-                nonlocal last
-                if time.monotonic() - last > SECONDS_BETWEEN_LINES:
-                    last = time.monotonic()
-                    click.echo(f"{what}: {share:.0%}", err=True)
+            def store_step(what: str, share: float) -> None:
+                self._step = f"{what}: {share:.0%}"
 
-            yield line
+            yield store_step
+            self._step = ""
             return
 
         class CompilingColumn(TextColumn):
             def render(self, task: Task) -> Text:
                 return Text("compiling, once" if is_compiling() else "")
 
+        self.end_waiting()
         columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), CompilingColumn(""))
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task("", total=1.0)
@@ -175,8 +177,15 @@ class Output:
     def _show_elapsed_time(self) -> None:
         begin = time.monotonic()
         while not self._done.wait(1.0):
-            seconds = time.monotonic() - begin
-            click.echo(f"\r\x1b[Kcomputing, {seconds:.0f} s (new programs are compiled once, then stored)", nl=False, err=True)
+            text = _COMPUTING.format(f"{time.monotonic() - begin:.0f} s")
+            click.echo(f"\r\x1b[K{text}", nl=False, err=True)
+
+    def _print_lines(self) -> None:
+        begin, due = time.monotonic(), SECONDS_TO_FIRST_LINE
+        while not self._done.wait(min(max(begin + due - time.monotonic(), 0.0), threading.TIMEOUT_MAX)):
+            elapsed, step = duration_text(time.monotonic() - begin), self._step
+            click.echo(f"{step}, after {elapsed}" if step else _COMPUTING.format(elapsed), err=True)
+            due += min(due, _MAX_SECONDS_BETWEEN_LINES)
 
     @staticmethod
     def _make_folder(folder: Path, option: str) -> None:

@@ -13,7 +13,7 @@ from jaxvib.cli.app import run
 @pytest.fixture
 def type_(capsys, monkeypatch):
     """Runs a command line without lines of progress; gives exit code, stdout, stderr."""
-    monkeypatch.setattr(output, "SECONDS_BETWEEN_LINES", math.inf)
+    monkeypatch.setattr(output, "SECONDS_TO_FIRST_LINE", math.inf)
 
     def typed(*words):
         code = run(list(words))

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import jaxvib as jv
+from jaxvib.cli import output as output_module
 from jaxvib.cli.app import run, table, tolerance_table
 from jaxvib.cli.optimize import _few_machines_texts, _quantities_with_ranges, _with_time_left
 from jaxvib.cli.output import Output
@@ -84,6 +86,47 @@ def test_the_progress_bar_shows_that_programs_are_compiled(capsys, monkeypatch, 
         progress("descending", 0.5)
     shown = capsys.readouterr().err
     assert "descending" in shown and ("compiling, once" in shown) == compiling and not stored.is_compiling()
+
+
+def test_lines_of_progress_come_at_doubling_intervals(capsys, monkeypatch):
+    now, output = [100.0], Output(False, None)
+
+    def wait(seconds):
+        now[0] += seconds
+        output._step = "descending: 50%" if now[0] > 150.0 else ""
+        return now[0] > 4000.0
+
+    output._done = SimpleNamespace(wait=wait)
+    monkeypatch.setattr("jaxvib.cli.output.time", SimpleNamespace(monotonic=lambda: now[0]))
+    output._print_lines()
+    lines, compiled = capsys.readouterr().err.splitlines(), "(new programs are compiled once, then stored)"
+    assert lines[:3] == [f"computing, {x} s {compiled}" for x in (10, 20, 40)]
+    minutes = (
+        "1 min 20 s",
+        "2 min 40 s",
+        "5 min 20 s",
+        "10 min 40 s",
+        "20 min 40 s",
+        "30 min 40 s",
+        "40 min 40 s",
+        "50 min 40 s",
+    )
+    assert lines[3:] == [*(f"descending: 50%, after {x}" for x in minutes), "descending: 50%, after 1 h 0 min"]
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_a_long_command_shows_its_progress(capsys, monkeypatch, is_terminal):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: is_terminal, raising=False)
+    monkeypatch.setattr(output_module, "SECONDS_TO_FIRST_LINE", 0.01)
+    seen, output = "", Output(False, None)
+    with output.waiting(), output.progress() as progress:
+        for _ in range(500):
+            progress("{descending}", 0.5)
+            seen += capsys.readouterr().err
+            if "{descending}" in seen:
+                break
+            time.sleep(0.01)
+    assert "{descending}" in seen and ("\x1b" in seen) == is_terminal == ("after" not in seen)
 
 
 def test_programs_count_as_compiling_until_they_are_ready():

@@ -1,5 +1,6 @@
 """`jaxvib sweep`, `jaxvib show`, `jaxvib new sweep` as a user types them."""
 
+import contextlib
 import json
 import math
 import sys
@@ -8,7 +9,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.cli import output
+from jaxvib.cli.output import Output
 from jaxvib.cli.study import sweep as command
 from jaxvib.sweeps.seals import seal_of
 from jaxvib.sweeps.store import Store
@@ -67,13 +68,13 @@ def test_a_store_without_a_computed_case_has_no_figures(typed, tmp_path):
     assert code == 0 and "no case was computed" in err and "has not been computed yet" in out
 
 
-def test_progress_is_lines_where_there_is_no_terminal(typed, monkeypatch):
-    monkeypatch.setattr(output, "SECONDS_BETWEEN_LINES", 0.0)
-    _, _, err = typed("sweep", "study.toml")
-    lines = err.splitlines()
+def test_progress_of_a_sweep_counts_cases(typed, monkeypatch):
+    lines = []
+    monkeypatch.setattr(Output, "progress", lambda _: contextlib.nullcontext(lambda *line: lines.append(line)))
+    typed("sweep", "study.toml")
     # Chunks of 4, 4 and 2 cases are computed in threads; any of them can end first.
-    assert (lines[0][:15], lines[0][-5:]) in (("4 of 10 cases, ", ": 40%"), ("2 of 10 cases, ", ": 20%"))
-    assert lines[-1].startswith("10 of 10 cases, ") and lines[-1].endswith(" left: 100%")
+    assert (lines[0][0][:15], lines[0][1]) in (("4 of 10 cases, ", 0.4), ("2 of 10 cases, ", 0.2))
+    assert lines[-1][0].startswith("10 of 10 cases, ") and lines[-1][0].endswith(" left") and lines[-1][1] == 1.0
 
 
 def test_a_commented_study_file_is_one(typed, tmp_path):
