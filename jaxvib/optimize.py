@@ -18,7 +18,7 @@ def _package() -> ModuleType:
         if Path(getattr(imported, "__file__", None) or "").resolve() != source.resolve():
             raise ImportError(
                 f"the module 'optimize' is {getattr(imported, '__file__', imported)}, not the package of jaxvib; "
-                "import jaxvib.optimize before it, or rename it"
+                "rename that module"
             )
         return imported
     spec = importlib.util.spec_from_file_location("optimize", source, submodule_search_locations=[str(source.parent)])
