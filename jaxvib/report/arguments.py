@@ -55,6 +55,8 @@ def arguments_of(build: Callable[..., object]) -> list[Argument]:
         spec = specs.get(name, PLAIN)
         needed = parameter.default is parameter.empty
         meaning = meanings.get(name, spec.words)
+        if spec.unit and meaning.startswith(spec.unit):
+            meaning = f"{spec.words}, {meaning}"
         arguments.append(Argument(name, spec.unit, needed, default, _choices(build, parameter), spec.bounds.words, meaning))
     return arguments
 
@@ -63,7 +65,7 @@ def _meanings(text: str) -> dict[str, str]:
     """Return the descriptions in the list of arguments of a docstring, by the name of the argument.
 
     >>> _meanings("**Arguments**\\n\\n- `mass` M, kg; typical: 5\\n- `low` and `high`: the ends\\n  of a range\\n\\nEnd.")
-    {'mass': 'M, kg; typical: 5', 'low': 'the ends of a range', 'high': 'the ends of a range'}
+    {'mass': 'mass M, kg; typical: 5', 'low': 'the ends of a range', 'high': 'the ends of a range'}
     """
     _, _, listed = text.partition("**Arguments**")
     meanings = {}
@@ -71,7 +73,8 @@ def _meanings(text: str) -> dict[str, str]:
         line = " ".join(entry.split())
         head = re.match(r"`\w+`(?:(?:, | and | or )`\w+`)*", line)
         if head is not None:
-            meaning = line[head.end() :].lstrip(":, ").replace("`", "")
+            rest = line[head.end() :].replace("`", "")
+            meaning = rest.lstrip(":, ") if rest.startswith((":", ",")) else head[0].strip("`").replace("_", " ") + rest
             meanings |= dict.fromkeys(re.findall(r"\w+", head[0].replace(" and ", " ").replace(" or ", " ")), meaning)
     return meanings
 

@@ -1,5 +1,7 @@
 """Arguments of the parts of scene files, with their units written by hand."""
 
+import re
+
 import pytest
 
 import jaxvib as jv
@@ -112,3 +114,15 @@ def test_texts_are_chosen_from_the_allowed_ones():
 def test_an_unknown_part_is_refused(group, name, field):
     with pytest.raises(jv.InputError, match=rf"^{field} is '.*'; did you mean '(machines|rotor)'"):
         builder_of(group, name)
+
+
+def test_meanings_begin_with_a_noun():
+    """Not with a unit, nor with the rest of a phrase whose noun is the name of the argument."""
+    parts = [(kind, argument) for kinds in GROUPS.values() for kind, build in kinds.items() for argument in arguments_of(build)]
+    wrong = [
+        f"{kind} {argument.name}: {argument.meaning}"
+        for kind, argument in parts
+        if argument.meaning
+        and (re.match("of |about |during ", argument.meaning) or argument.meaning.startswith(argument.unit or "?"))
+    ]
+    assert wrong == []
