@@ -65,7 +65,9 @@ def drag_of(
     - `radius` R of the circle of the loads' centres, m; typical: 0.05 to 0.3
     - `load_speed` Omega, less than `rotor_speed` n, rad/s; typical: "800 rpm" and "1500 rpm"
     - `ball_radius` r of a ball or roller, m; typical: 0.01 to 0.03
-    - `viscosity` eta of the oil at its working temperature, Pa s; typical: 0.05 to 0.5; `density` rho, kg/m^3; typical: 870
+    - `viscosity` eta of the oil at its working temperature, Pa s; typical: 0.05 to 0.5. Data sheets of oils state the
+      kinematic viscosity: "100 mm^2/s" (ISO VG 100 at 40 degrees Celsius) is multiplied by the density
+    - `density` rho of the oil, kg/m^3; typical: 870
     - `mass` m of the load, kg; typical: 0.1 to 1
     - `rolling_lever` f of the rolling friction, m; typical: 1e-5 to 5e-5 for steel on steel
     - `friction` mu of the bearing, a coefficient without unit; typical: 0.001 to 0.002 for ball and roller bearings, 0.01 to
@@ -77,6 +79,7 @@ def drag_of(
     **Raises** `InputError` for a missing argument, for one that the cause does not use, and outside the range of validity:
 
     - oil: Re up to 3e5
+    - oil, rolling: r below R
     - rolling: f up to r/10
     - bearing: d up to R
 
@@ -115,9 +118,12 @@ def drag_of(
         if name not in needed and each is not None:
             raise InputError(name, f"is not used for the drag by {cause}, which needs {', '.join(needed)}; leave it out")
         if each is not None:
-            value[name] = read(each, needed[name], name)
+            value[name] = _viscosity(each, given["density"]) if name == "viscosity" else read(each, needed[name], name)
     speeds = {"load_speed": load_speed, "rotor_speed": rotor_speed}
     arm, (slow, fast) = read(radius, "m", "radius"), (read(speed, "rad/s", name) for name, speed in speeds.items())
+    if "ball_radius" in value:
+        problem = "is {:.6g} m; it must be less than the radius of {:.6g} m, on which the centres of the loads move"
+        require_if_known(lambda r, arm: r < arm, value["ball_radius"], arm, field="ball_radius", problem=problem)
     problem = (
         "is {:.6g} rad/s; it must be less than the rotor_speed of {:.6g} rad/s (a ball that turns with the rotor: give a speed "
         "slightly below it)"
@@ -133,6 +139,19 @@ def drag_of(
     problem = "is {:g} m; it must be at most the radius of {:g} m"
     require_if_known(lambda d, r: d <= r, value["diameter"], arm, field="diameter", problem=problem)
     return 0.5 * value["friction"] * value["mass"] * acceleration * value["diameter"] / (arm * relative_speed)
+
+
+def _viscosity(given: Number, density: Number) -> Array:
+    """Return the dynamic viscosity, Pa s, also from a kinematic viscosity, whose unit is that of an area per time."""
+    read = partial(number, field="viscosity", low=0.0, open_low=True)
+    try:
+        return read(given, "Pa s")
+    except InputError as error:
+        try:
+            kinematic = read(given, "m^2/s")
+        except InputError:
+            raise error from None
+        return kinematic * number(density, "kg/m^3", "density", low=0.0, open_low=True)
 
 
 def _oil_drag(speed: Array, r: Array, viscosity: Array, density: Array) -> Array:

@@ -30,6 +30,12 @@ def test_a_slow_ball_in_thick_oil_has_the_drag_of_stokes():
     assert float(drag) == pytest.approx(6.0 * np.pi * 1e4 * 0.02, rel=0.02)
 
 
+@pytest.mark.parametrize("kinematic", ["100 mm^2/s", "100 cSt", "1e-4 m^2/s"])
+def test_a_kinematic_viscosity_is_multiplied_by_the_density(kinematic):
+    drag = jv.drag_of("oil", ball_radius=0.02, viscosity=kinematic, density="0.9 kg/l", **SPEEDS)
+    assert float(drag) == pytest.approx(float(jv.drag_of("oil", ball_radius=0.02, viscosity=0.09, density=900.0, **SPEEDS)))
+
+
 def test_rolling_drag_balances_the_rolling_moment():
     """Power: the moment f N turns with the slip speed of the ball's centre divided by its radius."""
     mass, lever, r = 0.5, 3e-5, 0.02
@@ -52,6 +58,9 @@ def test_bearing_drag_has_the_torque_of_the_effect():
         ("oil", dict(ball_radius=0.02), "viscosity is missing; the drag by oil needs ball_radius, viscosity, density"),
         ("oil", dict(ball_radius=0.02, viscosity=0.1, density=900.0, mass=1.0), "mass is not used for the drag by oil"),
         ("oil", dict(ball_radius=0.02, viscosity=1e-4, density=900.0), "Reynolds number of 3.02e"),
+        ("oil", dict(ball_radius=34.0, viscosity=0.1, density=900.0), "ball_radius is 34 m; it must be less than the radius"),
+        ("oil", dict(ball_radius=0.02, viscosity="100 mm/s", density=900.0), "viscosity is '100 mm/s', which is not in Pa s"),
+        ("oil", dict(ball_radius=0.02, viscosity="-100 cSt", density=900.0), "not in Pa s"),
         ("rolling", dict(ball_radius=0.02, mass=1.0, rolling_lever=0.01), "at most a tenth of the ball_radius"),
         ("bearing", dict(mass=1.0, friction=0.0015, diameter=0.2), "at most the radius of 0.12 m"),
     ],
