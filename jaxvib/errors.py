@@ -87,6 +87,15 @@ def within(place: str) -> Iterator[None]:
         raise InputError(place + error.field, error.problem) from error
 
 
+def counted(number: int) -> str:
+    """Return a number of values as text.
+
+    >>> counted(1), counted(2)
+    ('1 value', '2 values')
+    """
+    return f"{number} value{'' if number == 1 else 's'}"
+
+
 def quoted(value: object, longest: int = 60) -> str:
     """Return the value as an error message quotes it: its representation, at most `longest` characters of one line.
 

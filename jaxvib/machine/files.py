@@ -34,7 +34,7 @@ from jaxvib.machine.templates import TEMPLATES as TEMPLATES
 from jaxvib.machine.templates import Templates as Templates
 from jaxvib.machine.torus import torus_balls
 from jaxvib.units.known import require_known, when_known
-from jaxvib.units.tables import csv_column
+from jaxvib.units.tables import csv_column, row_names
 
 MACHINES: dict[str, Callable[..., Machine]] = {
     "one_mass": one_mass,
@@ -215,7 +215,10 @@ def _with_torque_tables(value: Any, folder: Path) -> Any:
         return value
     if value.get("kind") == "torque_table" and isinstance(value.get("file"), str):
         path, rest = folder / value["file"], {name: each for name, each in value.items() if name != "file"}
-        return {**rest, "speeds": csv_column(path, "rad/s").tolist(), "torques": csv_column(path, "N m").tolist()}
+        speeds, torques = csv_column(path, "rad/s"), csv_column(path, "N m")
+        if row_names(path, "rad/s") != row_names(path, "N m"):
+            raise InputError(str(path), "has a row with only one of speed and torque; complete this row or remove it")
+        return {**rest, "speeds": speeds.tolist(), "torques": torques.tolist()}
     return {name: _with_torque_tables(each, folder) for name, each in value.items()}
 
 

@@ -16,7 +16,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxvib.boundary import is_whole
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, counted, quoted
 from jaxvib.runtime.compat import traced
 from jaxvib.runtime.devices import array_module
 from jaxvib.units.reading import ADDED, Number, Numbers, number_words, to_float
@@ -159,13 +159,13 @@ def numbers(
     if isinstance(value, Sequence) and not isinstance(value, (str, bytes, bytearray)):
         if len(value) > (_MAX_NUMBERS if length is None else length):
             needed = _needed(length, unit) if length is not None else f"at most {_MAX_NUMBERS} are allowed"
-            raise InputError(field, f"has {len(value)} values; {needed}")
+            raise InputError(field, f"has {counted(len(value))}; {needed}")
         for i, part in enumerate(value):
             if isinstance(part, (list, tuple)) or getattr(part, "ndim", 0) != 0:
                 raise InputError(f"{field}[{i}]", f"is not a single number; write a {number_words(unit)}")
         parts = [to_float(v, unit, f"{field}[{i}]") for i, v in enumerate(value)]
         if length is not None and len(parts) != length:
-            raise InputError(field, f"has {len(parts)} values; {_needed(length, unit)}")
+            raise InputError(field, f"has {counted(len(parts))}; {_needed(length, unit)}")
         if not parts:
             raise InputError(field, "is an empty list; at least 1 value is needed")
         if not all(isinstance(part, jax.Array) for part in parts):

@@ -37,7 +37,7 @@ _NUMBER_WITH_UNIT = re.compile(
 """Pattern of one number (with a point, not a comma, before decimals), then one unit, which may begin with "1/". Other texts
 are refused as mistakes, even if pint could evaluate them."""
 
-SEVERAL = r"\d{1,4}\s*[x×*]\s*"
+SEVERAL = r"[1-9]\d{0,3}\s*[x×*]\s*"
 """Pattern of the number of equal parts side by side, such as "4 x " in "4 x 50 N/mm"."""
 
 _SEVERAL = re.compile(rf"({SEVERAL})(\S.*)")
@@ -67,7 +67,7 @@ _SPELLINGS = {
 }
 """Other spellings of units, as on rating plates and in catalogues."""
 
-_PER_MINUTE = ("1/min", "min^-1", "min**-1", "min⁻¹")
+_PER_MINUTE = ("1/min", "min^-1", "min**-1", "min⁻¹", "min-1")
 """Spellings of revolutions per minute, if the argument is a speed."""
 
 _JOINED = {
@@ -77,10 +77,15 @@ _JOINED = {
     "Nm": "N m",
     "kNm": "kN m",
     "Nmm": "N mm",
+    "mNm": "mN m",
     "Ncm": "N cm",
     "kgm": "kg m",
     "kgmm": "kg mm",
     "kgcm": "kg cm",
+    "gmm": "g mm",
+    "gcm": "g cm",
+    "Pas": "Pa s",
+    "mPas": "mPa s",
 }
 """Products that are often written without a space. Without this list, pint would read "Nm" as `number_meter`, meters per
 gram."""

@@ -63,7 +63,8 @@ def _column(path: str | Path, unit: str, column: str | None) -> tuple[float, lis
     names = [split_head(each, unit) for each in head]
     matching = [k for k, (name, head_unit) in enumerate(names) if _matches(head[k], name, head_unit, unit, column)]
     if not matching and column is None:
-        raise InputError(str(path), f"has no column with a unit such as {unit}; write it in the header: NAME ({unit})")
+        example = "rpm" if unit == "rad/s" else unit
+        raise InputError(str(path), f"has no column with a unit such as {example}; write it in the header: NAME ({example})")
     if len(matching) != 1:
         wanted = f"with a unit such as {unit}" if column is None else f"{quoted(column)}"
         problem = f"has {len(matching) or 'no'} columns {wanted}"

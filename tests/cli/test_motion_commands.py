@@ -309,7 +309,7 @@ def test_response_of_several_exciters_lists_each_torque(typed, tmp_path):
     out = typed("response", "screen.toml", "--phases", "0 deg, -90 deg")[1]
     assert "torques at the operating points" in out and "foundation force: zero to peak, root" in out
     code, _, err = typed("response", "screen.toml", "--phases", "0 deg")
-    assert code == 2 and err.strip() == "jaxvib: --phases has 1 values; 2 are needed"
+    assert code == 2 and err.strip() == "jaxvib: --phases has 1 value; 2 are needed"
 
 
 def test_regimes_list_motions_in_groups_if_not_all_synchronize(typed, tmp_path, monkeypatch):

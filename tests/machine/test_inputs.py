@@ -62,7 +62,7 @@ WRONG = {
     ),
     "stiffness of no link": (
         lambda: jv.network(mass=[1, 1], stiffness=1, damping=1, link_stiffness=[1e3], link_damping=[1.0], exciter=1),
-        "machine.link_stiffness has 1 values, but the machine has no links",
+        "machine.link_stiffness has 1 value, but the machine has no links",
     ),
     "links that are no list": (
         lambda: jv.network(mass=[1, 1], stiffness=1, damping=1, links=3, exciter=1),

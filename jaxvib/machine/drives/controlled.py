@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, counted, quoted
 from jaxvib.machine.drives.drive import INERTIA, Drive, IdealDrive, Motor, MotorWrapper
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number, Numbers
@@ -96,10 +96,10 @@ def _points(part: type[eqx.Module], **lists: Numbers) -> list[Array]:
     (first, *others), (name, *names) = (found := read_numbers(part, "drive", **lists)).values(), found
     n = np.size(first)
     if np.ndim(first) != 1 or n < 2:
-        raise InputError(f"drive.{name}", f"has {n} value{'' if n == 1 else 's'}; a list of at least 2 is needed")
+        raise InputError(f"drive.{name}", f"has {counted(n)}; a list of at least 2 is needed")
     for other, values in zip(names, others, strict=True):
         if np.shape(values) != (n,):
-            raise InputError(f"drive.{other}", f"has {np.size(values)} values; {n} are needed, one for each of the {name}")
+            raise InputError(f"drive.{other}", f"has {counted(np.size(values))}; {n} are needed, one for each of the {name}")
     when_known(lambda known: _require_ascending(known, name), first)
     return [first, *others]
 

@@ -158,8 +158,10 @@ def _require_plate(rated: float, frequency: float, ratio: float, synchronous: fl
     """**Raises** `InputError` for a rated speed that no motor with this breakdown ratio has at this frequency of the supply."""
     speed = f"is {speed_text(rated)}"
     if not rated < frequency * (1.0 - 1e-6):
-        problem = f"{speed}; it must be below {speed_text(frequency)}, the synchronous speed of one pole pair"
-        raise InputError("drive.rated_speed", f"{problem}; a plain number is in rad/s; write for example '1440 rpm'")
+        hertz = f"{frequency / (2.0 * np.pi):.4g} Hz"
+        problem = f"{speed}; it must be below {speed_text(frequency)}, the synchronous speed of one pole pair at {hertz}"
+        remedy = "plain numbers are in rad/s; write for example '1440 rpm' and '50 Hz'"
+        raise InputError("drive.rated_speed", f"{problem}; {remedy}")
     pole_pairs = frequency / synchronous if synchronous > 0.0 else np.inf
     if pole_pairs > _MAX_POLE_PAIRS + 0.5:
         problem = f"{speed}, which needs {pole_pairs:.0f} pole pairs; motors have 1 to {_MAX_POLE_PAIRS}"

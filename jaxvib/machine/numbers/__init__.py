@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.display import ELECTRICAL, shown_unit
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, counted, quoted
 from jaxvib.runtime.startup import start
 from jaxvib.units import Bounds, number, numbers
 from jaxvib.units.known import when_known
@@ -134,7 +134,7 @@ def _read(spec: NumberSpec, value: Any, field: str, length: int | None) -> Array
     if not isinstance(value, (list, tuple)) and getattr(value, "ndim", 0) != 1:
         raise InputError(field, f"is {quoted(value)}; it must be a list of {size} numbers, in {spec.unit}")
     if len(value) != size:
-        raise InputError(field, f"has {len(value)} values; {size} are needed")
+        raise InputError(field, f"has {counted(len(value))}; {size} are needed")
     units = enumerate(spec.units)
     return jnp.stack([number(value[k], unit, f"{field}[{k}]", **bounds) for k, unit in units])
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, counted, quoted
 from jaxvib.units import Number, Numbers, number
 from jaxvib.units.known import when_known
 
@@ -29,7 +29,8 @@ def damping_constants(damping: Numbers, field: str, stiffness: Array, mass: Call
     **Arguments**: `damping` of n springs, as a user gives it; `field` for messages; `stiffness` (n,) N/m; `mass`: function that
     returns the mass (n,) kg that each spring carries, None if a ratio must name it.
 
-    **Raises** `InputError` for a negative ratio, for one without a mass, and for a spring without stiffness.
+    **Raises** `InputError` for a negative ratio, for one without a mass, for a spring without stiffness, for a frequency
+    without a unit, and for a list of another length.
 
     >>> import jax.numpy as jnp
     >>> damping_constants(["5 %", 7.0, "loss factor 0.1 at 100 rad/s"], "damping", jnp.full(3, 1e4), lambda: jnp.array(100.0))
@@ -37,8 +38,10 @@ def damping_constants(damping: Numbers, field: str, stiffness: Array, mass: Call
     """
     if isinstance(damping, (list, tuple)):
         k = jnp.broadcast_to(stiffness, (len(damping),)) if np.ndim(stiffness) == 0 else stiffness
-        if not any(map(_is_relative, damping)) or len(damping) != np.size(k):
+        if not any(map(_is_relative, damping)):
             return damping
+        if len(damping) != np.size(k):
+            raise InputError(field, f"has {counted(len(damping))}; the number of springs is {np.size(k)}")
         m = [None] * len(damping) if mass is None else jnp.broadcast_to(mass(), np.shape(k))
         return [_constant(value, f"{field}[{i}]", k[i], m[i]) for i, value in enumerate(damping)]
     if not isinstance(damping, str) or not _is_relative(damping):
@@ -64,6 +67,8 @@ def _constant(value: Number, field: str, stiffness: Array, mass: Array | None) -
         raise InputError(field, f"is {quoted(value)}; a damping must be at least 0")
     when_known(lambda k: _require_spring(k, field, value), stiffness)
     if loss is not None:
+        if re.fullmatch(_NUMBER_PATTERN, loss[2]):
+            raise InputError(field, f"is {quoted(value)}; write the frequency with its unit: {quoted(value.strip() + ' Hz')}")
         constant = size * stiffness / number(loss[2], "rad/s", field, low=0.0, open_low=True)
     else:
         assert ratio is not None

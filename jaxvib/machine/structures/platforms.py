@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, counted, quoted
 from jaxvib.machine.carrier import Carrier, Machine, Mount, Place, read_number_of_place
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.machine.structures.damping import damping_constants
@@ -107,7 +107,7 @@ def _platforms(
     for name, value in of_links.items():
         given = len(value) if isinstance(value, (list, tuple)) else getattr(value, "size", 1)
         if not joined and given > 0:
-            problem = f"has {given} values, but the machine has no links; leave it out or give links"
+            problem = f"has {counted(given)}, but the machine has no links; leave it out or give links"
             raise InputError(f"machine.{name}", problem)
     if joined:
         found |= read(len(joined), link_stiffness=link_stiffness)

@@ -170,7 +170,7 @@ REFUSED = {
         lambda: jv.TorqueTable([5.0], [1.0], 0.1),
         "drive.speeds has 1 value; a list of at least 2 is needed",
     ),
-    "list for times": (lambda: jv.SpeedProfile([0.0, 1.0], [1.0]), "drive.speeds has 1 values; 2 are needed, one for each of"),
+    "list for times": (lambda: jv.SpeedProfile([0.0, 1.0], [1.0]), "drive.speeds has 1 value; 2 are needed, one for each of"),
     "three torques": (
         lambda: jv.TorqueTable([0.0, 5.0], [1.0, 2.0, -1.0], 0.1),
         "drive.torques has 3 values; 2 are needed, one for each of the speeds",
@@ -197,7 +197,7 @@ REFUSED = {
     "profile that ends": (lambda: jv.SpeedProfile([0.0, 1.0], [5.0, 0.0]).settled(), "drive.speeds end at 0, so there is no"),
     "rated at 3000 rpm": (
         lambda: jv.NamePlateMotor(4e3, "3000 rpm", 2.8, 0.02),
-        "drive.rated_speed is 3000 rpm; it must be below 3000 rpm, the synchronous speed of one pole pair",
+        "drive.rated_speed is 3000 rpm; it must be below 3000 rpm, the synchronous speed of one pole pair at 50 Hz",
     ),
     "rated at 750 rpm": (
         lambda: jv.NamePlateMotor(4e3, "750 rpm", 2.0, 0.02),

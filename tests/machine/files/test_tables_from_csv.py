@@ -94,6 +94,12 @@ def test_a_torque_table_is_read_beside_its_scene(tmp_path):
     np.testing.assert_allclose(drive.speeds, same.speeds, rtol=1e-14)
     with pytest.raises(jv.InputError, match=r"drive\.file is not a field here"):
         jv.scene_from_toml(SCENE)
+    (tmp_path / "curves" / "motor.csv").write_text("speed (rpm);torque (Nm)\n0;15\n800;\n;18\n1500;0\n")
+    with pytest.raises(jv.InputError, match="has a row with only one of speed and torque"):
+        jv.load_scene(tmp_path / "machine.toml")
+    (tmp_path / "curves" / "motor.csv").write_text("speed,torque (Nm)\n0,15\n1500,0\n")
+    with pytest.raises(jv.InputError, match=r"has no column with a unit such as rpm; write it in the header: NAME \(rpm\)"):
+        jv.load_scene(tmp_path / "machine.toml")
 
 
 def test_choices_of_a_design_come_from_a_catalogue(tmp_path):

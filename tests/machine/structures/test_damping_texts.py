@@ -66,6 +66,8 @@ def test_a_support_of_a_body_needs_the_mass_it_carries():
         ("loss 0.1", "write a damping as '5 %'"),
         ("% 5", "write a damping as '5 %'"),
         ("loss factor 0.1 at 3 kg", "not in rad/s"),
+        ("loss factor 0.1 at 16", "write the frequency with its unit: 'loss factor 0.1 at 16 Hz'"),
+        (("5 %", "5 %"), r"machine\.damping has 2 values; the number of springs is 1"),
     ],
 )
 def test_wrong_ratios_are_refused(damping, words):
