@@ -1,6 +1,7 @@
 """Every result: status, sentence, text, figure, plain and labelled data, files and back."""
 
 import dataclasses
+import itertools
 import json
 import re
 import subprocess
@@ -259,6 +260,28 @@ def alike(one, other):
 def test_speaks(result):
     assert isinstance(result.message, str) and " " in result.message and "<" not in result.message
     assert result.summary().strip() and "Array(" not in result.summary() and isinstance(result.plot(), Figure)
+
+
+def drawn_points(axes):
+    """Points (n, 2) of the lines, areas and cells of axes, as fractions of the axes, without those that have no place there."""
+    lines = [line.get_xydata() for line in axes.lines if line.get_transform() == axes.transData]
+    for points in (*lines, *(each.get_datalim(axes.transData).corners() for each in axes.collections)):
+        points = np.asarray(points, float)
+        is_drawn = np.all(np.isfinite(points), axis=1)
+        for k, scale in enumerate((axes.get_xscale(), axes.get_yscale())):
+            is_drawn &= (scale != "log") | (points[:, k] > 0.0)
+        yield axes.transLimits.transform(axes.transScale.transform(points[is_drawn]))
+
+
+def test_figures_cut_neither_points_nor_texts(result):
+    """Axes of some figures end where the rest has no meaning."""
+    figure, cropped = result.plot(), ("Branches", "ExactBranches", "PhaseJams", "Whirl", "Response")
+    figure.canvas.draw()
+    drawn = figure.get_tightbbox().get_points()  # of all texts, legends and axes
+    assert np.all(drawn >= -0.01) and np.all(drawn <= figure.get_size_inches() + 0.01)
+    if type(result).__name__ not in cropped:
+        for points in itertools.chain.from_iterable(map(drawn_points, figure.axes)):
+            assert np.all((points > -1e-6) & (points < 1.0 + 1e-6))
 
 
 def test_every_array_has_a_unit(result):

@@ -51,7 +51,7 @@ def curve_chart(
     if np.any(missing):
         axis.plot(value[missing], np.zeros(np.sum(missing)), "x", color="black", clip_on=False, label="not all starts captured")
     axis.set(xlabel="value", ylabel="initial speed relative to the\nrotor / rotor speed", ylim=(-1.03, 0.0))
-    legend_above(axis)
+    legend_above(axis, 3)
     return figure if ax is None else ax
 
 

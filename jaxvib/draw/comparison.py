@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, MARKERS, STROKES, Look, color_of, legend_above, log_ticks, panels
+from jaxvib.draw.style import COLORS, MARKERS, STROKES, Look, cell_edges, color_of, legend_above, log_ticks, panels
 
 
 def tiers_chart(
@@ -145,7 +145,7 @@ def stability_chart(
     unit, scale = speed_unit(unit)
     figure, (axes,) = panels(1, size=(7.5, 5.0), ax=ax)
     logarithmic = value[0] > 0.0 and value[-1] > 3.0 * value[0]
-    edges = np.exp(_edges(np.log(value))) if logarithmic else _edges(value)
+    edges = cell_edges(value, logarithmic)
     for speeds, is_stable, low, high in zip(omega, stable, edges[:-1], edges[1:], strict=True):
         axes.fill_between(scale * speeds, low, high, where=is_stable, color="#cfe3d6", lw=0.0)
     axes.set_ylim(edges[0], edges[-1])
@@ -163,14 +163,6 @@ def stability_chart(
     axes.set(xlabel=f"load speed, {unit}", ylabel=label)
     legend_above(axes, 1)
     return figure if ax is None else ax
-
-
-def _edges(places: np.ndarray) -> np.ndarray:
-    """Return the edges (n + 1,) of bands around ascending positions (n,), midway between neighbours."""
-    if places.size == 1:
-        return places[0] + max(abs(float(places[0])), 1.0) * np.array([-0.1, 0.1])
-    between = (places[:-1] + places[1:]) / 2.0
-    return np.concatenate([[2.0 * places[0] - between[0]], between, [2.0 * places[-1] - between[-1]]])
 
 
 def audit_chart(

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import NullLocator
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
-from jaxvib.draw.style import GUIDE, WORKING, legend_above, log_ticks, panels
+from jaxvib.draw.style import GUIDE, WORKING, cell_edges, legend_above, log_ticks, panels
 
 _KINDS = (
     ("loads gather (both agree)", "#ececec"),
@@ -43,11 +43,13 @@ def agreement_maps(
     colours = ListedColormap([colour for _, colour in _KINDS])
     norm = BoundaryNorm(np.arange(len(_KINDS) + 1) - 0.5, len(_KINDS))
     unit, scale = speed_unit(unit)
+    is_log = np.size(height) > 1
     figure, axes = panels(1, len(maps), size=(3.8, 3.6), ax=ax)
     for axis, (title, exact) in zip(axes, maps, strict=True):
         kind = np.where(predicted == exact, np.where(exact, 1, 0), np.where(predicted, 2, 3))
-        axis.pcolormesh(scale * speed, height, kind, cmap=colours, norm=norm, shading="nearest", rasterized=True)
-        if np.size(height) > 1:
+        corners = cell_edges(scale * speed), cell_edges(height, is_log)
+        axis.pcolormesh(*corners, kind, cmap=colours, norm=norm, rasterized=True)
+        if is_log:
             axis.set_yscale("log")
             log_ticks(axis)
         axis.set_xlabel(f"rotor speed, {unit}")
@@ -55,7 +57,7 @@ def agreement_maps(
     axes[0].set_ylabel("load mass / load mass of the scene")
     entries = [Patch(color=colour, label=label) for label, colour in _KINDS]
     if ax is None:
-        figure.legend(handles=entries, loc="outside upper left", ncols=2, fontsize="small", frameon=False)
+        figure.legend(handles=entries, loc="outside upper left", ncols=min(2, len(maps)), fontsize="small", frameon=False)
     else:
         legend_above(axes[0], 1, handles=entries)
     return figure if ax is None else ax

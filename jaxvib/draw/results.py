@@ -311,7 +311,7 @@ def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Draw
             np.imag(multipliers[kind]),
             **{"marker": "o", "ls": "", "ms": 5.0, "label": name, **look},
         )
-    legend_above(axis, 3)
+    legend_above(axis, 2)
     axis.set(aspect="equal", xlabel="real part", ylabel="imaginary part")
     return figure if ax is None else ax
 

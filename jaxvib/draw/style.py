@@ -143,6 +143,20 @@ def panels(
     return figure, list(grid.ravel())
 
 
+def cell_edges(places: np.ndarray, log: bool = False) -> np.ndarray:
+    """Return the edges (n + 1,) of cells around ascending positions (n,), midway between neighbours on the drawn scale.
+
+    >>> cell_edges(np.array([1.0, 3.0])).tolist(), cell_edges(np.array([1.0, 100.0]), True).round(9).tolist()
+    ([0.0, 2.0, 4.0], [0.1, 10.0, 1000.0])
+    """
+    if log:
+        return np.exp(cell_edges(np.log(places)))
+    if places.size == 1:
+        return places[0] + max(abs(float(places[0])), 1.0) * np.array([-0.1, 0.1])
+    between = (places[:-1] + places[1:]) / 2.0
+    return np.concatenate([[2.0 * places[0] - between[0]], between, [2.0 * places[-1] - between[-1]]])
+
+
 def log_places(low: float, high: float, max_ticks: int = 9) -> LogLocator:
     """Return the tick positions of a logarithmic axis.
 

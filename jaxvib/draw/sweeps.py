@@ -18,6 +18,7 @@ from jaxvib.draw.style import (
     NO_RESULT,
     STROKES,
     Look,
+    cell_edges,
     color_of,
     label_colors,
     legend_above,
@@ -55,7 +56,8 @@ def label_map(
     colours = [look["facecolor"] if "facecolor" in look else look["color"] for look in looks]
     norm = BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present))
     places, shown = np.searchsorted(present, codes), ListedColormap(colours)
-    mesh = axis.pcolormesh(x, y, places, cmap=shown, norm=norm, shading="nearest", rasterized=True)
+    corners = cell_edges(x, log[0]), cell_edges(y, log[1])
+    mesh = axis.pcolormesh(*corners, places, cmap=shown, norm=norm, rasterized=True)
     for code, look in zip(present, looks, strict=True):
         if "hatch" in look:
             axis.add_patch(PathPatch(_cells_path(np.asarray(mesh.get_coordinates()), codes == code), rasterized=True, **look))
@@ -143,7 +145,7 @@ def value_map(
     """Draw a map over x (n,) and y (m,), coloured by values (m, n); NaN is grey."""
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
     axis.set_facecolor("#dddddd")
-    drawn = axis.pcolormesh(x, y, values, cmap="viridis", shading="nearest", rasterized=True)
+    drawn = axis.pcolormesh(cell_edges(x, log[0]), cell_edges(y, log[1]), values, cmap="viridis", rasterized=True)
     figure.colorbar(drawn, ax=axis, label=label)
     _scales(axis, x_label, y_label, log)
     axis.grid(False)

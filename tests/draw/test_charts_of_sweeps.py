@@ -37,6 +37,26 @@ def test_a_map_of_values_has_logarithmic_axes_on_request():
         np.testing.assert_array_equal(axis.collections[0].get_array().filled(np.nan), values)
 
 
+@pytest.mark.parametrize("log", [(False, False), (True, False), (True, True)])
+@pytest.mark.parametrize("count", [1, 3])
+def test_cells_of_a_map_lie_around_their_points_on_its_scale(log, count):
+    """Three points a factor of 10 apart: midway between the first two, a linear scale would have edges below 0."""
+    x, y, kinds = 10.0 ** np.arange(count), 10.0 ** np.arange(3.0), np.zeros((3, count), int)
+    labels = dict(x_label="x", y_label="y", log=log)
+    for axis in (label_map(x, y, kinds, ["a"], **labels).axes[0], value_map(x, y, 1.0 * kinds, label="z", **labels).axes[0]):
+        axis.figure.canvas.draw()  # sets the limits
+        points = np.stack(np.broadcast_arrays(x, y[:, None]), axis=-1)
+        corners, centres = (
+            axis.transLimits.transform(axis.transScale.transform(each.reshape(-1, 2))).reshape(each.shape)
+            for each in (axis.collections[0].get_coordinates(), points)
+        )
+        np.testing.assert_allclose(corners[[0, -1], [0, -1]], [[0.0, 0.0], [1.0, 1.0]], atol=1e-9)
+        assert np.all((corners[:-1, :-1] < centres) & (centres < corners[1:, 1:]))
+        for k, is_log in enumerate(log):
+            if is_log:
+                np.testing.assert_allclose((corners[:-1, :-1] + corners[1:, 1:])[..., k] / 2.0, centres[..., k], atol=1e-9)
+
+
 def test_points_over_a_parameter_are_drawn():
     x, values = np.array([1.0, 10.0]), np.array([[1.0, 2.0], [3.0, 4.0]])
     axis = points_over(x, values, x_label="x", y_label="y", log=True).axes[0]
