@@ -4,16 +4,19 @@
     python benchmarks/trials/interrupts.py audit --count 40 --cold --within 60
 
 The command runs undisturbed, then `--count` times with an interrupt between 0.2 s and its end; with `--within`, before this
-time, without an undisturbed run. With `--cold`, each run has an empty cache of programs, and therefore compiles in threads. An
-interrupted command prints the line "jaxvib: interrupted" and ends within 30 s with the exit code 1; a search may instead print
-its result so far, with the exit code 0. The exit code of the script is the number of other outcomes, which are printed.
+time, without an undisturbed run. An interrupted sweep is continued by the next run. With `--cold`, each run has an empty cache
+of programs, and therefore compiles in threads. An interrupted command prints the line "jaxvib: interrupted" and ends within
+30 s with the exit code 1; a search may instead print its result so far, with the exit code 0. The exit code of the script is
+the number of other outcomes, which are printed.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -89,16 +92,22 @@ def main() -> int:
             made = subprocess.run([sys.executable, "-c", ENTRY, "new", kind], capture_output=True, text=True, check=True)
             (folder / file).write_text(made.stdout)
         cache, whole = next(caches), given.within
+        # a finished sweep would have nothing to compute
+        forget = functools.partial(shutil.rmtree, folder / "study.zarr", ignore_errors=True)
         for _ in range(0 if whole else 1 if given.cold else 2):  # the second run finds its programs
+            forget()
             start = time.monotonic()
             done = begun(words, folder, cache)
             said = done.communicate()[1]
             assert done.returncode == 0, said
             whole = time.monotonic() - start
+        forget()
         print(f"{given.command}: interrupts within {whole:.1f} s", flush=True)
         for k in range(given.count):
             moment = draw.uniform(0.2, whole)
             found = outcome(words, folder, next(caches) if given.cold else cache, moment)
+            if not found.startswith("interrupted"):
+                forget()
             counts[found[:40]] = counts.get(found[:40], 0) + 1
             if found.startswith("WRONG"):
                 print(f"number {k}, interrupted after {moment:.2f} s: {found}", flush=True)
