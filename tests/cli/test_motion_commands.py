@@ -116,6 +116,13 @@ def test_settle_shows_ranges_within_tolerances(typed, tmp_path):
     assert "--step-tolerance is -1" in typed(*words[:-2], "--step-tolerance", "-1")[2]
 
 
+def test_settle_names_motors_that_are_switched_off(typed, tmp_path):
+    off = jv.SwitchedOff(jv.DCMotor(100.0, stall_torque=2.5, inertia=0.5), at="8 s", bearing=0.01)
+    machine = jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0)
+    jv.save_scene(jv.Scene(machine, exciters=[jv.Exciter(drive=off, unbalance=0.4)]), tmp_path / "off.toml")
+    assert typed("settle", "off.toml")[1].startswith("exciter 1 is switched off at 8 s: steady motions are those after")
+
+
 def test_settle_and_growth_pass_their_options(typed, tmp_path, monkeypatch):
     asked, kept = [], small_run()
 

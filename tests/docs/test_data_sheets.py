@@ -66,3 +66,12 @@ def test_the_rotor_is_balanced_by_its_balls(scenes):
     alone = 6e-3 * w**2 / abs(k - m * w**2 + 2j * 0.03 * np.sqrt(k * 25.0) * w)
     assert run.regime.label == "balanced" and alone == pytest.approx(3e-4, rel=0.01)
     assert float(np.max(run.amplitude)) < 1e-3 * alone
+
+
+def test_the_drag_of_a_wide_bath_is_that_of_the_page(scenes):
+    """Larger than the greatest drag with a jam, in a jam; smaller in the balanced motion."""
+    oil = dict(radius=0.1, rotor_speed="3000 rpm", ball_radius="11 mm", viscosity="0.5 Pa s", density=870.0)
+    jammed, balanced = (float(jv.drag_of("oil", load_speed=speed, **oil)) for speed in ("1350 rpm", "2999.9 rpm"))
+    greatest = float(jv.drag_limits(scenes["my_rotor"]).drag[0])
+    np.testing.assert_allclose([jammed, balanced, greatest], [1.5, 0.105, 0.36], rtol=0.02)
+    assert all(f"{drag} N s/m" in PAGE for drag in ("1.5", "0.1", "0.36"))

@@ -32,6 +32,7 @@ from jaxvib.cli.document import (
 )
 from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
+from jaxvib.machine.validation import off_notes
 
 _START_HELP = "Initial state [jam with --mode, otherwise rest]."
 _START = click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), help=_START_HELP)
@@ -76,7 +77,8 @@ def settle(
         {"tolerances": [ranges_of_quantity._asdict() for ranges_of_quantity in ranges]} if tolerances else {}
     )
     table = [tolerance_table(ranges, tolerances)] if tolerances else []
-    output.done(document, lambda: "\n".join([run_text(run, measures), *table]), "settle", run)
+    text = "\n".join([*off_notes(loaded), run_text(run, measures), *table])
+    output.done(document, lambda: text, "settle", run)
 
 
 def _modes_of(run: jv.Run) -> list[int] | None:
