@@ -164,3 +164,17 @@ def test_table_of_a_batch_is_refused():
     batch = Readings(*(np.zeros((2, 3)) for _ in range(3)))
     with pytest.raises(jv.InputError, match=r"^result is a batch with 1 outer axis; take one of its results, "):
         table_along(batch, "load")
+
+
+class Curve(eqx.Module):
+    """Points of a curve of two pieces with a common end."""
+
+    speed: np.ndarray = eqx.field(metadata=in_unit("rad/s", "point"))
+    sample: np.ndarray = eqx.field(metadata=in_unit("m", "time"))
+
+
+@pytest.mark.parametrize("axis, expected", [("point", [1.0, 2.0, 3.0]), ("time", [1.0, 2.0, 2.0, 3.0])])
+def test_the_common_end_of_two_pieces_is_written_once(tmp_path, axis, expected):
+    values = np.array([1.0, 2.0, 2.0, 3.0])
+    (column,) = table(Curve(values, values), axis, tmp_path / "curve.csv").values()
+    assert column.astype(float).tolist() == expected

@@ -118,6 +118,13 @@ def test_damping_ratio_is_accurate_near_critical_damping(zeta):
     np.testing.assert_allclose(damping_ratio(jnp.asarray(restitution)), zeta, rtol=1e-11)
 
 
+@pytest.mark.parametrize("effect", [jv.LoadContact(stiffness=1e5), jv.RollingFriction(coefficient=1e-4)])
+def test_loads_without_a_ball_radius_are_refused(effect):
+    pendulums = jv.pendulums(count=2, mass=0.1, radius=0.1, drag=0.1)
+    with pytest.raises(jv.InputError, match=r"needs loads that roll .* a ball_radius, and these .* have none"):
+        jv.Scene(jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0), pendulums, jv.ConstantSpeed(60.0), effects=(effect,))
+
+
 def test_restitution_is_read_from_files_and_checked():
     s = plane(0.7)
     again = jv.scene_from_toml(jv.scene_to_toml(s))

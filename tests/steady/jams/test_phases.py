@@ -12,6 +12,7 @@ import jaxvib as jv
 from jaxvib.draw.style import COLORS
 from jaxvib.equations.torque_balance import assemble_torque_balance, influence_of, torques_at
 from jaxvib.numerics.linalg import eliminate
+from jaxvib.steady.jams.jam import STABILITY_CRITERION, STABILITY_OF_FREE_LOADS
 from jaxvib.steady.jams.patterns import is_same_pattern
 from jaxvib.steady.jams.phase_search import phase_branch
 from jaxvib.steady.jams.phases import growth_of_free_loads, phase_jam, phase_pattern
@@ -344,6 +345,20 @@ def test_stability_with_a_stride_differs_at_few_points():
     (each, text), (some, same) = curve.with_free_loads(), curve.with_free_loads(stride=16)
     assert text == same and np.sum(np.asarray(curve.stable) & ~np.asarray(each.stable)) > 300
     assert np.sum(np.asarray(each.stable) != np.asarray(some.stable)) < 50
+
+
+@pytest.mark.parametrize("unknown, text", [(slice(1), STABILITY_OF_FREE_LOADS), (slice(None), STABILITY_CRITERION)])
+def test_criterion_of_branches_where_growth_is_unknown(monkeypatch, unknown, text):
+    def growth(scene, omega, rotor_speed):
+        values = np.full(omega.shape, -1.0)
+        values[unknown] = np.nan
+        return values
+
+    curve = jv.branches(platforms(), points=200)
+    monkeypatch.setattr("jaxvib.steady.branches.growth_of_free_loads", growth)
+    stricter, found = curve.with_free_loads()
+    assert found == text
+    np.testing.assert_array_equal(stricter.stable, curve.stable)
 
 
 def test_every_jam_is_listed_once_and_in_order():
