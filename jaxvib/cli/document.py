@@ -150,13 +150,19 @@ def deck_of_options() -> dict[str, Any]:
     return dict(click.get_current_context().meta.get(_DECK_KEY, {}))
 
 
+def _given_options() -> list[str]:
+    """Return the names of the given options of the deck."""
+    return ["--deck" if name == "at" else f"--{name}" for name in deck_of_options()]
+
+
 def require_deck_options(scene: jv.Scene) -> None:
     """**Raises** `InputError` for the options of the deck with a machine that is not a body in a plane, and for points far
     outside of the machine, which are in another unit."""
     deck = deck_of_options()
     if deck and scene.machine.places != "plane":
-        option = "--deck" if "at" in deck else f"--{next(iter(deck))}"
-        raise InputError(option, f"is for bodies in a plane, not for a machine of kind '{scene.machine.kind}'; leave it out")
+        raise InputError(
+            _given_options()[0], f"is for bodies in a plane, not for a machine of kind '{scene.machine.kind}'; leave it out"
+        )
     for x, y in deck.get("at", []):
         size = largest_coordinate(scene)
         if max(abs(x), abs(y)) > _MAX_DECK_SIZES * size:
@@ -177,7 +183,7 @@ def run_measures(run: jv.Run | jv.Envelope) -> jv.VibrationMeasures | None:
     if not run.no_vibration:
         return measures_of(run.scene, run.vibration())
     if deck_of_options():
-        note("note: --deck, --slope, --layer: no stroke, throw and conveying, because the run ends without a vibration")
+        note(f"note: {', '.join(_given_options())}: no stroke, throw and conveying, because the run ends without a vibration")
     return None
 
 

@@ -36,6 +36,7 @@ def modes_chart(
     *,
     names: Sequence[str],
     units: Sequence[str] | None = None,
+    stable_label: str = "stable by slope",
     unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
@@ -45,7 +46,7 @@ def modes_chart(
 
     - `mode` (k,): numbers of the modes
     - `omega` (k,): load speeds, rad/s, drawn in `unit`
-    - `stable` (k,): stability by slope
+    - `stable` (k,): True for stable modes, which the legend calls `stable_label`
     - `amplitude` (k, nd): amplitudes, m, drawn in mm or µm (tilts: rad, drawn in deg), with a marker and a colour for each
       coordinate
     - `resonances`: resonances, rad/s, drawn as horizontal lines
@@ -66,7 +67,7 @@ def modes_chart(
     legend_above(bottom, 6)
     if resonances is not None:
         resonance_lines(top.axhline, scale * resonances)
-    top.plot([], [], "o", color="black", label="stable by slope")
+    top.plot([], [], "o", color="black", label=stable_label)
     top.plot([], [], "o", color="black", mfc="white", label="unstable")
     legend_above(top)
     top.set_ylabel(f"load speed, {unit}")

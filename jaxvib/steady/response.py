@@ -310,7 +310,8 @@ def require_unbalances(scene: Scene) -> None:
     """**Raises** `InputError` for exciters with loads, and for effects that the response does not include."""
     for k, exciter in enumerate(scene.exciters):
         if exciter.loads is not None:
-            problem = "turn at a speed of their own; this function needs unbalances; for loads use branches (command modes)"
+            for_loads = "branches (command modes)" if scene.is_plain else "synchronous_regimes (command regimes) or simulate"
+            problem = f"turn at a speed of their own; this function needs unbalances; for loads use {for_loads}"
             raise InputError(f"{scene.prefix_of(k)}loads", problem)
     require_rotating_masses(scene, (*AVERAGED_TERMS, RotorImbalance))
 

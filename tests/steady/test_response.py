@@ -447,6 +447,9 @@ def test_scenes_with_loads_are_refused():
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
     with pytest.raises(jv.InputError, match=r"^loads turn at a speed of their own.*use branches \(command modes\)$"):
         jv.response(scene)
+    several = jv.Scene(machine, exciters=[jv.Exciter(scene.loads, scene.drive), jv.Exciter(None, scene.drive, unbalance=0.01)])
+    with pytest.raises(jv.InputError, match=r"for loads use synchronous_regimes \(command regimes\) or simulate$"):
+        jv.response(several)
 
 
 @pytest.mark.parametrize(("name", "value"), [("most", b"12"), ("most", True), ("most", -1.0), ("points", 0)])

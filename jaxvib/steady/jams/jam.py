@@ -78,7 +78,7 @@ class AbstractJam(Result):
     - `status`: a `JamStatus`
     - `omega`: load speed, rad/s; `rotor_speed`, rad/s
     - `stable`: True if the slope dn/dOmega > 0 and the vibration can balance the drag and dry friction of each load.
-      This holds for light loads that stay together (`phase_jams` shows whether they do)
+      This holds for light loads that stay together (`JamModes.stable_with_free_loads` computes whether they do)
     - `slope`: dn/dOmega
     - `displacement` (nd,): complex amplitudes of q = Re(displacement exp(i Omega t)), m (rad for tilts)
     - `amplitude` (nd,), m (rad for tilts), zero to peak; typical: 0.5 to 10 mm
@@ -232,9 +232,29 @@ class JamModes(AbstractJam):
         return "\n".join([f"rotor {rotor}; resonances {resonances}", *rows, *notes])
 
     @validated
-    def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
-        """Plot the load speed of each mode in `unit`, with the resonances, and the amplitudes; `ax`: two axes to plot onto."""
-        return _modes_chart(self, self.resonances, unit, ax)
+    def stable_with_free_loads(self, scene: Scene) -> np.ndarray:
+        """Return True for each mode (2 nd + 1,) that is `stable` and whose loads stay together if each is free to move
+        separately, as in the table of `jaxvib modes`. Loads with a `ball_radius` or dry friction are assumed to stay together.
+
+        **Arguments**: `scene` of the modes.
+
+        >>> import jaxvib as jv
+        >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+        >>> scene = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
+        >>> modes = jv.jam_modes(scene)
+        >>> modes.stable.tolist(), modes.stable_with_free_loads(scene).tolist()
+        ([True, False, False, False, True], [True, False, False, False, False])
+        """
+        return np.asarray(self.stable) & ~(growth_of_free_loads(scene, self.omega) > 0.0)
+
+    @validated
+    def plot(self, scene: Scene | None = None, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
+        """Plot the load speed of each mode in `unit`, with the resonances, and the amplitudes; `ax`: two axes to plot onto.
+
+        Stable modes are filled: by slope, or, if the `scene` of the modes is given, according to `stable_with_free_loads`.
+        """
+        stricter = None if scene is None else self.stable_with_free_loads(scene)
+        return _modes_chart(self, self.resonances, unit, ax, stricter)
 
 
 def require_mode_number(mode: object, count: int) -> None:
@@ -299,12 +319,15 @@ def _modes_of_pieces(folds: Folds, resonances: Array) -> Array:
     return piece_modes(jnp.where(folds.exists, folds.omega, jnp.inf), folds.exists, resonances)
 
 
-def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit | None, ax: Onto) -> Drawn:
+def _modes_chart(
+    jams: AbstractJam, resonances: Array | None, unit: SpeedUnit | None, ax: Onto, stricter: np.ndarray | None = None
+) -> Drawn:
     from jaxvib.draw.results import modes_chart  # slow import
 
     mode, omega, stable, amplitude = map(np.asarray, (jams.mode, jams.omega, jams.stable, jams.amplitude))
-    lines = None if resonances is None else np.asarray(resonances)
-    return modes_chart(mode, omega, stable, amplitude, lines, names=jams.coordinates, units=jams.units, unit=unit, ax=ax)
+    stable, label = (stable, "stable by slope") if stricter is None else (stricter, "stable with free loads")
+    lines, about = None if resonances is None else np.asarray(resonances), {"names": jams.coordinates, "units": jams.units}
+    return modes_chart(mode, omega, stable, amplitude, lines, **about, stable_label=label, unit=unit, ax=ax)
 
 
 @validated

@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
 from jaxvib.errors import InputError
@@ -133,15 +134,19 @@ def jam_orbit(
     orbit = _solve_accurately(plan)
     if plan.mode is not None and not abs(float(orbit.omega) / float(plan.problem.start) - 1.0) < _MAX_SPEED_DIFFERENCE:
         # The mode does not exist in leading order, or its exact load speed is far from that of leading order.
-        orbit = _solve_accurately(_plan_from_search(plan, plan.mode))
+        plan = _plan_from_search(plan, plan.mode)
+        orbit = _solve_accurately(plan)
     return outcome(orbit, throw=throw, failures=("absent", "not_converged"), hint=partial(_advice, plan))
 
 
 def _advice(plan: OrbitPlan, status: str) -> str:
     """Return the advice that follows the message of a failed search."""
-    if status != "absent" or plan.mode is None or "ambiguous" not in status_names(jams_of(plan.problem.scene).status):
+    if status != "absent" or plan.mode is None:
         return ""
-    return f", or this search does not find it: {sentence(JamStatus.ambiguous)}"
+    if "ambiguous" in status_names(jams_of(plan.problem.scene).status):
+        return f", or this search does not find it: {sentence(JamStatus.ambiguous)}"
+    there = ", ".join(map(str, sorted({*plan.existing} - {plan.mode})))
+    return f" (jam mode {plan.mode}, {speed_text(plan.problem.value)}); existing modes: {there or 'none'}"
 
 
 class JamProblem(NamedTuple):
@@ -168,13 +173,14 @@ class OrbitPlan(NamedTuple):
     """Plan of an exact jam.
 
     **Attributes**: the `problem`; `mode`: its number, or None; `points`: numbers of collocation points to try one after the
-    other; `is_known`: True if no parameter is traced.
+    other; `is_known`: True if no parameter is traced; `existing`: modes that the search of the exact branch finds.
     """
 
     problem: JamProblem
     mode: int | None
     points: tuple[int, ...]
     is_known: bool
+    existing: tuple[int, ...] = ()
 
 
 def plan_orbit(
@@ -266,11 +272,11 @@ def _solve_accurately(plan: OrbitPlan) -> Orbit:
 
 def _plan_from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
     """Return the plan that starts at the load speed of the mode that a search of the whole exact branch finds."""
-    speed, start = exact_mode_speeds(plan.problem.scene).get(mode), plan.problem.start
+    speeds, start = exact_mode_speeds(plan.problem.scene), plan.problem.start
+    speed = speeds.get(mode)
     start = start if speed is None else jnp.asarray(speed, dtype=start.dtype)
-    return plan._replace(
-        problem=plan.problem._replace(exists=jnp.asarray(speed is not None), start=start, is_start_solved=True)
-    )
+    problem = plan.problem._replace(exists=jnp.asarray(speed is not None), start=start, is_start_solved=True)
+    return plan._replace(problem=problem, existing=tuple(speeds))
 
 
 def _outputs(orbit: Orbit, problem: JamProblem, points: int, max_steps: int | None) -> Orbit:

@@ -112,7 +112,10 @@ def test_a_deck_without_vibration_has_a_note_and_its_peak(stopped, tmp_path, mon
     text, err = capsys.readouterr()
     peak = 1e3 * float(stopped.point(AT, part="all").largest_displacement)
     assert f"largest on the way, zero to peak: point (1.5, 0.1) m {peak:.4g} mm" in text
-    assert "--deck, --slope, --layer: no stroke, throw and conveying" in err
+    assert "note: --deck: no stroke, throw and conveying" in err
+    given = ["--slope", "-5 deg", "--layer", "1 m,50 mm,1600"]
+    assert run_command(["simulate", str(path), "--until", "60s", *given]) == 0
+    assert "note: --slope, --layer: no stroke" in capsys.readouterr()[1]
     assert run_command(["simulate", str(path), "--until", "60s", "--deck", "1.5,0.1", "--json"]) == 0
     document = json.loads(capsys.readouterr()[0])
     assert document["no_vibration"] == stopped.no_vibration and "measures" not in document

@@ -314,6 +314,11 @@ def test_jams_by_slope_are_judged_for_loads_that_may_part():
     assert modes.stable.tolist() == [False, False, True, False, True]
     np.testing.assert_array_equal(np.isnan(growth), [True, True, False, False, False])
     assert growth[2] < 0.0 < growth[3] and growth[4] > 0.0
+    assert modes.stable_with_free_loads(s).tolist() == [False, False, True, False, False]
+    for given, label, filled in (((), "stable by slope", [3, 5]), ((s,), "stable with free loads", [3])):
+        speeds = modes.plot(*given).axes[0]
+        assert [x for x in speeds.lines[0].get_xdata() if x in modes.mode_numbers()] == filled
+        assert label in [text.get_text() for text in speeds.get_legend().get_texts()]
     # The full equations, loads 0.01 rad apart, and together.
     asked = dict(start="jam", mode=5, estimate=False, samples=2)
     coincident, separated = (jv.simulate(s, 2.0, separation=a, **asked) for a in (0.0, 0.01))
