@@ -21,12 +21,13 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union
 
+import equinox as eqx
 import jax
 import jax.typing as jax_typing
 import numpy as np
 import numpy.typing as np_typing
 
-from jaxvib.errors import InputError, quoted, require_path
+from jaxvib.errors import InputError, quoted, require_path, suggest_name
 
 _MAX_ENTRIES = 10**7
 """Largest length of a list. Longer lists are refused, because the check of each entry takes time."""
@@ -87,6 +88,7 @@ def validated(function: F) -> F:
         try:
             bound = signature.bind(*args, **kwargs)
         except TypeError:  # the call raises the same error with Python's message
+            _explain_names(function, kwargs, function.__name__)
             return function(*args, **kwargs)
         for name, value in bound.arguments.items():
             kind = checks[name]
@@ -113,6 +115,60 @@ def validated(function: F) -> F:
             raise InputError("jax_numpy_dtype_promotion", problem) from error
 
     return typing.cast(F, checked)
+
+
+def _explain_names(function: Callable[..., Any], given: Mapping[str, Any], name: str) -> None:
+    """**Raises** `TypeError`, as Python does, for the first of the `given` keywords that a function does not have; the message
+    lists its arguments. `name`: that of the function in the message."""
+    parameters = inspect.signature(function).parameters
+    if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
+        return
+    allowed = [key for key, each in parameters.items() if each.kind is not inspect.Parameter.POSITIONAL_ONLY and key != "self"]
+    for key in given:
+        if key not in allowed:
+            advice = suggest_name(key, allowed, given) if allowed else "it has no arguments"
+            raise TypeError(f"{name}() got an unexpected keyword argument {key!r}; {advice}") from None
+
+
+def with_known_names(function: F) -> F:
+    """Explain unknown keywords of a function that reads its other arguments itself, see `_explain_names`.
+
+    >>> @with_known_names
+    ... def disc(*, mass: float, radius: float) -> float:
+    ...     return mass * radius
+    >>> disc(mass=1.0, raduis=2.0)
+    Traceback (most recent call last):
+        ...
+    TypeError: disc() got an unexpected keyword argument 'raduis'; did you mean 'radius'? allowed: mass, radius
+    """
+
+    @functools.wraps(function)
+    def called(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return function(*args, **kwargs)
+        except TypeError:
+            _explain_names(function, kwargs, function.__name__)
+            raise
+
+    return typing.cast(F, called)
+
+
+if typing.TYPE_CHECKING:
+    Module = eqx.Module
+else:
+
+    class _ModuleType(type(eqx.Module)):
+        """Metaclass that explains unknown keywords of constructors, which may be those of dataclasses."""
+
+        def __call__(cls, *args: Any, **kwargs: Any) -> Any:
+            try:
+                return super().__call__(*args, **kwargs)
+            except TypeError:
+                _explain_names(cls.__init__, kwargs, cls.__name__)
+                raise
+
+    class Module(eqx.Module, metaclass=_ModuleType):
+        """Module of Equinox whose constructor explains unknown keywords, see `_explain_names`."""
 
 
 def _require_known(arguments: Mapping[str, Any]) -> None:

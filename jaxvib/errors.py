@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import importlib
 import os
 import re
 import stat
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import IO
@@ -109,6 +110,14 @@ def quoted(value: object, longest: int = 60) -> str:
     except Exception:  # `repr` of a user's class may raise any error
         text = f"a {type(value).__name__}"
     return text if len(text) <= longest else f"{text[: longest - 4].rstrip()} ..."
+
+
+def suggest_name(name: str, allowed: list[str], present: Container[str] = ()) -> str:
+    """Return the end of an error message about an unknown name: the most similar allowed name that is not `present` in the same
+    table, and all allowed names."""
+    similar = difflib.get_close_matches(name, [other for other in allowed if other not in present], n=1)
+    question = f"did you mean {similar[0]!r}? " if similar else ""
+    return f"{question}allowed: {', '.join(allowed)}"
 
 
 def require_one_of(value: object, allowed: Iterable[str], field: str) -> None:

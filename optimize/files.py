@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxvib.boundary import validated
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, quoted, suggest_name
 from jaxvib.machine.files import (
     Tables,
     Templates,
@@ -18,7 +18,6 @@ from jaxvib.machine.files import (
     read_toml,
     require_fields,
     require_tables,
-    suggest_name,
 )
 from jaxvib.machine.numbers.named import find_number
 from jaxvib.machine.scene import Scene

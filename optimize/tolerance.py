@@ -11,8 +11,7 @@ import jax
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.errors import ComputationError, InputError, quoted
-from jaxvib.machine.files import suggest_name
+from jaxvib.errors import ComputationError, InputError, quoted, suggest_name
 from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, present_numbers, put_numbers, put_present
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Bounds, count, number

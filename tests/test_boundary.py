@@ -203,6 +203,22 @@ def test_an_unknown_name_remains_a_type_error():
         question(colour="red")
 
 
+@pytest.mark.parametrize(
+    ("make", "name", "says"),
+    [
+        (jv.pendulums, "length", r"^pendulums\(\) .* 'length'; allowed: count, mass, radius, drag, inertia$"),
+        (jv.balls, "radious", r"^balls\(\) .*; did you mean 'radius'\? allowed: count, "),
+        (jv.ConstantSpeed, "sped", r"^ConstantSpeed\(\) .*; did you mean 'speed'\? allowed: speed$"),
+        (jv.Spin, "rotatoin", r"^Spin\(\) .*; allowed: "),
+        (jv.Scene, "exciter", r"^Scene\(\) .*; did you mean 'exciters'\? "),
+        (jv.simulate, "untill", r"^simulate\(\) .*; did you mean 'until'\? "),
+    ],
+)
+def test_unknown_names_of_arguments_are_explained(make, name, says):
+    with pytest.raises(TypeError, match=says):
+        make(**{name: 1.0})
+
+
 def test_numbers_and_paths_are_known_by_their_kind():
     assert is_real(2) and is_real(np.ones(3, np.float16)) and is_real(jnp.ones(2, jnp.bfloat16)) and is_whole(np.int8(1))
     assert not any(map(is_real, (True, 1j, "1", None, np.datetime64("2020"), np.asarray([True], dtype=object))))

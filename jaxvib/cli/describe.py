@@ -25,7 +25,7 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
 
     GROUP is machines, loads, drives, effects or tables ([[exciters]], [[machine.supports]], [[machine.bodies]]); NAME is a
     part, such as three_mass or exciter, whose whole documentation is printed."""
-    from jaxvib.machine.files import suggest_name
+    from jaxvib.errors import suggest_name
     from jaxvib.report.arguments import GROUPS, arguments_of, builder_of
 
     if group is None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import re
 import tomllib
-from collections.abc import Callable, Collection, Container, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -14,7 +13,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.errors import CONTROL, InputError, quoted, read_text, within, written
+from jaxvib.errors import CONTROL, InputError, quoted, read_text, suggest_name, within, written
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drag import drag_of
 from jaxvib.machine.drives.belt import BeltDrive
@@ -77,14 +76,6 @@ T = TypeVar("T")
 
 Tables: TypeAlias = dict[str, Any]
 """Content of a file by name, before validation: tables, arrays, texts and numbers."""
-
-
-def suggest_name(name: str, allowed: list[str], present: Container[str] = ()) -> str:
-    """Return the end of an error message about an unknown name: the most similar allowed name that is not `present` in the same
-    table, and all allowed names."""
-    similar = difflib.get_close_matches(name, [other for other in allowed if other not in present], n=1)
-    question = f"did you mean {similar[0]!r}? " if similar else ""
-    return f"{question}allowed: {', '.join(allowed)}"
 
 
 _KEY = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import validated, with_known_names
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number, Numbers, count, number
@@ -356,6 +356,7 @@ def ball_mass(ball_radius: Number, material: str = "steel") -> Array:
     return 4.0 / 3.0 * jnp.pi * number(ball_radius, "m", "ball_radius", low=0.0, open_low=True) ** 3 * DENSITIES[material]
 
 
+@with_known_names
 def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radius: Number | None = None) -> CircularLoads:
     """Return balls that roll in an annular track, kappa = 7/5.
 
@@ -397,6 +398,7 @@ def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radi
     return _circular("ball", count, mass, radius, drag, None, ball_radius)
 
 
+@with_known_names
 def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radius: Number | None = None) -> CircularLoads:
     """Return cylindrical rollers in an annular track, kappa = 3/2.
 
@@ -419,6 +421,7 @@ def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_ra
     return _circular("roller", count, mass, radius, drag, None, ball_radius)
 
 
+@with_known_names
 def pendulums(*, count: int, mass: Numbers, radius: Number, drag: Numbers, inertia: Numbers = 0.0) -> CircularLoads:
     """Return pendulums on the shaft, kappa = 1 + J_C/(m R^2).
 

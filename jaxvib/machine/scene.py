@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import is_real, require_field_types
+from jaxvib.boundary import is_real, require_field_types, with_known_names
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine, Mount, Place, on_body, read_place, shapes_of
 from jaxvib.machine.drives.drive import Directed, Drive
@@ -143,6 +143,7 @@ class Exciter(Part):
         return self.position if self.platform is None else self.platform
 
 
+@with_known_names
 def unbalance(*, force: Number, at: Number) -> Array:
     """Return the unbalance of an exciter from the centrifugal force that its catalogue states.
 

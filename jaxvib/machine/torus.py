@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
+from jaxvib.boundary import with_known_names
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.loads import BALL_RADIUS, DRAG, MASS, DrillingSpin, Loads, NormalForce, require_side_by_side, side_by_side
 from jaxvib.machine.numbers import read_numbers, unit
@@ -131,6 +132,7 @@ def require_torus_balls(loads: Loads, caller: str) -> TorusBalls:
     return loads
 
 
+@with_known_names
 def torus_balls(
     *,
     count: int,

@@ -7,8 +7,8 @@ import re
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import EFFECTS, SECTIONS, suggest_name
+from jaxvib.errors import InputError, quoted, suggest_name
+from jaxvib.machine.files import EFFECTS, SECTIONS
 from jaxvib.machine.numbers import PLAIN, number_specs
 from jaxvib.machine.scene import Exciter
 from jaxvib.machine.structures.plane_body import body, support

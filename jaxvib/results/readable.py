@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxvib.boundary import Module
 from jaxvib.display import shown_unit
 from jaxvib.results.fields import is_single
 from jaxvib.results.status import is_status, sentence
@@ -19,7 +20,7 @@ _MAX_ENTRIES = 12
 value are shown."""
 
 
-class Readable(eqx.Module):
+class Readable(Module):
     """Base of results, of their parts and of other objects with arrays: `repr` shows values with units, and `==` is True if all
     fields are equal, with NaN equal to NaN.
 

@@ -12,8 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.state import State
-from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import suggest_name
+from jaxvib.errors import InputError, quoted, suggest_name
 from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_present
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene

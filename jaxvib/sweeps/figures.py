@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.display import Axes, Drawn, Figure, shown_unit
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, quoted, suggest_name
 from jaxvib.machine.drives.drive import ConstantSpeed
-from jaxvib.machine.files import scene_from_toml, suggest_name
+from jaxvib.machine.files import scene_from_toml
 from jaxvib.machine.numbers.named import find_number
 from jaxvib.results.estimate import wilson
 from jaxvib.steady.orbits.diagram import exact_branches

@@ -11,8 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import suggest_name
+from jaxvib.errors import InputError, quoted, suggest_name
 from jaxvib.motion.analysis.measure import mean_speeds, turning_angles, turning_directions
 from jaxvib.motion.analysis.points import has_vibration, vibration_of, vibration_share
 from jaxvib.motion.analysis.regime import REGIMES

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import Module
 from jaxvib.display import ELECTRICAL, shown_unit
 from jaxvib.errors import InputError, counted, quoted
 from jaxvib.runtime.startup import start
@@ -139,7 +140,7 @@ def _read(spec: NumberSpec, value: Any, field: str, length: int | None) -> Array
     return jnp.stack([number(value[k], unit, f"{field}[{k}]", **bounds) for k, unit in units])
 
 
-class Part(eqx.Module):
+class Part(Module):
     """Base of the parts of a scene: its text representation shows values with their units.
 
     >>> import jaxvib as jv

@@ -18,11 +18,11 @@ import numpy as np
 from jax import Array
 
 from jaxvib.display import ELECTRICAL
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, quoted, suggest_name
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import Effect
-from jaxvib.machine.files import EFFECTS, suggest_name
+from jaxvib.machine.files import EFFECTS
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import PLAIN, NumberSpec, number_specs
 from jaxvib.machine.scene import Exciter, Scene

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import is_real
+from jaxvib.boundary import is_real, with_known_names
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine, Mount, Place, read_number_of_place
 from jaxvib.machine.numbers import unit
@@ -94,6 +94,7 @@ class MatrixMachine(Machine):
         return self.places_rows[read_number_of_place(place, f"give the number of a place, 1 to {last}", last, name) - 1]
 
 
+@with_known_names
 def from_matrices(
     mass: Any,
     damping: Any,

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import with_known_names
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import BodyPoint, Carrier, Machine, Mount, Place
 from jaxvib.machine.numbers import Part, read_numbers, unit
@@ -39,6 +40,7 @@ class PlaneSupport(Part):
     to: int | None = eqx.field(static=True)
 
 
+@with_known_names
 def support(
     *,
     at: Sequence[Number],
@@ -97,6 +99,7 @@ class Body(Part):
     inertia: Array = eqx.field(metadata=unit("kg m^2", low=0.0, open_low=True, words="moment of inertia of the body"))
 
 
+@with_known_names
 def body(*, mass: Number, inertia: Number) -> Body:
     """Return a rigid body of a `plane_network`.
 
@@ -270,6 +273,7 @@ class PlaneNetwork(_Bodies):
         return [(each.mass, each.inertia) for each in self.bodies]
 
 
+@with_known_names
 def plane_body(*, mass: Number, inertia: Number, supports: Sequence[PlaneSupport]) -> PlaneBody:
     """Return a rigid body that moves in its plane.
 
@@ -302,6 +306,7 @@ def plane_body(*, mass: Number, inertia: Number, supports: Sequence[PlaneSupport
     return PlaneBody(**found, supports=read, kind="plane_body")
 
 
+@with_known_names
 def plane_network(bodies: Sequence[Body], supports: Sequence[PlaneSupport]) -> PlaneNetwork:
     """Return rigid bodies that move in a plane, joined to each other and to the foundation by springs.
 

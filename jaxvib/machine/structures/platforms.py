@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import with_known_names
 from jaxvib.errors import InputError, counted, quoted
 from jaxvib.machine.carrier import Carrier, Machine, Mount, Place, read_number_of_place
 from jaxvib.machine.numbers import read_numbers, unit
@@ -138,6 +139,7 @@ def _links(links: Sequence[Sequence[int]], n: int) -> tuple[tuple[int, int], ...
     return tuple(joined)
 
 
+@with_known_names
 def one_mass(*, mass: Number, stiffness: Number, damping: Number) -> Platforms:
     """Return one platform on a support, with the exciter.
 
@@ -163,6 +165,7 @@ def one_mass(*, mass: Number, stiffness: Number, damping: Number) -> Platforms:
     return _platforms("one_mass", 1, mass, stiffness, damping, (), (), (), 1)
 
 
+@with_known_names
 def two_mass(
     *,
     mass: Sequence[Number],
@@ -202,6 +205,7 @@ def two_mass(
     return _platforms("two_mass", 2, mass, stiffness, damping, ((1, 2),), link_stiffness, link_damping, exciter)
 
 
+@with_known_names
 def three_mass(
     *,
     mass: Sequence[Number],
@@ -237,6 +241,7 @@ def three_mass(
     return _platforms("three_mass", 3, mass, stiffness, damping, links, link_stiffness, link_damping, exciter)
 
 
+@with_known_names
 def network(
     *,
     mass: Sequence[Number],

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import with_known_names
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine, Mount, Place
 from jaxvib.machine.numbers import read_numbers, unit
@@ -162,6 +163,7 @@ class Rotor(Machine):
         return list(zip(position.tolist(), stiffness, damping, strict=True))
 
 
+@with_known_names
 def rotor(
     *,
     mass: Number,
@@ -349,6 +351,7 @@ class PlanarRotor(Machine):
         return Mount(rows=(jnp.eye(2, dtype=self.mass.dtype),), axes=(0, 1))
 
 
+@with_known_names
 def planar_rotor(
     *, mass: Number, stiffness: Number, damping: Number, stiffness_up: Number | None = None, damping_up: Number | None = None
 ) -> PlanarRotor:
