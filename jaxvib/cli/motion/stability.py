@@ -58,7 +58,7 @@ def stability_map(
     rows = [
         {
             "value": float(value),
-            "stable_share": float(result.stable[k].mean()),
+            "stable_share": float(result.stable_share[k]),
             "special": [fields_of(p, "kind", "omega", "rotor_speed") for p in result.special[k]],
         }
         for k, value in enumerate(result.value)

@@ -182,7 +182,8 @@ class BalancedStates(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the arrangements in the rotor's frame, each on a circle; for loads in two planes on a circle for each plane.
+        """Plot the `distinct` arrangements in the rotor's frame, each on a circle; for loads in two planes on a circle for each
+        plane.
 
         Arrows show the unbalance of the loads and the imbalance of the rotor in the plane, relative to the unbalance of all
         loads there at one angle. **Arguments**: `ax`: one axes object for each circle, plane by plane.
@@ -190,15 +191,16 @@ class BalancedStates(Result):
         from jaxvib.draw.results import draw_circle  # slow imports
         from jaxvib.draw.style import panels
 
-        sides, planes, count = _sides(turning_loads(self.scene)), _planes(self.scene), len(self.angles)
-        figure, axes = panels(len(planes), max(count, 1), size=(3.2, 3.2), ax=ax)
+        sides, planes, distinct = _sides(turning_loads(self.scene)), _planes(self.scene), self.distinct
+        figure, axes = panels(len(planes), max(len(distinct), 1), size=(3.2, 3.2), ax=ax)
         for axis in axes:
             axis.set_axis_off()
-        for (p, plane), k in itertools.product(enumerate(planes), range(count)):
+        for axis, ((p, plane), images) in zip(axes, itertools.product(enumerate(planes), distinct), strict=False):
+            k = images[0]
             own = sides[plane.loads]
             shown = {"weights": own / np.sum(own), "imbalance": plane.imbalance / np.sum(own), "numbers": plane.loads}
-            title = f"arrangement {k + 1}" + (f", plane {p + 1}" if len(planes) > 1 else "")
-            draw_circle(axes[p * count + k], title, self.angles[k, plane.loads], **shown)
+            title = f"arrangement {k + 1}{images_text(images)}" + (f", plane {p + 1}" if len(planes) > 1 else "")
+            draw_circle(axis, title, self.angles[k, plane.loads], **shown)
         return figure if ax is None else ax
 
 

@@ -20,6 +20,9 @@ from jaxvib.steady.jams.branch_plot import MARKS
 from jaxvib.steady.orbits.diagram import ExactBranches, SpecialPoint, exact_branches
 from jaxvib.units import number
 
+_MIN_POINTS = 10
+"""Smallest number of load speeds of a diagram. Between the speeds of fewer ones, several special points are overlooked."""
+
 
 class StabilityMap(Result):
     """Exact jams over a design parameter x.
@@ -39,12 +42,19 @@ class StabilityMap(Result):
     stable: np.ndarray = eqx.field(metadata=in_unit("", "value", "point"))
     special: tuple[tuple[SpecialPoint, ...], ...]
 
+    @property
+    def stable_share(self) -> np.ndarray:
+        """Share of the range of load speeds in which the jams are stable, (n,)."""
+        widths = np.diff(self.omega, axis=1)
+        stable = (self.stable[:, 1:].astype(float) + self.stable[:, :-1]) / 2.0
+        return np.sum(stable * widths, axis=1) / np.sum(widths, axis=1)
+
     def summary(self) -> str:
         """Return a line of text for each value: the stable share of the range, and the special points."""
         lines = []
-        for x, stable, points in zip(self.value, self.stable, self.special, strict=True):
+        for x, share, points in zip(self.value, self.stable_share, self.special, strict=True):
             kinds = ", ".join(f"{point.kind.replace('_', ' ')} at {speed_text(point.omega, 6)}" for point in points)
-            lines.append(f"{x:.6g}: {100.0 * np.mean(stable):.1f} % of the load speeds stable; {kinds or 'no special point'}")
+            lines.append(f"{x:.6g}: {100.0 * share:.1f} % of the load speeds stable; {kinds or 'no special point'}")
         return "\n".join(lines)
 
     def plot(self, *, label: str = "x", unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
@@ -73,10 +83,11 @@ def stability_map(
     - `make`: a function that returns the scene for a value of x
     - `values` of x, ascending; typical: 5 to 20
     - `omega`: the lowest and the highest load speed, rad/s; typical: a range about one resonance
-    - `points`: number of load speeds in each diagram; typical: 60 to 300 (the default). The computing time is proportional to
-      this number
+    - `points`: number of load speeds in each diagram, at least 10; typical: 60 to 300 (the default). The computing time is
+      proportional to this number
 
-    **Returns** `StabilityMap`. **Raises** `InputError` for an empty list of values, and for values that do not ascend.
+    **Returns** `StabilityMap`. **Raises** `InputError` for an empty list of values, for values that do not ascend, and for too
+    few points.
 
     >>> import jaxvib as jv
     >>> def machine(eps):
@@ -91,6 +102,7 @@ def stability_map(
     x = np.asarray(values, dtype=float)
     if x.ndim != 1 or x.size == 0 or not np.all(np.diff(x) > 0.0):
         raise InputError("values", f"are {quoted(values)}; give numbers in ascending order")
+    _require_points(points)
     scenes = [make_scene(make, float(v)) for v in x]
 
     def diagram(k: int) -> ExactBranches:
@@ -104,6 +116,13 @@ def stability_map(
         np.stack([np.asarray(d.stable) for d in diagrams]),
         tuple(d.special for d in diagrams),
     )
+
+
+def _require_points(points: int) -> None:
+    """**Raises** `InputError` for too few load speeds of a diagram."""
+    if points < _MIN_POINTS:
+        problem = f"is {points}; with so few load speeds, stability changes between them are overlooked"
+        raise InputError("points", f"{problem}; give at least {_MIN_POINTS}")
 
 
 @validated
@@ -129,8 +148,8 @@ def stability_onset(
     - `kind` of the special point, see `SpecialPoint`
     - `between`: two positive values of x; at the lower value the diagram has no such point, at the higher value it has one
     - `omega`: the lowest and the highest load speed of the search, rad/s
-    - `points`: number of load speeds in each diagram; typical: 60 to 300 (the default). The computing time is proportional to
-      this number
+    - `points`: number of load speeds in each diagram, at least 10; typical: 60 to 300 (the default). The computing time is
+      proportional to this number
     - `accuracy` of x, relative; at least 1e-12; typical: 0.1 to 1e-3 (the default). Each diagram halves the range
 
     **Returns** x, which is too large by at most `accuracy` (relative). **Raises** `InputError` for an unknown kind, if the
@@ -151,6 +170,7 @@ def stability_onset(
         return any(point.kind == kind for point in diagram.special)
 
     number(accuracy, "", "accuracy", low=1e-12)
+    _require_points(points)
     if kind not in MARKS:
         raise InputError("kind", f"is {quoted(kind)}; it must be one of {', '.join(MARKS)}")
     low, high = between

@@ -34,13 +34,11 @@ def test_forces_and_moments_cancel_in_all_arrangements():
     assert states.angles.shape == (4, 4) and states.dimension == 0 and states.names == ()
     pairs = {tuple(np.round(np.sort(row[:2]), 9)) + tuple(np.round(np.sort(row[2:]), 9)) for row in states.angles}
     axes = states.plot().axes
-    assert [axis.get_title().split("\n")[0] for axis in axes] == [
-        f"arrangement {k}, plane {p}" for p in (1, 2) for k in (1, 2, 3, 4)
-    ]
+    assert [axis.get_title().split("\n")[0] for axis in axes] == [f"arrangement 1 (4 mirror images), plane {p}" for p in (1, 2)]
     numbers = [
         sorted(text.get_text() for text in axis.texts if "°" not in text.get_text() and text.get_text()) for axis in axes
     ]
-    assert numbers == 4 * [["3", "4"]] + 4 * [["1", "2"]] and all(axis.get_title().endswith("sum 0") for axis in axes)
+    assert numbers == [["3", "4"], ["1", "2"]] and all(axis.get_title().endswith("sum 0") for axis in axes)
     assert len(pairs) == 1  # equal loads: the arrangements differ by exchanges
 
 

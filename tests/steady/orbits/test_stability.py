@@ -119,6 +119,11 @@ def test_figure_of_stability_over_the_load_mass():
     assert found.plot(label="eps").axes[0].get_ylabel() == "eps"
     with pytest.raises(jv.InputError, match="ascending"):
         jv.stability_map(lambda x: published(eps=x).scene(), [0.05, 0.02], omega=(0.36, 0.5))
+    with pytest.raises(jv.InputError, match=r"^points is 2; with so few load speeds, .*; give at least 10$"):
+        jv.stability_map(lambda x: published(eps=x).scene(), [0.02, 0.05], omega=(0.36, 0.5), points=2)
+    # Jams are stable above the fold, or above the torus bifurcation.
+    begins = np.array([max(point.omega for point in points) for points in found.special])
+    np.testing.assert_allclose(found.stable_share, (0.5 - begins) / 0.14, atol=0.01)
 
 
 def test_bands_of_the_stability_map_are_its_rows():
@@ -133,7 +138,7 @@ def test_bands_of_the_stability_map_are_its_rows():
     axes = found.plot(unit="rad/s").axes[0]
     boxes = [band.get_paths()[0].get_extents() for band in axes.collections]
     edge = np.sqrt(0.1)
-    np.testing.assert_allclose([[b.x0, b.x1, b.y0, b.y1] for b in boxes], [[3, 5, edge / 10, edge], [4, 5, edge, edge * 10]])
+    np.testing.assert_allclose([[b.x0, b.x1, b.y0, b.y1] for b in boxes], [[3, 5, 0.1, edge], [4, 5, edge, 1]])
     axes.figure.canvas.draw()
     legend, whole = axes.get_legend().get_window_extent(), axes.figure.bbox
     assert whole.x0 <= legend.x0 and legend.x1 <= whole.x1 and axes.get_window_extent().width > 0.7 * whole.width
