@@ -81,13 +81,20 @@ class Column(NamedTuple):
     """Column of a catalogue of rows, other than the first column.
 
     `source` is the parameter of the first column, with the values `at`; `target` is the parameter of this column, with `values`
-    (SI). Between rows, `target` is interpolated linearly.
+    (SI). Between rows, `target` is interpolated linearly; the first and the last line continue beyond them, so that the
+    sensitivities of a design at the end of a catalogue are those of a whole row.
     """
 
     target: NamedNumber
     source: NamedNumber
     at: tuple[float, ...]
     values: tuple[float, ...]
+
+    def value(self, x: Array) -> Array:
+        """Return the value of `target` if that of `source` is `x`."""
+        at, values = jnp.asarray(self.at), jnp.asarray(self.values)
+        k = jnp.clip(jnp.searchsorted(at, x) - 1, 0, len(self.at) - 2)
+        return values[k] + (values[k + 1] - values[k]) / (at[k + 1] - at[k]) * (x - at[k])
 
 
 class Choice(NamedTuple):
@@ -247,8 +254,7 @@ class DesignSpace(Readable):
         self._require_size(values, "values", single=True)
         scene = put_numbers(self.scene, self.free, jnp.asarray(values))
         for each in self.columns:
-            row = jnp.interp(each.source.read(scene), jnp.asarray(each.at), jnp.asarray(each.values))
-            scene = put_numbers(scene, (each.target,), row)
+            scene = put_numbers(scene, (each.target,), each.value(each.source.read(scene)))
         for tie in self.ties:
             scene = put_numbers(scene, (tie.target,), jnp.asarray(tie.factor) * tie.source.read(scene))
         return scene
@@ -277,6 +283,12 @@ class DesignSpace(Readable):
     def words(self) -> list[tuple[str, str]]:
         """Return the name for tables and the unit for `jaxvib.display.shown_unit` of each free parameter."""
         return [(word, each.unit_of_tables) for each in self.free for word in each.words(self.scene)]
+
+    def words_of_changes(self) -> list[tuple[str, str]]:
+        """Return `words`; names of first columns of catalogues state that the other columns change too."""
+        rows = [column.source.entries for column in self.columns]
+        ends = [" (with its row)" if each.entries in rows else "" for each in self.free for _ in each.words(self.scene)]
+        return [(word + end, unit) for (word, unit), end in zip(self.words(), ends, strict=True)]
 
     @validated
     def within(self, low: np.ndarray, high: np.ndarray) -> DesignSpace:

@@ -67,7 +67,7 @@ def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult,
     with np.errstate(divide="ignore", invalid="ignore"):
         slopes = np.where(space.logs, numbers * np.log(high / low), high - low)
         position = np.where(space.logs, np.log(numbers / low) / np.log(high / low), (numbers - low) / (high - low))
-    for k, (word, unit) in enumerate(problem.space.words()):
+    for k, (word, unit) in enumerate(problem.space.words_of_changes()):
         dual = duals.bounds[best, k]
         upper = position[k] > 0.5
         is_active = min(position[k], 1.0 - position[k]) <= _EDGE and dual != 0.0
@@ -98,7 +98,9 @@ def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]
     if not values[0]:
         return ()
     change = 100.0 * (values[1:] - values[0]) / abs(values[0])
-    return tuple(Influence(word, float(change[k]), float(change[d + k])) for k, (word, _) in enumerate(problem.space.words()))
+    return tuple(
+        Influence(word, float(change[k]), float(change[d + k])) for k, (word, _) in enumerate(problem.space.words_of_changes())
+    )
 
 
 def unresolved_of(quantities: Sequence[Quantity], values: np.ndarray) -> tuple[Unresolved, ...]:

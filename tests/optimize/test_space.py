@@ -59,6 +59,14 @@ def test_columns_are_interpolated_between_rows():
         np.testing.assert_allclose(space.scene_of(jnp.array([stiffness])).machine.damping[0], damping, rtol=1e-12)
 
 
+def test_the_ends_of_a_catalogue_have_sensitivities_of_rows():
+    rows = {"machine.stiffness[0]": [1e4, 2e4, 4e4], "machine.damping[0]": [30.0, 90.0, 50.0]}
+    space = DesignSpace(SCENE, {"loads.drag": (1.0, 2.0)}, choices={"spring": rows})
+    for stiffness, damping in ((0.99e4, 29.4), (4.04e4, 49.2)):
+        np.testing.assert_allclose(space.scene_of(jnp.array([1.0, stiffness])).machine.damping[0], damping, rtol=1e-12)
+    assert [word.endswith(" (with its row)") for word, _ in space.words_of_changes()] == [False, True]
+
+
 def test_ties_follow_in_order():
     ties = {"machine.stiffness[1]": ("machine.stiffness[0]", 2.0), "machine.link_stiffness": ("machine.stiffness[1]", "keep")}
     space = DesignSpace(THREE, {"machine.stiffness[0]": (1e4, 9e4)}, ties=ties)
