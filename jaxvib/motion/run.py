@@ -46,6 +46,7 @@ from jaxvib.motion.analysis.regime import STILL_SHARE, Regime, regime
 from jaxvib.motion.analysis.separation import has_collision, has_overlap, would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
 from jaxvib.motion.analysis.stays import Stay, find_stays
+from jaxvib.motion.analysis.unsettled import balanced_text, coasting_text, last_turn_text
 from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -228,10 +229,12 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         rotors = [w[-1] for w in self.window.rotor_speeds]
         stuck = [] if np.max(np.abs(rotors)) > 1.0 else start_notes(self.scene)
         if not stuck and float(jnp.abs(self.omega)) < STILL_SHARE * float(self.scene.top_speed):
-            stuck = [f"the {turning_masses(self.scene)} are almost at rest"]
+            angles = turning_angles(self.scene, lambda: self._stored.time, self._stored.state)[0]
+            last_turn = last_turn_text(self.scene, np.asarray(self._stored.time), np.asarray(angles))
+            stuck = [f"the {turning_masses(self.scene)} are almost at rest{last_turn}"]
         if (creep := creep_text(self.scene, self.window)) and not stuck:
             stuck = ["the loads creep, see below"]
-        state = "settled" if bool(self.settled) else f"not settled: {stuck[0] if stuck else self._unsettled_text()}"
+        state = "settled" if bool(self.settled) else f"not settled: {stuck[0]}" if stuck else self._unsettled_text()
         state = "steady in the mean" if bool(self.status == RunStatus.beating) else state
         state = "balanced" if bool(self.status == RunStatus.creeping) else state
         unstable, first = bool(self.status == RunStatus.would_separate), []
@@ -266,11 +269,17 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         )
 
     def _unsettled_text(self) -> str:
+        if self.scene.is_plain and (balanced := balanced_text(self.regime, self.window)):
+            return balanced
+        time = self.window.time
+        _, speeds = turning_angles(self.scene, lambda: time, self.window.state)
+        if coasting := coasting_text(self.scene, np.asarray(time), np.asarray(speeds)):
+            return f"not settled: {coasting}"
         period = beat_period(self.scene, self._stored)
         if period is None:
-            return "run longer"
+            return "not settled: run longer"
         reason = "the loads turn slower than the imbalance of the rotor"
-        return f"the vibration beats with a period of {period:.4g} s and will not settle, because {reason}"
+        return f"not settled: the vibration beats with a period of {period:.4g} s and will not settle, because {reason}"
 
     def _window_text(self) -> str:
         start, end = (f"{float(self.window.time[k]):.4g}" for k in (0, -1))

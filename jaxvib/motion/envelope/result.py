@@ -23,6 +23,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, duration_text, only_exciter_value
 from jaxvib.motion.analysis.points import absent_vibration, measures_text, require_vibration
 from jaxvib.motion.analysis.stays import Stay, find_stays
+from jaxvib.motion.analysis.unsettled import coasting_text
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.readable import Readable
@@ -192,7 +193,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         moves = bool(np.all(np.isfinite(self.amplitude)))
         measured = measures_text(self.scene, self.no_vibration, self.vibration, measures) if moves else []
         named, first = status_name(self.status), []
-        end, state = self.message, "settled" if bool(self.settled) else "not settled: run longer"
+        end, state = self.message, "settled" if bool(self.settled) else f"not settled: {self._unsettled_text()}"
         if named in ("would_separate", "unstable"):
             first, end = [f"not settled: {self.message}"], EnvelopeStatus[EnvelopeStatus.done]
             state = f"periodic only {'while the loads are at one angle' if named == 'would_separate' else 'until disturbed'}"
@@ -209,6 +210,11 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
                 f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
             ]
         )
+
+    def _unsettled_text(self) -> str:
+        if not np.all(np.isfinite(np.asarray(self.window.load_speed))):
+            return "run longer"
+        return coasting_text(self.scene, np.asarray(self.window.time), np.asarray(self.window.load_speed)) or "run longer"
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:

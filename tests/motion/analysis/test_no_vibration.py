@@ -8,16 +8,17 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.cli.app import run as run_command
-from jaxvib.machine.files import SCREENS
+from jaxvib.machine.files import SCREENS, TEMPLATES
 from jaxvib.motion.analysis.measure import Measured, Trajectory
 from jaxvib.motion.analysis.points import measures_text, vibration_of
 
 AT = (1.5, 0.1)
 
 
-def coasting(at="2 s", bearing=0.3):
+def coasting(at="2 s", bearing=0.3, *, on=()):
     screen = jv.scene_from_toml(SCREENS["linear_screen"])
-    exciters = [each.with_parts(None, jv.SwitchedOff(each.drive, at, bearing), each.effects) for each in screen.exciters]
+    off = [each.with_parts(None, jv.SwitchedOff(each.drive, at, bearing), each.effects) for each in screen.exciters]
+    exciters = [screen.exciters[k] if k in on else each for k, each in enumerate(off)]
     return jv.Scene(screen.machine, exciters=exciters, effects=screen.effects)
 
 
@@ -42,6 +43,49 @@ def test_a_screen_that_coasts_down_has_no_measures(stopped):
     assert "not settled: the exciters are almost at rest" in text and "largest on the way, zero to peak: x" in text
     with pytest.raises(jv.InputError, match="run has no vibration to measure: the exciters make"):
         stopped.vibration()
+
+
+def test_a_stopped_screen_states_the_end_of_its_last_turn(stopped):
+    text = stopped.summary()
+    ends = []
+    for angle in stopped.trajectory.rotor_angles:
+        ends.append(stopped.trajectory.time[np.flatnonzero(np.abs(angle - angle[-1]) > np.pi)[-1]])
+    assert f"are almost at rest, and their last full turn ended at {float(max(ends)):.4g} s (drift" in text
+    assert 3.0 < max(ends) < 8.0
+
+
+def test_summaries_state_that_exciters_coast_down():
+    run, averaged = jv.simulate(coasting(), "5 s"), jv.envelope(coasting(), "5 s", throw=False)
+    speeds = np.mean([np.abs(each) for each in run.window.rotor_speeds], axis=0)
+    first, second = (30.0 / np.pi * float(np.mean(half)) for half in np.split(speeds, 2))
+    said = (
+        f"coasting down, mean speed {first:.4g} rpm in the first and {second:.4g} rpm in the second half of the window (drift"
+    )
+    assert second < 0.6 * first and f"not settled: {said}" in run.summary()
+    assert "not settled: coasting down, mean speed 5" in averaged.summary()
+    assert "coasting" not in jv.simulate(coasting(at="6 s"), "5 s").summary()
+    assert "not settled: exciter 1 coasts down, mean speed" in jv.simulate(coasting(on=[1]), "5 s").summary()
+
+
+@pytest.mark.parametrize(("until", "says"), [(18.0, False), (21.0, True), (23.0, True)])
+def test_loads_of_a_drive_that_stops_coast_down(until, says):
+    profile = jv.SpeedProfile([0, 10, 20, 22], ["0 rpm", "600 rpm", "600 rpm", "0 rpm"])
+    machine = jv.one_mass(mass=120.0, stiffness="50 N/mm", damping=40.0)
+    scene = jv.Scene(machine, jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), profile)
+    text = jv.simulate(scene, until, estimate=False).summary()
+    assert ("coasting down" in text) == says == ("run longer" not in text)
+
+
+def test_a_balanced_motion_that_decays_needs_no_longer_run():
+    scene = jv.scene_from_toml(TEMPLATES["one_mass"])
+    run = jv.simulate(scene, 30.0, estimate=False)
+    first = run.summary().splitlines()[0]
+    unbalance = abs(np.mean(np.exp(1j * np.asarray(run.window.state.azimuth)), axis=1))
+    assert not run.settled and "not settled" not in first and "run longer" not in first
+    left = f"{100.0 * float(run.regime.unbalance):.2g} %"
+    assert f"balanced within {left} of the loads' unbalance; the remaining vibration decays (drift" in first
+    assert np.max(unbalance) < 1e-3
+    assert "run longer" in jv.simulate(scene, 2.0, estimate=False).summary()
 
 
 def test_a_rotor_that_slows_down_has_no_measures():
