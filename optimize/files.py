@@ -207,6 +207,9 @@ def quantity_from_table(
             values[key] = tuple(tuple(v) if isinstance(v, list) else v for v in values[key])
     if "mode" in values:
         count(values["mode"], f"{section}.mode")
+    elif (response := f"response_{name}") in _QUANTITIES:
+        problem = f"is missing; give the number of a jam mode of the loads; for motors with unbalances use {quoted(response)}"
+        raise InputError(f"{section}.mode", problem)
     quantity = build_part(_QUANTITIES[name], values, section)
     for key in ("statistic", "samples"):
         if key in table and "tolerances" not in table:

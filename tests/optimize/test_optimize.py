@@ -317,6 +317,10 @@ def test_worst_machine_of_a_maximum_has_the_least_value(tmp_path):
         (('scene = "machine.toml"', 'scene = "no.toml"'), "cannot be read"),
         (('"force_per_amplitude"', '"force"'), "objective.quantity is 'force'"),
         (('quantity = "force_per_amplitude"', "x = 1"), "objective.quantity is missing"),
+        (
+            ("[objective]", '[[demand]]\nquantity = "stroke"\nat_least = "3 mm"\n[objective]'),
+            "demand[0].mode is missing; give the number of a jam mode of the loads; for motors with unbalances use",
+        ),
         (("of = [1, 2]", "off = [1, 2]"), "did you mean 'of'"),
         (('value = "570 rpm"', 'value = "570 kg"'), "is not in rad/s"),
         (("mode = 3", 'mode = "three"'), "mode is 'three'"),
