@@ -215,9 +215,9 @@ def _stiffness_under(deflection: str, load: str, value: str, field: str) -> floa
 
 
 def _in_unit(text: str, unit: str) -> float | None:
-    """Return a text with a unit as a number in `unit`; None for a plain number and for another dimension."""
+    """Return a text as a number in `unit`; None for another dimension."""
     try:
-        return None if _NUMBER_WITH_UNIT.fullmatch(text.strip()) is None else float(to_float(text, unit, ""))
+        return float(to_float(text, unit, ""))
     except InputError:
         return None
 

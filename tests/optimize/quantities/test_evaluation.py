@@ -129,6 +129,7 @@ def test_amplitudes_and_forces_of_each_tier():
     for of, values in ((1, (3.0, 30.0, 300.0)), (2, (5.0, 50.0, 500.0))):
         for tier, value in zip(("leading", "exact", "time"), values, strict=True):
             assert float(amplitude(mode=3, of=of, tier=tier).read(known)) == value
+    assert float(amplitude(mode=3, of=(1, 2)).read(known)) == 5.0
     assert float(amplitude(mode=3).read(known)) == 5.0 and float(amplitude(mode=3, of=(2, 1), tier="exact").read(known)) == 21.0
     for tier, value in (("leading", 7.0), ("exact", 70.0), ("time", 700.0)):
         assert float(foundation_force(mode=3, tier=tier).read(known)) == value
