@@ -62,7 +62,8 @@ def drag_of(
     **Arguments** (SI, or strings with a unit)
 
     - `cause`: "oil" for a ball in an oil bath, "rolling" for a roller or a ball on a dry track, "bearing" for a pendulum
-    - `radius` R of the circle of the loads' centres, m; typical: 0.05 to 0.3
+    - `radius` R of the circle of the loads' centres, m; typical: 0.05 to 0.3. It must be that of the loads that get this drag;
+      only scene files check this, because the drag is a plain number
     - `load_speed` Omega, less than `rotor_speed` n, rad/s; typical: "800 rpm" and "1500 rpm"
     - `ball_radius` r of a ball or roller, m; typical: 0.01 to 0.03
     - `viscosity` eta of the oil at its working temperature, Pa s; typical: 0.05 to 0.5. Data sheets of oils state the

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import re
 import tomllib
 from collections.abc import Callable, Collection, Mapping
@@ -32,6 +33,7 @@ from jaxvib.machine.templates import SCREENS as SCREENS
 from jaxvib.machine.templates import TEMPLATES as TEMPLATES
 from jaxvib.machine.templates import Templates as Templates
 from jaxvib.machine.torus import torus_balls
+from jaxvib.units import number
 from jaxvib.units.known import require_known, when_known
 from jaxvib.units.tables import csv_column, row_names
 
@@ -370,7 +372,9 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
     entries = {name: _build_entries(_ENTRIES[name], values[name], prefix + name) for name in _ENTRIES if name in values}
     if isinstance(drag := values.get("drag"), Mapping):
         with within(f"{prefix}drag."):
-            entries["drag"] = build_part(drag_of, drag, "")
+            _require_equal_lengths(drag, values, prefix)
+            size = {name: values[name] for name in ("radius",) if name in values}
+            entries["drag"] = build_part(drag_of, {**size, **drag}, "")
     if build in (balls, torus_balls) and isinstance(mass := values.get("mass"), Mapping):
         with within(f"{prefix}mass."):
             size = {name: values[name] for name in ("ball_radius",) if name in values}
@@ -379,6 +383,15 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
         if isinstance(values.get(name), Mapping):
             entries[name] = build_kind(values[name], prefix + name, DRIVES)
     return build(**{**values, **entries})
+
+
+def _require_equal_lengths(drag: Mapping[str, object], loads: Mapping[str, object], prefix: str) -> None:
+    """**Raises** `InputError` for radii in the table of a drag that are not those in the table of the loads."""
+    for name in ("radius", "ball_radius"):
+        if name in drag and name in loads:
+            own, other = (float(number(each[name], "m", name)) for each in (drag, loads))
+            if not math.isclose(own, other, rel_tol=1e-6):
+                raise InputError(name, f"is {own:g} m, but {prefix}{name} is {other:g} m; give the same value in both")
 
 
 def _build_entries(build: Callable[..., object], tables: object, section: str) -> object:

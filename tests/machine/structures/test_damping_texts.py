@@ -134,3 +134,19 @@ def test_gradients_pass_through_a_ratio():
         return jv.one_mass(mass=250.0, stiffness=k, damping="5 %").damping[0]
 
     np.testing.assert_allclose(jax.grad(constant)(jnp.asarray(2e5)), 0.05 * np.sqrt(250.0 / 2e5), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["radius", "ball_radius"])
+def test_radii_of_a_drag_and_of_its_loads_are_equal(name):
+    head, tail = FILE.split("[drive]")
+    old = {"radius": '\nradius = "120 mm"', "ball_radius": 'ball_radius = "20 mm"'}[name]
+    place = head.rindex(old)
+    other = head[:place] + old.replace("20 mm", "25 mm") + head[place + len(old) :]
+    with pytest.raises(jv.InputError, match=rf"^loads\.drag\.{name} is 0\.\d+ m, but loads\.{name} is 0\.\d+ m; give the same"):
+        jv.scene_from_toml(f"{other}[drive]{tail}")
+
+
+def test_the_radius_of_a_drag_is_that_of_its_loads():
+    without = FILE.replace('cause = "oil"\nradius = "120 mm"', 'cause = "oil"')
+    assert without != FILE
+    np.testing.assert_array_equal(jv.scene_from_toml(without).loads.drag, jv.scene_from_toml(FILE).loads.drag)
