@@ -12,14 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers, put_present, read_value
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import greatest
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, mapped
-from optimize.quantities.quantity import Quantity
+from optimize.quantities.quantity import Quantity, quantity_function
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ class Sampled:
         return jax.vmap(scene_with)(*(f for _, f in factors))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class _DerivedQuantity(Quantity):
     """Quantity that is computed from another quantity."""
 
@@ -98,7 +97,7 @@ class _DerivedQuantity(Quantity):
         return self.name
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Under(_DerivedQuantity):
     """Quantity of the scene in another load case."""
 
@@ -118,7 +117,7 @@ class Under(_DerivedQuantity):
         return value
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Robust(_DerivedQuantity):
     """Statistic of a quantity over tolerances."""
 
@@ -166,7 +165,7 @@ class Robust(_DerivedQuantity):
         return self.parts[0].simplified
 
 
-@validated
+@quantity_function
 def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quantity:
     """Return a quantity of the same machine in another load case, in which some parameters, such as the rotor speed, differ.
 
@@ -218,7 +217,7 @@ def _robust(
     )
 
 
-@validated
+@quantity_function
 def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0) -> Quantity:
     """Return the mean of a quantity over machines whose parameters deviate from the design.
 
@@ -240,7 +239,7 @@ def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: in
     return _robust(quantity, tolerances, samples, seed, "expected", 0.0)
 
 
-@validated
+@quantity_function
 def worst(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0) -> Quantity:
     """Return the largest value of a quantity over machines whose parameters deviate from the design, see `expected`.
 
@@ -257,7 +256,7 @@ def worst(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int =
     return _robust(quantity, tolerances, samples, seed, "worst", 0.0)
 
 
-@validated
+@quantity_function
 def quantile(
     quantity: Quantity, level: float, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0
 ) -> Quantity:

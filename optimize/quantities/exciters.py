@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.boundary import validated
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.equations.torque_balance import TorqueBalance, assemble_torque_balance, influence_of
 from jaxvib.errors import InputError, quoted
@@ -23,7 +22,7 @@ from jaxvib.steady.measures import conveying_speed_at
 from jaxvib.steady.points import Ellipse, at_positive_speed, read_slope
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation, require_foundation
-from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier, walk
+from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier, quantity_function, walk
 from optimize.quantities.user_inputs import Point, number_in, read_point
 
 __all__ = [
@@ -79,7 +78,7 @@ def _field_of_ellipse(evaluation: Evaluation, tier: Tier, at: Point, body: int, 
     return getattr(_ellipse(evaluation, tier, at, body, slope), name)
 
 
-@validated
+@quantity_function
 def throw_stroke(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
     """Return the stroke of a point, m peak to peak: the length of the long axis of its path, "double amplitude" in data sheets.
 
@@ -103,7 +102,7 @@ def _throw_stroke(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> A
     return 2.0 * _ellipse(evaluation, tier, at, body).semi_major
 
 
-@validated
+@quantity_function
 def throw_angle(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
     """Return the throw angle: direction of the long axis of a point's path, rad from x anticlockwise, -pi/2 to pi/2.
 
@@ -118,7 +117,7 @@ def throw_angle(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier 
     return _point_quantity("throw_angle", "rad", _field_of_ellipse, "throw angle", at, body, tier, "direction")
 
 
-@validated
+@quantity_function
 def throw_number(*, at: Sequence[Number] = (0.0, 0.0), slope: Number = 0.0, body: int = 0, tier: Tier = "leading") -> Quantity:
     """Return the throw number of a point of a deck, see `jaxvib.Ellipse`.
 
@@ -135,7 +134,7 @@ def throw_number(*, at: Sequence[Number] = (0.0, 0.0), slope: Number = 0.0, body
     return _point_quantity("throw_number", "", _field_of_ellipse, "throw number", at, body, tier, "throw_number", along)
 
 
-@validated
+@quantity_function
 def conveying_speed(
     *, at: Sequence[Number] = (0.0, 0.0), slope: Number = 0.0, body: int = 0, tier: Tier = "leading"
 ) -> Quantity:
@@ -163,7 +162,7 @@ def _conveying_speed(evaluation: Evaluation, tier: Tier, at: Point, body: int, s
     return conveying_speed_at(moved, speed, jnp.asarray(slope))
 
 
-@validated
+@quantity_function
 def roundness(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
     """Return the ratio of the semi-axes of the path of a point: 0 for a straight line, 1 for a circle.
 
@@ -184,7 +183,7 @@ def _roundness(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Arra
     return jnp.abs(path.semi_minor) / path.semi_major
 
 
-@validated
+@quantity_function
 def force_per_throw(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
     """Return the foundation force, N zero to peak, divided by the semi-major axis of the path of a point, N/m.
 
@@ -206,7 +205,7 @@ def _force_per_throw(evaluation: Evaluation, tier: Tier, at: Point, body: int) -
     return working_force(evaluation, tier) / _ellipse(evaluation, tier, at, body).semi_major
 
 
-@validated
+@quantity_function
 def motion_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier: Tier = "leading") -> Quantity:
     """Return the spread of the motions over a deck: root mean square over its points of |U_p - mean| / |mean|.
 
@@ -224,7 +223,7 @@ def motion_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier: Ti
     return _deck_quantity("motion_spread", "spread of the motions over the deck", points, body, tier)
 
 
-@validated
+@quantity_function
 def amplitude_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier: Tier = "leading") -> Quantity:
     """Return the range of the amplitudes of points of a deck divided by their mean; 0 if all are equal.
 
@@ -251,6 +250,7 @@ def _field_of_deck(evaluation: Evaluation, tier: Tier, points: tuple[Point, ...]
     return getattr(evaluation.working(tier).deck(points, body), name)
 
 
+@quantity_function
 def synchronization_margin() -> Quantity:
     """Return the factor by which all differences of the motors' torques can grow until the synchronous regime ends.
 
@@ -273,6 +273,7 @@ def _margin(evaluation: Evaluation, tier: Tier) -> Array:
     return jnp.where(is_large, _LARGEST_MARGIN, jnp.where(is_large, 1.0, margin))
 
 
+@quantity_function
 def resonance_distance() -> Quantity:
     """Return the distance of the speed of the working regime from the nearest natural frequency, relative to this speed.
 
@@ -294,6 +295,7 @@ def _distances(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
     return distances if sign < 0.0 else -jnp.max(distances)[None]
 
 
+@quantity_function
 def least_torque() -> Quantity:
     """Return the smallest factor of the torques of all motors with which the motors still pass the resonances of a run-up.
 

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import validated
 from jaxvib.equations.linear import peak_force
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
@@ -19,7 +18,7 @@ from jaxvib.steady.measures import shaft_torque
 from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation, require_foundation
 from optimize.quantities.exciters import RegimeQuantity, working_force, working_power
-from optimize.quantities.quantity import TIERS, BuiltinQuantity, Pair, Quantity, Tier
+from optimize.quantities.quantity import TIERS, BuiltinQuantity, Pair, Quantity, Tier, quantity_function
 
 __all__ = [
     "amplitude",
@@ -90,7 +89,7 @@ def pair_of(of: Pair | list[int]) -> Pair:
     return (of[0], of[1]) if isinstance(of, list) else of
 
 
-@validated
+@quantity_function
 def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
     """Return the amplitude in a jam mode, m zero to peak, of a platform or of one platform relative to another.
 
@@ -134,7 +133,7 @@ def jam_amplitude(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Ar
     return run.amplitude[chosen - 1] if isinstance(chosen, int) else relative_amplitude(run.window, *chosen)
 
 
-@validated
+@quantity_function
 def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") -> Quantity:
     """Return the phase difference of two platforms in a jam mode, rad, 0 to pi: 0 in phase, pi in antiphase.
 
@@ -171,7 +170,7 @@ def _phase(evaluation: Evaluation, tier: Tier, mode: int, of: tuple[int, int]) -
     return jnp.arctan2(jnp.abs(relative.imag), relative.real)
 
 
-@validated
+@quantity_function
 def foundation_force(*, mode: int | None = None, harmonic: int | None = None, tier: Tier = "leading") -> Quantity:
     """Return the force of all supports on the foundation, N zero to peak, in a jam mode or in the working regime.
 
@@ -219,7 +218,7 @@ def jam_force(evaluation: Evaluation, tier: Tier, mode: int, harmonic: int | Non
     return peak_force(orbit.force_harmonics[:, orbit.orders.index(harmonic)])
 
 
-@validated
+@quantity_function
 def force_per_amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
     """Return the foundation force per amplitude in a jam mode, N/m.
 
@@ -261,7 +260,7 @@ def _peaks_per_amplitude(evaluation: Evaluation, sign: float, tier: Tier, mode: 
     return _peaks(evaluation, sign, tier, mode, None) / jam_amplitude(evaluation, tier, mode, of)
 
 
-@validated
+@quantity_function
 def jam_frequency(*, mode: int, tier: Tier = "leading") -> Quantity:
     """Return the speed Omega at which the loads jam in a mode, rad/s.
 
@@ -283,7 +282,7 @@ def jam_speed(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     return evaluation.orbit(mode).omega if tier == "exact" else evaluation.jam_run(mode).omega
 
 
-@validated
+@quantity_function
 def fold_margin(*, mode: int) -> Quantity:
     """Return the smallest change of the rotor speed, up or down, at which a jam mode ends at a fold, rad/s (leading order).
 
@@ -314,7 +313,7 @@ def _margins(evaluation: Evaluation, sign: float, tier: Tier, mode: int) -> Arra
     return -both if sign < 0.0 else jnp.minimum(both[0], both[1])[None]
 
 
-@validated
+@quantity_function
 def largest_multiplier(*, mode: int) -> Quantity:
     """Return the largest modulus of the non-trivial Floquet multipliers of the exact motion; the motion is stable below 1.
 
@@ -333,7 +332,7 @@ def _multiplier(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     return evaluation.orbit(mode).multiplier
 
 
-@validated
+@quantity_function
 def power(*, mode: int | None = None, tier: Tier = "leading") -> Quantity:
     """Return the mean power, W, that loads take from the rotor in a jam mode, or of all drives in the working regime.
 

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers.named import spec_of
 from jaxvib.machine.scene import Scene
@@ -18,7 +17,7 @@ from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.steady.measures import require_platforms, static_deflections
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation
-from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier
+from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier, quantity_function
 from optimize.quantities.user_inputs import number_in
 
 __all__ = ["product", "spring_cost", "static_deflection", "support_frequency_squared", "total", "total_mass"]
@@ -28,6 +27,7 @@ def _make_quantity(name: str, unit: str, function: Callable[..., Array], text: s
     return BuiltinQuantity(name, unit, function, tiers=("leading",), text=text, settings=settings)
 
 
+@quantity_function
 def support_frequency_squared() -> Quantity:
     """Return the sum of the squared support frequencies, (rad/s)^2: sum_i k_i/M_i over the platforms.
 
@@ -71,7 +71,7 @@ def _leaf(scene: Scene, part: str, name: str) -> Array:
     return jnp.broadcast_to(leaf, (scene.loads.count,)) if part == "loads" and leaf.ndim == 0 else leaf
 
 
-@validated
+@quantity_function
 def total(field: str) -> Quantity:
     """Return the sum of an array of the scene, such as "machine.stiffness", in the unit of its entries.
 
@@ -93,7 +93,7 @@ def _total(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
     return jnp.sum(_leaf(evaluation.scene, part, name))
 
 
-@validated
+@quantity_function
 def product(field: str) -> Quantity:
     """Return the product of the entries of an array of the scene, such as "machine.stiffness", see `total`.
 
@@ -115,6 +115,7 @@ def _product(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
     return jnp.prod(_leaf(evaluation.scene, part, name))
 
 
+@quantity_function
 def total_mass() -> Quantity:
     """Return the mass of the platforms, the loads and the unbalances with an `unbalance_mass`, kg.
 
@@ -133,7 +134,7 @@ def _mass(evaluation: Evaluation, tier: Tier) -> Array:
     return jnp.trace(evaluation.model.mass)
 
 
-@validated
+@quantity_function
 def static_deflection(of: int | None = None) -> Quantity:
     """Return the static deflection of a platform, or of the centre of mass of a body in a plane, under the weight of the
     machine and its loads, m: K y = M g, g = 9.80665 m/s^2.
@@ -165,7 +166,7 @@ def _sag(evaluation: Evaluation, tier: Tier, of: int | None) -> Array:
     return jnp.max(sag) if of is None else sag[of - 1]
 
 
-@validated
+@quantity_function
 def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quantity:
     """Return the cost of the springs of supports and links, from a price list.
 

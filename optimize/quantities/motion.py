@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation, require_foundation
-from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier
+from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier, quantity_function
 from optimize.quantities.user_inputs import Point, number_in, read_point
 
 __all__ = ["peak_displacement", "peak_force", "settling_time"]
@@ -28,7 +27,7 @@ def _times(until: Number, spin_up: Number | None) -> tuple[float, float | None]:
     return end, up
 
 
-@validated
+@quantity_function
 def peak_force(*, until: Number, spin_up: Number | None = None) -> Quantity:
     """Return the largest foundation force, N, of a run from rest (full equations).
 
@@ -59,7 +58,7 @@ def _peak(evaluation: Evaluation, tier: Tier, until: float, spin_up: float | Non
     return evaluation.start_up(until, spin_up).largest_force
 
 
-@validated
+@quantity_function
 def peak_displacement(
     *, until: Number, at: int | Sequence[Number] | None = None, body: int = 0, spin_up: Number | None = None
 ) -> Quantity:
@@ -100,7 +99,7 @@ def _peak_displacement(
     return evaluation.start_up(until, spin_up).point(place, body, part="all").largest_displacement
 
 
-@validated
+@quantity_function
 def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: int = 1) -> Quantity:
     """Return the time, s, from the start at rest until the amplitude of a platform stays near its final value.
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias
+from functools import wraps
+from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import jax.numpy as jnp
 from jax import Array
@@ -30,13 +31,15 @@ Tier: TypeAlias = Literal["leading", "exact", "time"]
 
 TIERS: tuple[Tier, ...] = ("leading", "exact", "time")
 
+F = TypeVar("F", bound=Callable[..., Any])
+
 Operand: TypeAlias = "Quantity | Number"
 
 _UNIT = re.compile(r"[+-]?[\d.]+(?:[eE][+-]?\d+)?\s*(\S.*)")
 """Pattern of a limit that is written with a unit, such as "2 mm"."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Quantity:
     """Function of a scene with a scalar value, a name and a unit. Quantities can be added, multiplied and compared.
 
@@ -71,6 +74,15 @@ class Quantity:
     of: Pair = None
     parts: tuple[Quantity, ...] = field(default=(), kw_only=True)
     """Quantities from which this quantity is computed, for example the terms of a sum."""
+
+    written: str = field(default="", kw_only=True, compare=False)
+    """Python expression with which the quantity was made; "" if it follows from the fields."""
+
+    def __repr__(self) -> str:
+        """Return the quantity as it is written in Python."""
+        if self.written or type(self) is not Quantity:
+            return self.written or f"<{', '.join(filter(None, (self.words, self.unit)))}>"
+        return f'Quantity("{self.name}", "{self.unit}", {getattr(self.function, "__name__", "...")})'
 
     def __post_init__(self) -> None:
         for argument, value in (("name", self.name), ("unit", self.unit)):
@@ -130,7 +142,10 @@ class Quantity:
         **Raises** `InputError` for an unknown tier.
         """
         require_one_of(tier, TIERS, "tier")
-        return replace(self, parts=tuple(part.at_tier(tier) for part in self.parts)) if self.parts else self
+        if not self.parts:
+            return self
+        written = self.written and f'{self.written}.at_tier("{tier}")'
+        return replace(self, parts=tuple(part.at_tier(tier) for part in self.parts), written=written)
 
     @property
     def simplified(self) -> Quantity:
@@ -139,12 +154,15 @@ class Quantity:
         A search with the simplified quantity takes less time than a search with the quantity itself, and its best machines are
         near those of the final search.
         """
-        return replace(self, parts=tuple(part.simplified for part in self.parts)) if self.parts else self
+        if not self.parts:
+            return self
+        written = self.written and f"{self.written}.simplified"
+        return replace(self, parts=tuple(part.simplified for part in self.parts), written=written)
 
     @validated
     def named(self, name: str) -> Quantity:
         """Return the same quantity under another `name`."""
-        return replace(self, name=name)
+        return replace(self, name=name, written=f'{_code(self, in_brackets=True)}.named("{name}")')
 
     def __add__(self, other: Operand) -> Quantity:
         return _sum("+", self, other)
@@ -190,7 +208,7 @@ class Quantity:
     __ge__ = __gt__
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class BuiltinQuantity(Quantity):
     """Quantity of this package. Its function has the arguments evaluation (an `Evaluation`), tier and `settings`; without a
     function it is the largest of its `pieces`."""
@@ -228,7 +246,9 @@ class BuiltinQuantity(Quantity):
 
     def at_tier(self, tier: Tier) -> Quantity:
         super().at_tier(tier)
-        return replace(self, tier=tier) if tier in self.tiers else self
+        if tier not in self.tiers or tier == self.tier:
+            return self
+        return replace(self, tier=tier, written=self.written and f'{self.written}.at_tier("{tier}")')
 
     @property
     def simplified(self) -> Quantity:
@@ -236,15 +256,25 @@ class BuiltinQuantity(Quantity):
 
     @validated
     def named(self, name: str) -> Quantity:
-        return replace(self, name=name, text=name)
+        return replace(super().named(name), text=name)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Combined(Quantity):
     """Result of an `operation` on quantities (`parts`), or a constant."""
 
     operation: str = "+"
     constant: float = 0.0
+
+    def __repr__(self) -> str:
+        if self.written:
+            return self.written
+        if self.operation == "constant":
+            return self.name if self.name == f"{self.constant:.6g}" else f'"{self.name}"'
+        if self.operation in ("largest", "least"):
+            return f"{self.operation}({', '.join(map(repr, self.parts))})"
+        texts = [_code(part, in_brackets=self.operation != "+") for part in self.parts]
+        return f"-{texts[0]}" if self.operation == "neg" else f" {self.operation} ".join(texts)
 
     def read(self, evaluation: Evaluation) -> Array:
         values = [part.read(evaluation) for part in self.parts]
@@ -287,7 +317,7 @@ class Combined(Quantity):
         return super().pieces(evaluation, sign)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Demand:
     """Condition that a quantity is at most, or at least, a value or another quantity.
 
@@ -319,6 +349,12 @@ class Demand:
             raise InputError(quantity.words, f"is {units[0]} and compared with {other.words} {units[1]}")
         shown = limit.strip() if isinstance(limit, str) else other.words
         return cls(quantity, other, sense, shown)
+
+    def __repr__(self) -> str:
+        """Return the demand as it is written in Python."""
+        has_text = self.constant is not None and (self.limit.unit or self.shown != self.limit.words)
+        limit = f'"{self.shown}"' if has_text else repr(self.limit)
+        return f"{self.quantity!r} {'<' if self.sense == 'at most' else '>'} {limit}"
 
     @property
     def words(self) -> str:
@@ -357,6 +393,26 @@ class Demand:
     def __bool__(self) -> bool:
         problem = "is a demand, not True or False; write a range as two demands, force > 10 and force < 50"
         raise InputError(self.words, problem)
+
+
+def quantity_function(function: F) -> F:
+    """Check the arguments of a public function that returns a quantity, see `validated`, and record its call in `written`."""
+    checked = validated(function)
+
+    @wraps(function)
+    def made(*args: Any, **kwargs: Any) -> Quantity:
+        arguments = [*map(_code, args), *(f"{name}={_code(value)}" for name, value in kwargs.items())]
+        return replace(checked(*args, **kwargs), written=f"{function.__name__}({', '.join(arguments)})")
+
+    return cast(F, made)
+
+
+def _code(value: object, in_brackets: bool = False) -> str:
+    """Return a value as it is written in Python; an operation `in_brackets` if it would be ambiguous without them."""
+    if isinstance(value, str):
+        return f'"{value}"'
+    is_operation = isinstance(value, Combined) and not value.written and value.operation not in ("constant", "largest", "least")
+    return f"({value!r})" if in_brackets and is_operation else repr(value)
 
 
 def _constant(value: float, unit: str) -> Combined:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import is_whole, validated
+from jaxvib.boundary import is_whole
 from jaxvib.display import speed_text
 from jaxvib.equations.torque_balance import UnbalancedModel, unbalanced_model
 from jaxvib.errors import InputError, quoted
@@ -23,7 +23,7 @@ from jaxvib.steady.points import ellipse_at, rows_in_plane
 from jaxvib.steady.response import motion_at, operation_of, require_unbalances
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation, require_foundation
-from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier
+from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier, quantity_function
 from optimize.quantities.user_inputs import number_in
 
 __all__ = [
@@ -137,7 +137,7 @@ def _words(name: str, at: int | Number | Sequence[Number] | None, body: int) -> 
     return f"{name}{where} under unbalances"
 
 
-@validated
+@quantity_function
 def response_amplitude(
     *,
     at: int | Number | Sequence[Number] | None = None,
@@ -174,7 +174,7 @@ def _amplitude(model: UnbalancedModel, w: Array, at: int | Array | None, body: i
     return ellipse_at(moved, w, jnp.zeros_like(w), jnp.zeros_like(w)).semi_major
 
 
-@validated
+@quantity_function
 def response_stroke(
     *,
     at: int | Number | Sequence[Number] | None = None,
@@ -200,7 +200,7 @@ def _stroke(model: UnbalancedModel, w: Array, at: int | Array | None, body: int)
     return 2.0 * _amplitude(model, w, at, body)
 
 
-@validated
+@quantity_function
 def response_force(*, speed: Number | None = None, between: Sequence[Number] | None = None) -> Quantity:
     """Return the force on the foundation under the unbalances of the exciters, N zero to peak, see `jaxvib.response`.
 
@@ -215,7 +215,7 @@ def response_force(*, speed: Number | None = None, between: Sequence[Number] | N
     return _response_quantity("response_force", "N", _field, "force under unbalances", speed, between, "foundation_force")
 
 
-@validated
+@quantity_function
 def response_transmissibility(*, speed: Number | None = None, between: Sequence[Number] | None = None) -> Quantity:
     """Return the force on the foundation divided by the resultant of the centrifugal forces of the unbalances.
 
@@ -232,7 +232,7 @@ def response_transmissibility(*, speed: Number | None = None, between: Sequence[
     return _response_quantity("response_transmissibility", "", _field, text, speed, between, "transmissibility")
 
 
-@validated
+@quantity_function
 def response_torque(*, speed: Number | None = None, between: Sequence[Number] | None = None) -> Quantity:
     """Return the sum of the mean torques that the rotors need to sustain the vibration, N m, see `jaxvib.response`.
 
@@ -254,6 +254,7 @@ def _field(model: UnbalancedModel, w: Array, name: str) -> Array:
     return jnp.sum(motion_at(model, w)[1][name])
 
 
+@quantity_function
 def fold_distance() -> Quantity:
     """Return the distance of the speed of a motor from the nearest fold of the response, relative to this speed.
 

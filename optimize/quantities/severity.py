@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from jax import Array
 
-from jaxvib.boundary import validated
 from jaxvib.errors import InputError
 from jaxvib.steady import measures
 from jaxvib.steady.measures import acceleration_of, exciter_force, rms_velocity_of, support_loads, weight_deflection
 from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation, require_foundation
 from optimize.quantities.jams import jam_amplitude, jam_force, jam_quantity, jam_speed, pair_of, pair_text
-from optimize.quantities.quantity import Pair, Quantity, Tier
+from optimize.quantities.quantity import Pair, Quantity, Tier, quantity_function
 
 __all__ = ["acceleration", "shaft_torque", "stroke", "support_load", "transmissibility", "velocity"]
 
 
-@validated
+@quantity_function
 def stroke(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
     """Return the stroke in a jam mode, m peak to peak: twice the amplitude.
 
@@ -43,7 +42,7 @@ def _stroke(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
     return 2.0 * jam_amplitude(evaluation, tier, mode, of)
 
 
-@validated
+@quantity_function
 def acceleration(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
     """Return the amplitude of the acceleration in a jam mode, in g = 9.80665 m/s^2, for a vibration at the load speed.
 
@@ -72,7 +71,7 @@ def _acceleration(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Ar
     return acceleration_of(jam_amplitude(evaluation, tier, mode, of), jam_speed(evaluation, tier, mode))
 
 
-@validated
+@quantity_function
 def velocity(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
     """Return the root mean square of the velocity in a jam mode, m/s, for a vibration at the load speed.
 
@@ -99,7 +98,7 @@ def _velocity(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
     return rms_velocity_of(jam_amplitude(evaluation, tier, mode, of), jam_speed(evaluation, tier, mode))
 
 
-@validated
+@quantity_function
 def transmissibility(*, mode: int, tier: Tier = "leading") -> Quantity:
     """Return the foundation force in a jam mode, divided by the centrifugal force of the loads.
 
@@ -121,7 +120,7 @@ def _transmissibility(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     return jam_force(evaluation, tier, mode, None) / exciter_force(evaluation.jammed, jam_speed(evaluation, tier, mode))
 
 
-@validated
+@quantity_function
 def shaft_torque(*, mode: int, tier: Tier = "leading") -> Quantity:
     """Return the mean torque of the loads on the rotor in a jam mode, N m.
 
@@ -144,7 +143,7 @@ def _shaft_torque(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     return measures.shaft_torque(evaluation.jammed, jam.omega, jam.displacement)
 
 
-@validated
+@quantity_function
 def support_load(*, mode: int, of: int) -> Quantity:
     """Return the greatest force on a support in a jam mode, N: the weight on it plus the amplitude of the force of the
     vibration.

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scenes import scene
 
+import optimize
 from jaxvib import InputError
 from optimize import Quantity, amplitude, foundation_force, largest, least
 from optimize.quantities.evaluation import Evaluation
@@ -167,3 +168,26 @@ def test_an_acceleration_is_compared_across_radians():
 def test_comparisons_make_demands_of_their_sense():
     for demand, sense in ((A < 3.0, "at most"), (A <= 3.0, "at most"), (A > 3.0, "at least"), (A >= 3.0, "at least")):
         assert demand.sense == sense and demand.constant == 3.0 and demand.words == f"a {sense} 3"
+
+
+def test_quantities_and_demands_read_as_they_are_written():
+    force, travel, mass = optimize.foundation_force(mode=3), optimize.amplitude(mode=3, of=1), optimize.total_mass()
+    slow = optimize.under(force, "slow", {"drive.speed": "1200 rpm"})
+    expected = {
+        'amplitude(mode=3, of=1) > "60 mm"': travel > "60 mm",
+        'total_mass() < "300 kg"': mass < 300.0,
+        "foundation_force(mode=3) / (total_mass() + total_mass())": force / (mass + mass),
+        'amplitude(mode=3, of=1) - "1 mm"': travel - "1 mm",
+        "-(foundation_force(mode=3) * 2)": -(force * 2.0),
+        "foundation_force(mode=3) > total_mass() ** 2": Demand(force, mass**2.0, "at least", ""),
+        'amplitude(mode=3, of=1).at_tier("exact")': travel.at_tier("exact"),
+        'largest(total_mass(), total_mass().named("x"))': optimize.largest(mass, mass.named("x")),
+        "under(foundation_force(mode=3), \"slow\", {'drive.speed': '1200 rpm'})": slow,
+        'Quantity("heaviest", "kg", heaviest)': optimize.Quantity("heaviest", "kg", heaviest),
+    }
+    assert [repr(value) for value in expected.values()] == list(expected)
+    assert travel.at_tier("exact") == optimize.amplitude(mode=3, of=1, tier="exact")
+
+
+def heaviest(scene):
+    return scene.machine.mass.max()
