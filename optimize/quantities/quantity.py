@@ -35,6 +35,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 Operand: TypeAlias = "Quantity | Number"
 
+_MAX_WRITTEN = 500
+"""Largest number of characters of an argument in the text of a quantity."""
+
 _UNIT = re.compile(r"[+-]?[\d.]+(?:[eE][+-]?\d+)?\s*(\S.*)")
 """Pattern of a limit that is written with a unit, such as "2 mm"."""
 
@@ -401,8 +404,9 @@ def quantity_function(function: F) -> F:
 
     @wraps(function)
     def made(*args: Any, **kwargs: Any) -> Quantity:
+        quantity = checked(*args, **kwargs)
         arguments = [*map(_code, args), *(f"{name}={_code(value)}" for name, value in kwargs.items())]
-        return replace(checked(*args, **kwargs), written=f"{function.__name__}({', '.join(arguments)})")
+        return replace(quantity, written=f"{function.__name__}({', '.join(arguments)})")
 
     return cast(F, made)
 
@@ -412,7 +416,7 @@ def _code(value: object, in_brackets: bool = False) -> str:
     if isinstance(value, str):
         return f'"{value}"'
     is_operation = isinstance(value, Combined) and not value.written and value.operation not in ("constant", "largest", "least")
-    return f"({value!r})" if in_brackets and is_operation else repr(value)
+    return f"({value!r})" if in_brackets and is_operation else quoted(value, _MAX_WRITTEN)
 
 
 def _constant(value: float, unit: str) -> Combined:
