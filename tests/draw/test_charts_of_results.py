@@ -49,6 +49,7 @@ def test_bars_of_a_mode_shape_have_its_heights():
     shape = np.array([[1.0, -0.5], [0.25, 1.0]])
     axis = shapes_chart(np.array([10.0, 20.0]), shape, names=("y1", "y2"), unit="rad/s").axes[0]
     np.testing.assert_array_equal([bar.get_height() for bar in axis.patches], shape.T.ravel())
+    assert not any(line.get_visible() for line in axis.get_xgridlines()) and axis.get_ygridlines()[0].get_visible()
     assert [text.get_text() for text in axis.get_xticklabels()] == ["10 rad/s", "20 rad/s"]
 
 

@@ -34,6 +34,18 @@ def orbit():
     return jv.jam_orbit(SCENE, mode=1)
 
 
+def test_a_title_of_several_lines_has_its_space(monkeypatch):
+    """The drawing keeps its size, and the title is inside of the figure."""
+    heights = []
+    for count in (1, 2, 6):
+        monkeypatch.setattr("jaxvib.show.sketch.caption", lambda scene, count=count: "\n".join(["caption"] * count))
+        figure = jv.sketch(SCENE)
+        figure.canvas.draw()
+        heights.append(figure.axes[0].get_window_extent().height / figure.dpi)
+        assert figure.axes[0]._left_title.get_window_extent().y1 < figure.bbox.y1
+    np.testing.assert_allclose(heights, heights[0], rtol=1e-6)
+
+
 def thinned(run, every):
     """The run as it had kept fewer states."""
     return eqx.tree_at(lambda r: r.trajectory, run, jax.tree.map(lambda x: x[::every], run.trajectory))
