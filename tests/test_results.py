@@ -447,7 +447,7 @@ def test_batch_of_runs_has_its_own_axis():
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, 2.0 * leaf]) if leaf.dtype == float else jnp.stack([leaf, leaf]), run)
     data = batch.to_xarray()
     assert data.displacement.dims == ("batch", "time", "coordinate") and data.coordinate.values.tolist() == ["y1"]
-    for name in ("largest_displacement", "largest_force"):
+    for name in ("largest_displacement", "largest_force", "largest_displacement_time", "largest_force_time"):
         one = getattr(run, name)
         np.testing.assert_allclose(getattr(batch, name), jnp.stack([one, 2.0 * one]), rtol=1e-12)
     one = run.point().largest_displacement

@@ -187,21 +187,26 @@ def run_measures(run: jv.Run | jv.Envelope) -> jv.VibrationMeasures | None:
     return None
 
 
-def _deck_peaks(run: jv.Run) -> list[tuple[list[float], float]]:
-    """Return the points of the option --deck with their largest displacements, m, during a run whose trajectory was stored."""
+def _deck_peaks(run: jv.Run) -> list[dict[str, Any]]:
+    """Return the points of the option --deck with their largest displacements, m, during a run whose trajectory was stored, and
+    the times of these, s."""
     points = [] if run.trajectory is None else deck_of_options().get("at", [])
-    return [(at, float(run.point(at, part="all").largest_displacement)) for at in points]
+    motions = [(at, run.point(at, part="all")) for at in points]
+    names = ("largest_displacement", "largest_displacement_time")
+    return [{"point": at, **{name: float(getattr(motion, name)) for name in names}} for at, motion in motions]
 
 
 def run_text(run: jv.Run, measures: jv.VibrationMeasures | None) -> str:
     """Return the summary of a run, and the largest displacement of each point of the option --deck."""
-    from jaxvib.display import quantity_text  # slow import, which --help does not need
+    from jaxvib.display import quantity_text  # slow imports, which --help does not need
+    from jaxvib.motion.analysis.points import peak_time_text
 
-    peaks = [
-        f"  largest on the way, zero to peak: point ({', '.join(f'{x:.4g}' for x in at)}) m {quantity_text(peak, 'm', 4)}"
-        for at, peak in _deck_peaks(run)
-    ]
-    return "\n".join([run.summary(measures), *peaks])
+    lines = [run.summary(measures)]
+    for at, peak, time in map(dict.values, _deck_peaks(run)):
+        place, size = ", ".join(f"{x:.4g}" for x in at), quantity_text(peak, "m", 4)
+        when = peak_time_text(peak, float(run.point(at).largest_displacement), time)
+        lines.append(f"  largest on the way, zero to peak: point ({place}) m {size}{when}")
+    return "\n".join(lines)
 
 
 def force_lines(scene: jv.Scene) -> list[str]:
@@ -252,12 +257,13 @@ def measures_document(run: jv.Run | jv.Envelope, measures: jv.VibrationMeasures 
 
 def run_document(run: jv.Run, measures: jv.VibrationMeasures | None) -> dict[str, object]:
     """Return the quantities of a run in its window, its error and its cost, for a document."""
-    peaks = [{"point": at, "largest_displacement": peak} for at, peak in _deck_peaks(run)]
+    peaks = _deck_peaks(run)
+    largest = ("largest_displacement", "largest_displacement_time", "largest_force", "largest_force_time")
     return {
         **measured_document(run, run.scene),
         **measures_document(run, measures),
         **({"regime": _regime(run.regime)} if run.scene.is_plain else {}),
-        **({} if run.trajectory is None else fields_of(run, "largest_displacement", "largest_force")),
+        **({} if run.trajectory is None else fields_of(run, *largest)),
         **({"deck": peaks} if peaks else {}),
         **fields_of(run, "coincident", "error", "evaluations", "seconds"),
     }

@@ -38,6 +38,8 @@ from jaxvib.motion.analysis.points import (
     fit_harmonic,
     measures_text,
     motion_of_point,
+    peak_time,
+    peak_time_text,
     require_turns,
     require_vibration,
     vibration_of,
@@ -71,9 +73,6 @@ _CONTACT = "add load_contact = { stiffness = 1e5, restitution = 0.6 } to [effect
 
 _LARGE_ERROR = 1.0
 """Error of the states above which the summary states that the phase is not determined."""
-
-_MIN_PEAK_RATIO = 1.02
-"""Smallest ratio of the largest value during a run to that of its window for which the summary states the time."""
 
 
 def _length(vectors: Array) -> np.ndarray:
@@ -192,6 +191,16 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         zero = square == 0.0  # where the square root has no derivative
         return sampled_maximum(jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square))), axis=-1)
 
+    @property
+    def largest_displacement_time(self) -> Array:
+        """Time of the stored state with the largest displacement of each coordinate, (nd,), s."""
+        return peak_time(self._stored.time[..., None, :], jnp.swapaxes(jnp.abs(self._stored.state.displacement), -1, -2))
+
+    @property
+    def largest_force_time(self) -> Array:
+        """Time of the stored state with the largest magnitude of the force on the foundation, s."""
+        return peak_time(self._stored.time, jnp.sum(self._stored.foundation_force**2, axis=-1))
+
     def _require_end(self) -> None:
         """**Raises** `InputError` for a batch of runs, and for a run that failed: its window has no values."""
         self.require_single()
@@ -297,24 +306,20 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     def _on_the_way(self) -> str:
         structure, window, stored = self.scene.machine.structure(), self.window, self._stored
-        values = [*np.moveaxis(np.asarray(stored.state.displacement), -1, 0), _length(stored.foundation_force)]
-        last = [*np.moveaxis(np.asarray(window.state.displacement), -1, 0), _length(window.foundation_force)]
+        peaks, last = (
+            [*np.max(np.abs(np.asarray(part.state.displacement)), axis=0), np.max(_length(part.foundation_force))]
+            for part in (stored, window)
+        )
+        times = [*np.asarray(self.largest_displacement_time), self.largest_force_time]
         largest = zip(
             [*structure.coordinates, "magnitude of the foundation force"],
             [*np.asarray(self.largest_displacement), self.largest_force],
             [*structure.units, "N"],
-            [self._peak_time_text(each, end) for each, end in zip(values, last, strict=True)],
+            map(peak_time_text, peaks, last, times),
             strict=True,
         )
         *named, force = (f"{name} {quantity_text(x, unit, 4)}{time}" for name, x, unit, time in largest)
         return f"largest on the way, zero to peak: {', '.join(named)}; {force}"
-
-    def _peak_time_text(self, values: np.ndarray, last: np.ndarray) -> str:
-        """Return the time of the largest of the `values` as text; "" if those of the window, `last`, are about as large."""
-        values = np.abs(values)
-        if not np.max(values) > _MIN_PEAK_RATIO * np.max(np.abs(last)):
-            return ""
-        return f" at {float(self._stored.time[np.argmax(values)]):.4g} s"
 
     def _detachment(self) -> list[str]:
         times = np.asarray(self.detached)

@@ -122,6 +122,7 @@ def units_of_document(document: Mapping[str, Plain], result: eqx.Module | None) 
     and of numbers that commands add."""
     units = {} if result is None else units_of(result)
     units |= {"natural_frequencies": "rad/s", "rotor_speed": "rad/s", "largest_displacement": "m or rad", "largest_force": "N"}
+    units |= {"largest_displacement_time": "s", "largest_force_time": "s"}
     units |= {"growth_of_free_loads": "1/s", "drag": "N s/m", "exact_up_to": "rad/s", "exact_balancing": "rad/s"}
     units.setdefault("phases", "rad")
     if "regime" in document:

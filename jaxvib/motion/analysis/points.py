@@ -43,6 +43,9 @@ _PURE_SHARE = 0.95
 describe the whole motion. Typical: 0.9 for loads that are jammed on a rotor with an imbalance, which also vibrates at the rotor
 speed."""
 
+_MIN_PEAK_RATIO = 1.02
+"""Smallest ratio of the largest value during a run to that of its window for which the summary states the time."""
+
 _HARMONICS = 3
 """Number of fitted harmonics. The second and the third are included because they would otherwise influence the first."""
 
@@ -63,6 +66,22 @@ class PointMotion(Readable):
     def largest_displacement(self) -> Array:
         """Largest distance from the place at rest, m, between the stored states as in `Run`; NaN for a run that failed."""
         return sampled_maximum(magnitude(self.displacement[..., 0] + 1j * self.displacement[..., 1]), axis=-1)
+
+    @property
+    def largest_displacement_time(self) -> Array:
+        """Time of the stored state with the largest distance from the place at rest, s."""
+        return peak_time(self.time, jnp.sum(self.displacement**2, axis=-1))
+
+
+def peak_time(time: Array, values: Array) -> Array:
+    """Return the `time` (..., nt) of the largest of the `values` (..., nt)."""
+    largest = jnp.argmax(values, axis=-1)[..., None]
+    return jnp.take_along_axis(jnp.broadcast_to(time, values.shape), largest, axis=-1)[..., 0]
+
+
+def peak_time_text(peak: float, last: float, time: float) -> str:
+    """Return the `time` of the largest value `peak` of a run as text; "" if that of the window, `last`, is about as large."""
+    return f" at {float(time):.4g} s" if peak > _MIN_PEAK_RATIO * last else ""
 
 
 @cached

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxvib.display import speed_text
 from jaxvib.equations.linear import estimated_frequencies
@@ -61,7 +62,7 @@ class Stay(NamedTuple):
         return f"{self.masses} stayed near {speed_text(self.speed, 4)} {times} ({mode}{resonance}), then passed"
 
 
-def find_stays(scene: Scene, time: np.ndarray, speeds: np.ndarray, rotor_speeds: Sequence[np.ndarray]) -> list[Stay]:
+def find_stays(scene: Scene, time: np.ndarray, speeds: np.ndarray, rotor_speeds: Sequence[ArrayLike]) -> list[Stay]:
     """Return the stays of a run in the order of their times.
 
     A mass stays near a speed if it turns at least 10 times within 3 % of it, at least three times as long as at its mean

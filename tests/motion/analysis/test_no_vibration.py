@@ -155,7 +155,9 @@ def test_a_deck_without_vibration_has_a_note_and_its_peak(stopped, tmp_path, mon
     assert run_command(["simulate", str(path), "--until", "60s", "--deck", "1.5,0.1"]) == 0
     text, err = capsys.readouterr()
     peak = 1e3 * float(stopped.point(AT, part="all").largest_displacement)
-    assert f"largest on the way, zero to peak: point (1.5, 0.1) m {peak:.4g} mm" in text
+    x, y, turn = np.asarray(stopped.trajectory.state.displacement).T
+    time = float(stopped.trajectory.time[np.argmax(np.hypot(x - AT[1] * turn, y + AT[0] * turn))])
+    assert f"largest on the way, zero to peak: point (1.5, 0.1) m {peak:.4g} mm at {time:.4g} s\n" in text
     assert "note: --deck: no stroke, throw and conveying" in err
     given = ["--slope", "-5 deg", "--layer", "1 m,50 mm,1600"]
     assert run_command(["simulate", str(path), "--until", "60s", *given]) == 0
@@ -164,3 +166,7 @@ def test_a_deck_without_vibration_has_a_note_and_its_peak(stopped, tmp_path, mon
     document = json.loads(capsys.readouterr()[0])
     assert document["no_vibration"] == stopped.no_vibration and "measures" not in document
     np.testing.assert_allclose(document["deck"][0]["largest_displacement"], peak / 1e3, rtol=1e-12)
+    np.testing.assert_allclose(document["deck"][0]["largest_displacement_time"], time, rtol=1e-12)
+    force = np.linalg.norm(stopped.trajectory.foundation_force, axis=-1)
+    np.testing.assert_allclose(document["largest_force_time"], stopped.trajectory.time[np.argmax(force)])
+    np.testing.assert_allclose(document["largest_displacement_time"][2], stopped.trajectory.time[np.argmax(abs(turn))])
