@@ -213,7 +213,7 @@ RESULTS = {
         np.array([5.0]), np.array([3, 5]), np.array([[1e-3], [1e-5]]), np.array([[2e-3], [2e-5]])
     ),
     "StabilityMap": lambda: StabilityMap(
-        np.array([0.1, 0.2]), np.ones((2, 3)), np.ones((2, 3), bool), ((), (SpecialPoint("torus", 1.0, 2.0),))
+        np.array([0.1, 0.2]), np.array([[1.0, 2.0, 3.0]] * 2), np.ones((2, 3), bool), ((), (SpecialPoint("torus", 1.0, 2.0),))
     ),
     "Cost": lambda: jv.Cost("amplitude", [1.0], 1e-9, [CostRow("full", "Tsit5", "float64", "1e-3", 1e-3, 0.1, 1.0)] * 2),
     "Audit": audited,
