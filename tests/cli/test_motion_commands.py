@@ -372,6 +372,13 @@ def test_response_lists_operating_points_peaks_and_folds(typed, tmp_path):
     shown = [float(line.split()[8]) for line in out.splitlines() if line.startswith("  shaft: ")]
     np.testing.assert_allclose(np.ravel(power), shown, rtol=1e-3)
     assert typed("response", "machine.toml")[0] == 2
+    chosen = ("--points", "300", "--speed", "960 rpm", "--speed", "145 rpm")
+    assert "at the speeds of --speed" not in out and "at the speeds of --speed" in typed("response", "table.toml", *chosen)[1]
+    document = json.loads(typed("response", "table.toml", *chosen, "--csv", "chosen.csv", "--json")[1])
+    at_speeds = jv.response(jv.load_scene(tmp_path / "table.toml"), speeds=["960 rpm", "145 rpm"])
+    forces = [each["foundation_force"] for each in document["speeds"]]
+    np.testing.assert_allclose(forces, at_speeds.foundation_force, rtol=1e-12)
+    assert [float(row[0]) for row in read(tmp_path / "chosen.csv")[1:]] == [960.0, 145.0]
     code, _, err = typed("response", "table.toml", "--deck", "1,0")
     assert code == 2 and "--deck is for bodies in a plane, not for a machine of kind 'one_mass'" in err
 

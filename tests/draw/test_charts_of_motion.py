@@ -94,7 +94,7 @@ def test_a_response_has_its_amplitudes_phases_and_force():
 
 
 @pytest.mark.parametrize(
-    ("motor", "top"), [([4.0, 3.0, 0.0], 5.0), ([1.0, 0.5, 0.0], 3.0), ([8.0, 1.0, 0.0], 8.0), (None, 5.0)]
+    ("motor", "top"), [([4.0, 3.0, 0.0], 5.0), ([1.0, 0.5, 0.0], 5.0), ([8.0, 1.0, 0.0], 8.0), (None, 5.0)]
 )
 def test_the_torque_of_the_motor_bounds_the_axis(motor, top):
     curve = CURVE if motor is None else CURVE | {"motor_torque": np.asarray(motor)}
@@ -113,6 +113,13 @@ def test_the_torque_of_the_motor_bounds_the_axis(motor, top):
     if motor is not None:
         assert lines["fold: the speed jumps"] == [[15.0, 2.5]]
         assert lines["of the motor"] == np.stack([SPEED, motor], axis=1).tolist()
+
+
+def test_the_axis_of_the_torque_contains_each_fold():
+    about = {"names": ["y", "tilt"], "units": ["m", "rad"], "motors": 1, "show": ["torque"]}
+    for torque, scale in ((39.0, "linear"), (41.0, "log")):  # a motor of 4 N m
+        (axis,) = response_chart(CURVE, POINTS, FOLDS | {"torque": np.array([torque])}, np.zeros(0), **about).axes
+        assert axis.get_yscale() == scale and axis.get_ylim()[1] > torque
 
 
 def test_a_response_at_one_speed_is_a_point():

@@ -27,11 +27,25 @@ if TYPE_CHECKING:
     "the first stable synchronous regime].",
 )
 @click.option("--points", type=int, default=500, help="Number of speeds.")
+@click.option(
+    "--speed",
+    "speeds",
+    type=SPEED_TYPE,
+    multiple=True,
+    help="Add the vibration at this speed, such as '960 rpm', to the tables; --csv then has these speeds only; repeatable.",
+)
 @WITHOUT
 @deck_options
 @csv_options
 def response(
-    scene: Path, most: str | None, phases: str | None, points: int, without: tuple[str, ...], csv: Path | None, output: Output
+    scene: Path,
+    most: str | None,
+    phases: str | None,
+    points: int,
+    speeds: tuple[str, ...],
+    without: tuple[str, ...],
+    csv: Path | None,
+    output: Output,
 ) -> None:
     """Compute the vibration of SCENE under the unbalances of its exciters over their speed, and the torque that the vibration
     needs; --out adds a figure.
@@ -45,8 +59,9 @@ def response(
     loaded = loaded_scene(scene, without)
     angles, origin = _phases(loaded, phases)
     result = jax.device_get(jv.response(loaded, phases=angles, points=points, most=most))
+    listed = jax.device_get(jv.response(loaded, phases=angles, speeds=[*speeds])) if speeds else None
     output.figure("response.png", result.plot)
-    output.csv(csv, result, "speed")
+    output.csv(csv, result if listed is None else listed, "speed")
     operating = np.flatnonzero(result.operating.exists).tolist()
     folds = np.flatnonzero(result.folds.exists).tolist()
     is_stable = result.operating.stable
@@ -67,10 +82,12 @@ def response(
                 rows_of(result.operating, operating, *measures, *rest, "growth", "stable"), vibration_measures, strict=True
             )
         ],
+        **({} if listed is None else {"speeds": rows_of(listed, [*range(len(speeds))], *measures, *rest)}),
         "peaks": rows_of(result, result.peaks(), *measures, *rest),
         "folds": rows_of(result.folds, folds, "speed", "factor", "torque", "lands_at"),
     }
-    output.done(document, lambda: _text(result, (angles, origin), vibration_measures, operating, folds), "response", result)
+    about = (listed, (angles, origin), vibration_measures, operating, folds)
+    output.done(document, lambda: _text(result, *about), "response", result)
 
 
 def _phases(scene: jv.Scene, given: str | None) -> tuple[np.ndarray, str]:
@@ -94,12 +111,14 @@ def _phases(scene: jv.Scene, given: str | None) -> tuple[np.ndarray, str]:
 
 def _text(
     result: jv.Response,
+    listed: jv.Response | None,
     phases: tuple[np.ndarray, str],
     vibration_measures: list[jv.VibrationMeasures | None],
     operating: list[int],
     folds: list[int],
 ) -> str:
-    """Return the operating points, peaks and folds as tables; `vibration_measures`: those at the stable operating points."""
+    """Return the operating points, peaks and folds as tables, and the vibration at the `listed` speeds; `vibration_measures`:
+    those at the stable operating points."""
     import numpy as np  # slow import, which --help does not need
 
     from jaxvib.display import shown_unit, speed_text, speed_unit
@@ -138,6 +157,9 @@ def _text(
         lines += [indented(f"at {speed_text(points.speed[k])}:", each) for k, each in stable]
     else:
         lines.append("no operating point: at no speed is the torque of the motor equal to the torque that the vibration needs")
+    if listed is not None:
+        rows = [motion(listed, k) for k in range(len(listed.speed))]
+        lines.append(table("at the speeds of --speed (zero to peak)", [unit, *moves, *end], rows))
     if peaks := result.peaks():
         lines.append(table("peaks of the foundation force", [unit, *moves, *end], [motion(result, k) for k in peaks]))
     if folds:

@@ -30,6 +30,9 @@ PARTS = ("amplitude", "phase", "force", "torque")
 _DECADES = 4.0
 """Largest number of decades of a logarithmic axis."""
 
+_MAX_TORQUE_RATIO = 10.0
+"""Largest ratio of the torques at points and folds and the torque of the motors on a linear axis."""
+
 
 def response_chart(
     curve: Arrays,
@@ -122,7 +125,12 @@ def _torque(axis: Axes, curve: Arrays, points: Arrays, folds: Arrays, scale: flo
         if np.any(np.isfinite(folds["speed"])):
             look = {"ms": 5.0, "mfc": "white", "mec": COLORS[4], "label": "fold: the speed jumps"}
             axis.plot(scale * folds["speed"], folds["torque"], "D", **look)
-        top = min(max(top, float(np.max(motor))), 3.0 * float(np.max(motor)))
+        drives = float(np.max(motor))
+        markers = np.concatenate([points["torque"], folds["torque"]])
+        top = max(drives, min(top, 3.0 * drives), float(np.max(markers[np.isfinite(markers)], initial=0.0)))
+        if top > _MAX_TORQUE_RATIO * drives > 0.0:
+            _logarithmic(axis)
+            return
     if top > 0.0:
         axis.set_ylim(-0.03 * top, 1.08 * top)
 
