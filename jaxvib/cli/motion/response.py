@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,13 @@ if TYPE_CHECKING:
     import numpy as np
 
     from jaxvib.steady.response import AbstractResponse
+
+
+_MEASURES = (
+    *("speed", "amplitude", "phase", "acceleration", "velocity", "exciter_force", "foundation_force"),
+    *("transmissibility", "torque", "motor_torque", "power"),
+)
+"""Fields of a response in the document."""
 
 
 @command("response")
@@ -66,12 +74,6 @@ def response(
     folds = np.flatnonzero(result.folds.exists).tolist()
     is_stable = result.operating.stable
     vibration_measures = [measures_of(loaded, result.operating.vibration(k)) if is_stable[k] else None for k in operating]
-    measures = ("speed", "amplitude", "phase", "acceleration", "velocity", "exciter_force", "foundation_force")
-    rest = ("transmissibility", "torque", "motor_torque", "power")
-
-    def rows_of(of: object, places: list[int], *names: str) -> list[dict[str, object]]:
-        return [{name: getattr(of, name)[k] for name in names} for k in places]
-
     document = {
         "resonances": result.resonances,
         "phases": angles,
@@ -79,15 +81,20 @@ def response(
         "operating_points": [
             row | ({} if measured is None else {"measures": measured.document()})
             for row, measured in zip(
-                rows_of(result.operating, operating, *measures, *rest, "growth", "stable"), vibration_measures, strict=True
+                _rows(result.operating, operating, *_MEASURES, "growth", "stable"), vibration_measures, strict=True
             )
         ],
-        **({} if listed is None else {"speeds": rows_of(listed, [*range(len(speeds))], *measures, *rest)}),
-        "peaks": rows_of(result, result.peaks(), *measures, *rest),
-        "folds": rows_of(result.folds, folds, "speed", "factor", "torque", "lands_at"),
+        **({} if listed is None else {"speeds": _rows(listed, [*range(len(speeds))], *_MEASURES)}),
+        "peaks": _rows(result, result.peaks(), *_MEASURES),
+        "folds": _rows(result.folds, folds, "speed", "factor", "torque", "lands_at"),
     }
     about = (listed, (angles, origin), vibration_measures, operating, folds)
     output.done(document, lambda: _text(result, *about), "response", result)
+
+
+def _rows(of: object, places: list[int], *names: str) -> list[dict[str, object]]:
+    """Return the fields `names` of a result at some places, for a document."""
+    return [{name: getattr(of, name)[k] for name in names} for k in places]
 
 
 def _phases(scene: jv.Scene, given: str | None) -> tuple[np.ndarray, str]:
@@ -163,15 +170,19 @@ def _text(
     if peaks := result.peaks():
         lines.append(table("peaks of the foundation force", [unit, *moves, *end], [motion(result, k) for k in peaks]))
     if folds:
-        rows = [
-            [
-                f"{scale * result.folds.speed[k]:.5g}",
-                f"{result.folds.torque[k]:.4g}",
-                f"{result.folds.factor[k]:.4g}",
-                f"{scale * result.folds.lands_at[k]:.5g}" if np.isfinite(result.folds.lands_at[k]) else "-",
-            ]
-            for k in folds
-        ]
-        head = [unit, "torque, N m", "torque / drive torque", f"jump to, {unit}"]
-        lines.append(table("folds: the speed jumps if the drives have this torque", head, rows))
+        lines.append(_folds_table(result.folds, folds, unit, scale))
     return "\n".join(lines)
+
+
+def _folds_table(of: jv.TorqueFolds, folds: list[int], unit: str, scale: float) -> str:
+    rows = [
+        [
+            f"{scale * of.speed[k]:.5g}",
+            f"{of.torque[k]:.4g}",
+            f"{of.factor[k]:.4g}",
+            f"{scale * of.lands_at[k]:.5g}" if math.isfinite(of.lands_at[k]) else "-",
+        ]
+        for k in folds
+    ]
+    head = [unit, "torque, N m", "torque / drive torque", f"jump to, {unit}"]
+    return table("folds: the speed jumps if the drives have this torque", head, rows)
