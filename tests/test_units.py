@@ -255,6 +255,31 @@ def test_a_deflection_without_a_load_is_refused(text, advice):
 
 
 @pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0.3 kg x 0.24 m", 0.072),
+        ("300 g*24 cm", 0.072),
+        ("240 mm × 0.3 kg", 0.072),
+        ("3 kg x .24 m", 0.72),
+        ("2 x 0.3 kg x 0.24 m", 0.144),
+        ("2 x 36 g m", 0.072),
+    ],
+)
+def test_an_unbalance_may_be_a_mass_times_a_radius(text, expected):
+    assert to_float(text, "kg m", "unbalance") == pytest.approx(expected, rel=1e-14)
+    assert float(jv.StaticImbalance(text).moment) == pytest.approx(expected, rel=1e-14)
+    assert float(jv.Exciter(drive=jv.ConstantSpeed("10 Hz"), unbalance=text).unbalance) == pytest.approx(expected, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    "text", ["0.3 kg x 0.24", "0.3 x 0.24 m", "0.3 kg x 2 kg", "0.3 kg x 2 s", "-1 kg x -1 m", "1 kg x 1 m x 1 m"]
+)
+def test_a_product_that_is_no_unbalance_is_refused(text):
+    with pytest.raises(jv.InputError, match=re.escape(f"moment is '{text}'; a product needs a mass and a radius with units")):
+        jv.StaticImbalance(text)
+
+
+@pytest.mark.parametrize(
     "value",
     [
         True,

@@ -41,7 +41,8 @@ class Exciter(Part):
     - `loads` from `balls`, `rollers`, `pendulums` or `torus_balls`; None for an exciter without loads
     - `drive`, a `Motor` or an `IdealDrive`; the inertia of a motor includes the unbalance
     - `unbalance` S, kg m: static moment m r about the exciter's axis of a mass that turns with the rotor, greater than 0;
-      typical: 0.1 to 10 kg m. The function `unbalance` computes it from the force that catalogues state
+      typical: 0.1 to 10 kg m; text: "2 kg m" or "20 kg x 0.1 m". The function `unbalance` computes it from the force that
+      catalogues state
     - `unbalance_mass` m, kg: mass of the unbalance, added to the machine at the exciter's axis; typical: 5 to 200; default: the
       machine's mass includes it
     - `at`: place on the machine: the number of a platform or of a place of `from_matrices`, the distance along a rotor's axis

@@ -51,6 +51,9 @@ STANDARD_GRAVITY = 9.80665
 _UNDER = re.compile(r"(.+?)\s+under\s+(.+)")
 """Pattern of a stiffness that is given as a deflection under a mass or a force, such as "25 mm under 650 kg"."""
 
+_MASS_TIMES_RADIUS = re.compile(r"(.+?)\s*[x×*]\s*([+-]?\.?\d.*)")
+"""Pattern of an unbalance that is given as a mass times a radius, such as "0.3 kg x 0.24 m"."""
+
 _COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*(?:[^\W\d_%°][^,;()]*)?")
 
 _THOUSANDS = re.compile(r"[+-]?\d{1,3},\d{3}(?!\d)")
@@ -144,7 +147,8 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
     Strings and pint quantities are converted. If `unit` contains an angle, "1500 1/min" is 1500 rpm, 1/s without an angle
     raises an error, and a frequency in hertz counts as revolutions per second. (pint alone would convert 25 Hz to 25 rad/s.)
     Stiffnesses, dampings, masses and unbalances of several equal parts side by side are added: "4 x 50 N/mm". A stiffness may
-    be a deflection of the spring under a mass or a force: "25 mm under 650 kg".
+    be a deflection of the spring under a mass or a force: "25 mm under 650 kg". An unbalance may be a mass times a radius:
+    "0.3 kg x 0.24 m".
 
     **Raises** `InputError` for a string that is not a number, an unknown unit, a unit of another dimension, and a value that
     is not a real number (`require_real`).
@@ -173,6 +177,9 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         several = _SEVERAL.fullmatch(text) if unit in ADDED and len(text) < 100 else None
         if several is not None and _SEVERAL.fullmatch(several[2]) is None:
             return int(several[1].rstrip("x×* \t")) * to_float(several[2], unit, field)
+        times = _MASS_TIMES_RADIUS.fullmatch(text) if unit == "kg m" and len(text) < 100 else None
+        if times is not None:
+            return _unbalance_of(times[1], times[2], value, field)
         parts = _NUMBER_WITH_UNIT.fullmatch(text) if len(text) < 100 else None
         if parts is None:
             if len(text) < 100 and _COMMA.fullmatch(text):
@@ -212,6 +219,20 @@ def _stiffness_under(deflection: str, load: str, value: str, field: str) -> floa
         problem = "needs a positive deflection and a positive mass or force, with units"
         raise InputError(field, f"is {quoted(value)}, which {problem}, such as '25 mm under 650 kg'")
     return float(force) / float(sag)
+
+
+def _unbalance_of(one: str, other: str, value: str, field: str) -> float:
+    """Return the unbalance, kg m, of a mass at a radius; either may be first.
+
+    **Raises** `InputError` for texts that are not such quantities with units, and for negative values.
+    """
+    mass, radius = (one, other) if _in_unit(one, "m") is None else (other, one)
+    factors = [_in_unit(text, unit) for text, unit in ((mass, "kg"), (radius, "m")) if _NUMBER_WITH_UNIT.fullmatch(text)]
+    if len(factors) != 2 or not all(factor is not None and 0.0 <= factor < math.inf for factor in factors):
+        raise InputError(
+            field, f"is {quoted(value)}; a product needs a mass and a radius with units, such as '0.3 kg x 0.24 m'"
+        )
+    return math.prod(factor for factor in factors if factor is not None)
 
 
 def _in_unit(text: str, unit: str) -> float | None:

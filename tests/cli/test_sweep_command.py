@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import subprocess
 import sys
 
 import pytest
@@ -56,6 +57,13 @@ def test_a_study_is_run_resumed_and_shown(typed, tmp_path):
     assert "results of the cases" in out and last == "900 1 4712"  # 50 kg at 900 rpm
     code, out, _ = typed("show", "study.zarr", "--json")
     assert json.loads(out)["cases"] == 10
+
+
+def test_a_missing_package_is_reported_before_slow_imports(typed):
+    code = "import sys; sys.modules['zarr'] = None; from jaxvib.cli.app import run\n"
+    code += "print(run(['sweep', 'study.toml']), 'jaxvib.sweeps' in sys.modules)"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout == "2 False\n" and "zarr is not installed; install it with: pip install" in ended.stderr
 
 
 def test_a_store_without_a_computed_case_has_no_figures(typed, tmp_path):

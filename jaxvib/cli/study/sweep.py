@@ -30,10 +30,11 @@ def sweep(
 
     --out adds the figure that fits the study (sweep.png).
     """
+    optional_module("zarr", "sweep")  # first, because the other imports and the study take seconds
+
     from jaxvib.sweeps.study import load_study  # slow imports, which --help does not need
     from jaxvib.sweeps.sweep import run_study
 
-    optional_module("zarr", "sweep")  # before the study, whose preparation takes seconds
     path = store or study.with_suffix(".zarr")
     if not resume and os.path.exists(path):
         raise InputError("--no-resume", f"is given, but {quoted(str(path))} exists already; give another folder with --store")

@@ -201,8 +201,8 @@ class StaticImbalance(Effect):
 
     **Arguments** (SI, or strings with a unit)
 
-    - `moment` M e, kg m, not negative; typical: 1e-4 to 0.05. Grade G6.3 of ISO 21940-11 allows M times 6.3 mm/s divided by
-      the speed: 5e-4 for 37 kg at 460 rad/s
+    - `moment` M e, kg m, not negative; text: "72 g m" or "0.3 kg x 0.24 m"; typical: 1e-4 to 0.05. Grade G6.3 of ISO 21940-11
+      allows M times 6.3 mm/s divided by the speed: 5e-4 for 37 kg at 460 rad/s
     - `angle` of the heavy side at the rotor's angle 0, rad; typical: 0 (the default)
 
     **Raises** `InputError` for a wrong unit or a negative moment.

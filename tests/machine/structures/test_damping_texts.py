@@ -127,6 +127,23 @@ def test_a_found_machine_keeps_the_constant_of_a_ratio():
     assert 'damping = "5 %"             # of critical' in rewrite_scene(FILE, faster)
 
 
+def test_a_changed_product_of_mass_and_radius_keeps_its_radius():
+    text = """machine = { kind = "planar_rotor", mass = "18 kg", stiffness = "30 N/mm", damping = "8 %" }
+drive = { kind = "constant_speed", speed = "1200 rpm" }
+[loads]
+kind = "ball"
+count = 2
+mass = "0.1 kg"
+radius = "250 mm"
+drag = 0.15
+[effects.static_imbalance]
+moment = "0.3 kg x 0.24 m"
+"""
+    scene = jv.scene_from_toml(text)
+    heavier = scene.replace(effects=(jv.StaticImbalance(0.096),))
+    assert 'moment = "0.4 kg x 0.24 m"  # was "0.3 kg x 0.24 m"' in rewrite_scene(text, heavier)
+
+
 def test_gradients_pass_through_a_ratio():
     import jax
 
