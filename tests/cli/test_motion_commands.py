@@ -357,9 +357,14 @@ def test_response_at_an_undamped_resonance_is_unbounded(typed, tmp_path):
 
 def test_response_lists_operating_points_peaks_and_folds(typed, tmp_path):
     (tmp_path / "table.toml").write_text(UNBALANCED)
+    motor = jv.NamePlateMotor("7.5 kW", "1460 rpm", breakdown_ratio=2.8, inertia=1.3, starting_ratio=2.2)
+    screen = jv.one_mass(mass="1200 kg", stiffness="600 N/mm", damping="3 %")
+    jv.save_scene(jv.Scene(screen, exciters=[jv.Exciter(drive=motor, unbalance=12.0)]), tmp_path / "weak.toml")
     code, out, err = typed("response", "table.toml", "--points", "300", "--csv", "curve.csv")
     assert (code, err) == (0, "") and max(map(len, out.splitlines())) <= 80
     assert "zone" not in out and "jump to, rpm" in out
+    assert ("run-up or simulate shows" in out) == (out.count("│    yes │") > 1)
+    assert "run-up or simulate shows at which" in typed("response", "weak.toml", "--points", "300")[1]
     document = json.loads(typed("response", "table.toml", "--points", "300", "--json")[1])
     found = jv.response(jv.load_scene(tmp_path / "table.toml"), points=300)
     speeds = [each["speed"] for each in document["operating_points"]]

@@ -162,6 +162,9 @@ def _text(
             lines.append(table("torques at the operating points", head, rows))
         stable = [(k, each) for k, each in zip(operating, vibration_measures, strict=True) if each is not None]
         lines += [indented(f"at {speed_text(points.speed[k])}:", each) for k, each in stable]
+        if len(stable) > 1:
+            lines.append("an accelerating motor can pass the slower stable points;")
+            lines.append("run-up or simulate shows at which of them a start ends")
     else:
         lines.append("no operating point: at no speed is the torque of the motor equal to the torque that the vibration needs")
     if listed is not None:

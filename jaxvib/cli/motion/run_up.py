@@ -28,7 +28,7 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
     found = jv.run_up(loaded_scene(scene, without), until, least=least)
     output.figure("run_up.png", found.plot)
     output.csv(csv, found.run, "trajectory_time")
-    names = ("resonances", "speed", "caught_at", "peak_amplitude", "peak_force", "weight_error")
+    names = ("resonances", "speed", "caught_at", "peak_amplitude", "peak_force", "speed_variation")
     optional_fields = {"least_torque": found.least_torque} if least else {}
     document = {"status": found.status_name, "message": found.message, **fields_of(found, *names), **stays_document(found.run)}
     output.done(document | optional_fields, found.summary, "run_up", found)

@@ -39,8 +39,8 @@ _LIFTING_SHARE = 0.02
 """Relative difference below which the least torque counts as equal to the torque that lifts an unbalance; the least torque
 has an error of 1 %."""
 
-_MIN_SHOWN_ERROR = 0.01
-"""Smallest relative error of peaks that the text of a run-up states; that of averaging without gravity is about as large."""
+_MIN_SHOWN_VARIATION = 0.01
+"""Smallest variation of the speed by the weight that the text of a run-up states."""
 
 _LARGEST_FACTOR, _BISECTIONS = 64.0, 10
 """Largest factor of the torques in the search for the weakest motors, and largest number of its bisections."""
@@ -73,7 +73,7 @@ class MotorRunUp(Result):
     - `least_torque`: the smallest factor by which the torques of all motors can be multiplied such that all exciters still pass
       their resonances; 1/64 if this factor is still sufficient; NaN if it was not requested, or if even motors 64 times as
       strong do not pass
-    - `weight_error`: share by which the weight of the unbalances can change the peaks; 0 without gravity
+    - `speed_variation`: share by which the weight of the unbalances changes the speed within a turn; 0 without gravity
     - `run`: the averaged motion, an `Envelope`
     - `scene`
     """
@@ -89,11 +89,11 @@ class MotorRunUp(Result):
     scene: Scene = eqx.field(metadata=SCENE)
 
     @property
-    def weight_error(self) -> float:
-        """Share by which the weight of the unbalances, which averaging omits, can change the peaks.
+    def speed_variation(self) -> float:
+        """Share by which the weight of the unbalances, which averaging omits, raises and lowers the speed within a turn.
 
         It is the largest S g / (I w^2) of all motors, with the unbalance S, the inertia I and the lowest natural frequency w; 0
-        without gravity.
+        without gravity. The peaks can change by more, see `run_up`.
         """
         resonances = np.asarray(self.resonances)
         lowest = np.min(resonances[resonances > 0.0], initial=np.inf)
@@ -114,11 +114,15 @@ class MotorRunUp(Result):
         of = " (largest of several initial angles; the figure shows one run)" if _varied_motors(self.scene) else ""
         force = quantity_text(self.peak_force, "N", 4)
         lines += [f"  peaks on the way{of}:", f"    {peaks}; magnitude of the foundation force {force}"]
-        if self.weight_error > _MIN_SHOWN_ERROR:
-            share = f"{100.0 * self.weight_error:.2g} %"
-            lines.append(f"    the weight of the unbalances, which averaging omits, changes peaks by up to about {share}")
+        weight = self.speed_variation > _MIN_SHOWN_VARIATION
+        if weight:
+            share = f"by about {100.0 * self.speed_variation:.2g} % within a turn at the lowest resonance"
+            lines.append(f"    averaging omits the weight of the unbalances, which changes speeds {share};")
+            lines.append("    peaks can change by more: simulate from rest includes the weight")
         if np.isfinite(self.least_torque):
             lines.append(f"  all pass with torques of at least {float(self.least_torque):.3g} times those of the motors")
+            omitted = " without the weight, which changes this factor" if weight else ""
+            lines.append(f"  (by the averaged equations{omitted}; test weaker motors with simulate)")
             lifting = _lifting_factor(self.scene)
             if abs(float(self.least_torque) - lifting) < _LIFTING_SHARE * lifting:
                 lines.append(f"  (with {lifting:.3g} times its torque a motor just lifts its unbalance)")
@@ -173,10 +177,12 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     gravity, the peaks have errors of 2 % for a screen that passes its resonances within two turns.
 
     With gravity, the weight of an unbalance S acts on its rotor with the torque S g cos theta. The speed of the rotor therefore
-    changes within each turn by a share of about S g / (I w^2) (I: inertia of the rotor, w: a natural frequency). This change
-    excites the resonance w already at the speed w/2. When the rotor reaches w, a part of this vibration has not decayed yet. It
-    raises or lowers the peak, depending on the initial angle, by up to about this share (`weight_error`), which can exceed 20 %
-    for screens. Use `simulate` from rest for peaks with less error.
+    changes within each turn by a share of about S g / (I w^2) (I: inertia of the rotor, w: a natural frequency;
+    `speed_variation`). This change excites the resonance w already at the speed w/2. When the rotor reaches w, a part of this
+    vibration has not decayed yet. It raises or lowers the peak, depending on the initial angle. The change of the peak is about
+    this share if the motor is much stronger than `least_torque`, and larger for weaker motors: from -27 % to +62 % for a screen
+    with a variation of 18 % and a least torque of 0.95. The weight changes `least_torque`, too: this screen passes from rest with
+    0.82 times its torque. Use `simulate` from rest for peaks, and for motors near the least torque.
 
     **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between passing a
     resonance and being caught use `simulate`. The torque of a motor with currents is its steady torque here. This changes

@@ -500,7 +500,8 @@ def test_run_up_reads_peaks_and_speeds(monkeypatch):
     np.testing.assert_allclose(angles[:8], np.arange(8) * np.pi / 4.0, rtol=1e-12)
     assert lines[3] == "  peaks on the way (largest of several initial angles; the figure shows one run):"
     assert lines[4].startswith("    x 4 mm") and lines[4].endswith("foundation force 6 N")
-    assert lines[5] == "  all pass with torques of at least 0.5 times those of the motors" and len(lines) == 6
+    assert lines[5] == "  all pass with torques of at least 0.5 times those of the motors" and len(lines) == 7
+    assert lines[6] == "  (by the averaged equations; test weaker motors with simulate)"
     assert len(found.summary().splitlines()) == 5
     slow = eqx.tree_at(lambda r: r.window.rotor_speeds[0], run, jnp.full(3, -5.0))
     monkeypatch.setattr(run_up_module, "envelope", lambda *_, **__: slow)
