@@ -104,8 +104,8 @@ def drag_of(
     require_one_of(cause, get_args(Cause), "cause")
     given = {
         "ball_radius": ball_radius,
+        "density": density,  # before the viscosity, which may need it
         "viscosity": viscosity,
-        "density": density,
         "mass": mass,
         "rolling_lever": rolling_lever,
         "friction": friction,
@@ -119,7 +119,7 @@ def drag_of(
         if name not in needed and each is not None:
             raise InputError(name, f"is not used for the drag by {cause}, which needs {', '.join(needed)}; leave it out")
         if each is not None:
-            value[name] = _viscosity(each, given["density"]) if name == "viscosity" else read(each, needed[name], name)
+            value[name] = _viscosity(each, value["density"]) if name == "viscosity" else read(each, needed[name], name)
     speeds = {"load_speed": load_speed, "rotor_speed": rotor_speed}
     arm, (slow, fast) = read(radius, "m", "radius"), (read(speed, "rad/s", name) for name, speed in speeds.items())
     if "ball_radius" in value:
@@ -142,7 +142,7 @@ def drag_of(
     return 0.5 * value["friction"] * value["mass"] * acceleration * value["diameter"] / (arm * relative_speed)
 
 
-def _viscosity(given: Number, density: Number) -> Array:
+def _viscosity(given: Number, density: Array) -> Array:
     """Return the dynamic viscosity, Pa s, also from a kinematic viscosity, whose unit is that of an area per time."""
     read = partial(number, field="viscosity", low=0.0, open_low=True)
     try:
@@ -152,7 +152,7 @@ def _viscosity(given: Number, density: Number) -> Array:
             kinematic = read(given, "m^2/s")
         except InputError:
             raise error from None
-        return kinematic * number(density, "kg/m^3", "density", low=0.0, open_low=True)
+        return kinematic * density
 
 
 def _oil_drag(speed: Array, r: Array, viscosity: Array, density: Array) -> Array:

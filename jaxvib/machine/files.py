@@ -385,7 +385,7 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
     return build(**{**values, **entries})
 
 
-def _require_equal_lengths(drag: Mapping[str, object], loads: Mapping[str, object], prefix: str) -> None:
+def _require_equal_lengths(drag: Mapping[str, Any], loads: Mapping[str, Any], prefix: str) -> None:
     """**Raises** `InputError` for radii in the table of a drag that are not those in the table of the loads."""
     for name in ("radius", "ball_radius"):
         if name in drag and name in loads:

@@ -55,7 +55,11 @@ def test_bearing_drag_has_the_torque_of_the_effect():
     ("cause", "given", "words"),
     [
         ("water", {}, "cause is 'water'; allowed: oil, rolling, bearing"),
-        ("oil", dict(ball_radius=0.02), "viscosity is missing; the drag by oil needs ball_radius, viscosity, density"),
+        (
+            "oil",
+            dict(ball_radius=0.02, viscosity="100 mm^2/s"),
+            "density is missing; the drag by oil needs ball_radius, viscosity, density",
+        ),
         ("oil", dict(ball_radius=0.02, viscosity=0.1, density=900.0, mass=1.0), "mass is not used for the drag by oil"),
         ("oil", dict(ball_radius=0.02, viscosity=1e-4, density=900.0), "Reynolds number of 3.02e"),
         ("oil", dict(ball_radius=34.0, viscosity=0.1, density=900.0), "ball_radius is 34 m; it must be less than the radius"),
