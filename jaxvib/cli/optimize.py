@@ -116,7 +116,8 @@ def _draw_working_regime(output: Output, design: Design, best: Synthesis) -> Non
     regime = None if points is None else jv.working_regime(best.scene, throw=False)
     if regime is None or not bool(regime.stable):
         return
-    output.figure("phases.png", regime.plot)
+    if len(best.scene.exciters) > 1:
+        output.figure("phases.png", regime.plot)
     if points:
         output.figure("deck.png", lambda: jv.sketch(best.scene, deck=regime.deck(points)))
 

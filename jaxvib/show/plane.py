@@ -49,6 +49,10 @@ class _Strut(NamedTuple):
     stiffness: float
     damping: float
 
+    @property
+    def values(self) -> tuple[float, float]:
+        return self.stiffness, self.damping
+
 
 class PlaneView(View):
     """Drawing of a body to scale, with an outline around its centre of mass, its supports and its exciters. Springs are not to
@@ -100,7 +104,7 @@ class PlaneView(View):
         tops = [self.scale * at + 2.0 * wheel.rim for at, wheel in zip(self._axes, self.wheels, strict=True)]
         points = np.concatenate([points, tops])
         (left, bottom), (right, top) = np.min(points, axis=0), np.max(points, axis=0)
-        return float(left) - 0.8, float(right) + 1.7, float(bottom) - 1.0, float(top) + 0.3
+        return float(left) - 0.8, float(right) + 1.7, float(bottom) - 1.1, float(top) + 0.3
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """Return the foundation, springs and dampers, the body, its centre of mass, the exciters."""
@@ -134,7 +138,12 @@ class PlaneView(View):
         for struts in struts_of_support.values():
             lowest = min(struts, key=lambda strut: float((strut.start + strut.vector)[1]))
             x, y = lowest.start + lowest.vector
-            lines = [_pair([s.stiffness for s in struts], "N/m"), _pair([s.damping for s in struts], "N s/m")]
+            two = len(struts) == 2 and struts[0].values != struts[1].values
+            lines = [
+                _directions(struts) if two else "",
+                _pair([s.stiffness for s in struts], "N/m"),
+                _pair([s.damping for s in struts], "N s/m"),
+            ]
             texts.append(
                 Text(
                     float(x),
@@ -160,6 +169,12 @@ class PlaneView(View):
             k = strut.support
             force[k] += (strut.stiffness * strut.along @ displacement[k] + strut.damping * strut.along @ rate[k]) * strut.along
         return force
+
+
+def _directions(struts: list[_Strut]) -> str:
+    """Return the directions of the springs of a support: "across | up", or their angles."""
+    angles = [float(np.rad2deg(np.arctan2(strut.along[1], strut.along[0]))) for strut in struts]
+    return " | ".join({0.0: "across", 90.0: "up"}.get(round(angle, 6), f"at {angle:.4g}°") for angle in angles)
 
 
 def _pair(values: list[float], unit: str) -> str:

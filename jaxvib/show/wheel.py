@@ -138,7 +138,8 @@ def _words_of(exciter: Exciter) -> list[str]:
         if drag is not None:
             words.append(f"drag {_span(np.asarray(drag), 'N s/m')}")
     turning = ", clockwise" if exciter.direction == -1 else ""
-    return [", ".join(words), f"{drive.kind.replace('_', ' ')}: {speed_text(drive.speed)}{turning}"]
+    synchronous = " synchronous" if hasattr(drive, "breakdown_slip") else ""
+    return [", ".join(words), f"{drive.kind.replace('_', ' ')}: {speed_text(drive.speed)}{synchronous}{turning}"]
 
 
 class Wheel:

@@ -190,6 +190,12 @@ def test_regimes_of_many_masses_have_short_titles():
     ] * 3
 
 
+def test_a_single_mass_has_no_circle_beside_its_torque():
+    curves = TorqueCurves(np.array([10.0, 20.0]), np.array([[4.0], [2.0]]), np.ones((2, 1)))
+    one = regime(True, [3.0])
+    assert [len(regimes_chart([one], each, np.zeros(0), names=["motor 1"]).axes) for each in (curves, None)] == [1, 1]
+
+
 @pytest.mark.parametrize(
     ("needed", "torque", "limits"),
     [(-1.0, [3.0, 1.0], (-1.15, 4.6)), (-9.0, [3.0, 1.0], (-4.6, 4.6)), (0.5, [6.0, 1.0], (-0.3, 6.9))],

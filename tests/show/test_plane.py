@@ -81,7 +81,14 @@ def test_arrow_turns_in_its_direction(direction):
 def test_sketch_states_the_numbers_inside_its_limits(scene):
     axis = jv.sketch(scene).axes[0]
     words = " ".join([axis.get_title(loc="left"), *(text.get_text() for text in axis.texts)])
-    for number in ("M = 2000 kg", "J = 600 kg m²", "200 N/mm | 400 N/mm", "unbalance 5 kg m", "1000 rpm", "clockwise"):
+    for number in (
+        "M = 2000 kg",
+        "J = 600 kg m²",
+        "at 20° | at 110°\n200 N/mm | 400 N/mm",
+        "unbalance 5 kg m",
+        "1000 rpm",
+        "clockwise",
+    ):
         assert number in words
     left, right, bottom, top = view_of(scene).limits
     points = np.concatenate([part.points for part in view_of(scene).parts(at_rest(scene), 0.0)])

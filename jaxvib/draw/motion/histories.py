@@ -29,6 +29,9 @@ _MAX_BEATS, _SAMPLES_PER_INTERVAL, _MIN_SAMPLES = 20, 10, 1000
 """Maximum number of beats of an averaged history that is drawn as a curve. A history with more beats and at least
 `_MIN_SAMPLES` samples is drawn as a band between the minima and maxima of intervals of `_SAMPLES_PER_INTERVAL` samples."""
 
+_BEATING_BAND = "band: lowest to highest amplitude while it beats"
+"""Entry of a legend for the band of an averaged history."""
+
 _BAND_ALPHA = 0.22
 """Opacity of a band."""
 
@@ -243,11 +246,11 @@ def _draw_band(
         axis.fill_between(middle, low, high, color=look["color"], alpha=_BAND_ALPHA, lw=0.0, zorder=look["zorder"])
 
 
-def _draw_legend(axis: Axes, least: int = 1) -> None:
+def _draw_legend(axis: Axes, least: int = 1, band: str = "band: lowest to highest value") -> None:
     """Draw the legend of a panel, with an entry for its bands, unless it has fewer than `least` entries."""
     handles, _ = axis.get_legend_handles_labels()
     if axis.collections:
-        handles.append(Patch(color="#555555", alpha=_BAND_ALPHA, lw=0.0, label="band: lowest to highest value"))
+        handles.append(Patch(color="#555555", alpha=_BAND_ALPHA, lw=0.0, label=band))
     if len(handles) >= least:
         legend_above(axis, 6, handles=handles)
 
@@ -310,7 +313,7 @@ def amplitude_histories(
         of_kind = [k for k in range(len(names)) if units[k] == kind]
         lines(axis, factor * amplitude, of_kind, [names[k] for k in of_kind])
         axis.set_ylabel(label)
-        _draw_legend(axis)
+        _draw_legend(axis, band=_BEATING_BAND)
     for k, name in _equal_loads(load_speed, load_speed[-(load_speed.shape[0] // 4) :]):
         lines(axes[-2], scale * load_speed, [k], [name])
     _draw_rotor_speeds(axes[-2], time, scale * rotor_speed)
@@ -321,7 +324,7 @@ def amplitude_histories(
     _draw_legend(axes[-2])
     lines(axes[-1], force, range(len(directions)), directions)
     axes[-1].set_ylabel("foundation force, N")
-    _draw_legend(axes[-1], 2)
+    _draw_legend(axes[-1], 2, _BEATING_BAND)
     axes[-1].set_xlabel("time, s")
     axes[0].text(1.0, 1.02, "zero to peak", transform=axes[0].transAxes, ha="right", va="bottom", fontsize="small")
     return figure if ax is None else ax

@@ -53,6 +53,8 @@ def regimes_chart(
 ) -> Drawn:
     """Draw the torques over the speed in the first panel (if there are `curves`), and the phases of each regime on a circle.
 
+    The phase of a single mass is not drawn beside its torque.
+
     Points are filled for stable regimes, hollow for unstable ones.
 
     **Arguments**: `resonances`, rad/s; `names` (count,) of the masses; `resultant`, see `draw_circle`; `ax`: as many axes
@@ -66,7 +68,8 @@ def regimes_chart(
     [[], ['954.93 rpm, stable', 'phases in the direction of rotation', '0, 0 deg', 'torques 1, 1 N m']]
     """
     unit, scale = speed_unit()
-    count = len(regimes) + (curves is not None)
+    drawn = [] if curves is not None and len(names) == 1 else regimes
+    count = len(drawn) + (curves is not None)
     columns = max(count, 1) if ax is not None else min(max(count, 1), 4)
     rows = 1 if ax is not None else -(-max(count, 1) // columns)
     figure, axes = panels(rows, columns, size=(3.8, 3.6), ax=ax)
@@ -78,7 +81,7 @@ def regimes_chart(
         axis.set_axis_off()
     if not regimes:
         axes[0].text(0.5, 0.5, "no synchronous regime", ha="center", va="center", transform=axes[0].transAxes)
-    for axis, regime in zip(circles, regimes, strict=False):
+    for axis, regime in zip(circles, drawn, strict=False):
         lines = [
             f"{scale * regime.speed:.6g} {unit}, {'stable' if regime.stable else 'unstable'}",
             "phases in the direction of rotation",

@@ -149,8 +149,16 @@ class PhaseJams(AbstractPhaseJam):
                     factor = np.where(~stable & (np.abs(factor - other) < _SAME_LINE_DIFFERENCE * factor), np.nan, factor)
                 curves.append((sentence(jam.pattern), factor, at, stable))
         top, jams = float(self.scene.drive.speed), (omega, np.asarray(self.stable))
-        label = "drag / drag of the scene"
-        return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_shown_drags(curves), unit=unit, ax=ax)
+        times, label = _drag_axis(loads_with_drag(self.scene).drag)
+        within = _shown_drags(curves)
+        curves = [(name, times * factor, at, stable) for name, factor, at, stable in curves]
+        return drag_diagram(curves, top, label=label, at=times, jams=jams, within=within, unit=unit, ax=ax)
+
+
+def _drag_axis(drag: Array) -> tuple[float, str]:
+    """Return the factor and the label of a drag axis: N s/m, or multiples of the drag of the scene if the loads differ."""
+    drag = np.ravel(drag)
+    return (float(drag[0]), "drag, N s/m") if np.all(drag == drag[0]) else (1.0, "drag / drag of the scene")
 
 
 def _shown_drags(curves: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]) -> tuple[float, float]:
@@ -405,8 +413,7 @@ class PhaseBranch(Result):
         """
         from jaxvib.draw.results import drag_diagram  # slow import
 
-        alike = bool(np.all(np.asarray(self.drag == self.drag[0])))
-        times, label = (float(self.drag[0]), "drag, N s/m") if alike else (1.0, "drag / drag of the scene")
+        times, label = _drag_axis(self.drag)
         factor, omega, stable = drag_curve(self)
         curve = ("loads", times * factor, omega, stable)
         return drag_diagram([curve], float(self.rotor_speed), label=label, at=times, unit=unit, ax=ax)

@@ -204,10 +204,10 @@ def test_figure_of_a_branch_is_solid_where_it_is_stable():
 def test_figure_of_all_jams_has_each_on_a_line():
     jams = jv.phase_jams(planar(), starts=8)
     (axis,) = jams.plot(unit="rad/s").axes
-    assert axis.get_xlabel() == "drag / drag of the scene" and axis.get_xlim() == (1.0 / 30.0, 30.0)
+    assert axis.get_xlabel() == "drag, N s/m" and axis.get_xlim() == pytest.approx((0.04 / 30.0, 0.04 * 30.0))
     lines = [line.get_xydata() for line in axis.lines if len(line.get_xdata()) > 2 and line.get_linestyle() != "None"]
     for w in np.asarray(jams.omega):
-        assert any(np.min(np.abs(line - [1.0, w])[np.isfinite(line[:, 0])].sum(axis=1)) < 1e-6 for line in lines)
+        assert any(np.min(np.abs(line - [0.04, w])[np.isfinite(line[:, 0])].sum(axis=1)) < 1e-6 for line in lines)
     points = {line.get_markerfacecolor(): line.get_ydata() for line in axis.lines if line.get_marker() == "o"}
     np.testing.assert_allclose(points["black"], [w for w, good in zip(jams.omega, jams.stable, strict=True) if good])
     assert len(points["white"]) == 2
@@ -218,10 +218,10 @@ def test_figure_of_all_jams_reaches_their_greatest_drag(times):
     scene = planar(0.04 * times)
     factor = float(jv.drag_limits(scene, phases=True).factor[0])
     (axis,) = jv.phase_jams(scene, starts=8).plot(unit="rad/s").axes
-    low, high = axis.get_xlim()
+    low, high = np.divide(axis.get_xlim(), 0.04 * times)
     assert not 1.0 / 30.0 < factor < 30.0 and low < factor < high
     drags = np.concatenate([line.get_xdata() for line in axis.lines if len(line.get_xdata()) > 2])
-    assert np.nanmin(np.abs(np.log(drags / factor))) < 0.05
+    assert np.nanmin(np.abs(np.log(drags / (0.04 * times * factor)))) < 0.05
 
 
 def test_derivatives_are_the_implicit_function_theorems():
