@@ -55,6 +55,7 @@ class Quantity:
     - `mode`: the jam mode to which the quantity refers, if any; typical: 1, 3, 5
     - `of`: the platform or the pair of platforms whose amplitude the quantity contains, if any
     - `parts`: the quantities from which this quantity is computed, for example the terms of a sum
+    - `written`: the Python expression that `repr` shows; default: one that follows from the other arguments
 
     The operators `+ - * / **` on quantities and numbers give quantities; `<` and `>` give a `Demand`. Operands of a sum or a
     comparison must have the same unit. A string such as "50 N" can be an operand: `force < "50 N"`,
@@ -76,10 +77,7 @@ class Quantity:
     mode: int | None = None
     of: Pair = None
     parts: tuple[Quantity, ...] = field(default=(), kw_only=True)
-    """Quantities from which this quantity is computed, for example the terms of a sum."""
-
     written: str = field(default="", kw_only=True, compare=False)
-    """Python expression with which the quantity was made; "" if it follows from the fields."""
 
     def __repr__(self) -> str:
         """Return the quantity as it is written in Python."""
