@@ -126,7 +126,8 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
         lines += [text] if (text := modes_found.missing_text()) else []
         if tolerances:
             lines.append(tolerance_table(ranges, tolerances))
-        lines += _reached_lines(scene, output, [f"mode {mode}" for mode in measures], balanced)
+        unsure = {mode: " (if its loads stay together)" if math.isnan(growth[mode]) else "" for mode in measures}
+        lines += _reached_lines(scene, output, [f"mode {mode}{note}" for mode, note in unsure.items()], balanced)
         lines += [indented(f"mode {mode}:", entry) for mode, entry in measures.items()]
         if folds:
             ends = (modes_found.folds.omega, modes_found.folds.rotor_speed)

@@ -64,7 +64,7 @@ class Branches(AbstractJam):
         """Plot load speed, amplitudes (zero to peak) and foundation force over the rotor speed.
 
         Stable jams are solid lines, unstable ones dashed lines. As in the table of `jaxvib modes`, a jam is unstable if its
-        loads leave it when each is free to move separately (not computed for loads with a `ball_radius` or dry friction).
+        loads leave it when each is free to move separately; balls count as points (not computed for loads with dry friction).
         Jams at the scene's rotor speed are marked with the numbers of their modes.
 
         **Arguments**

@@ -31,6 +31,16 @@ def test_modes_json_has_the_promised_keys(typed):
         np.testing.assert_allclose(m["amplitude"], modes.select(m["mode"]).amplitude, rtol=1e-12)
 
 
+def test_modes_of_loads_with_friction_are_stable_with_a_condition(typed, tmp_path):
+    balls = jv.balls(count=3, mass=0.8, ball_radius=0.01, radius=0.12, drag=1.5)
+    s = scene("two_mass", speed=150.0).replace(loads=balls, effects=(jv.RollingFriction(1e-6),))
+    jv.save_scene(s, tmp_path / "friction.toml")
+    out = typed("modes", "friction.toml")[1]
+    assert "several motions are stable: mode 3 (if its loads stay together), mode 5 (if its loads stay together)" in out
+    modes = jv.jam_modes(s)
+    assert "yes, if they stay together" in modes.summary(s) and "several modes are stable" not in modes.summary(s)
+
+
 def test_modes_writes_table_and_figure(typed, tmp_path):
     code, out, _ = typed("modes", "machine.toml", "--out", "figures")
     assert code == 0 and "mode" in out and "stable" in out and "wrote" in out

@@ -216,7 +216,7 @@ class JamModes(AbstractJam):
         """Return the table of `jaxvib modes` in text; amplitudes and foundation force are zero to peak.
 
         **Arguments**: `scene` of the modes. If it is given, the column "stable" also states whether the loads stay together, as
-        in the table of the command (not computed for loads with a `ball_radius` or dry friction).
+        in the table of the command; balls count as points (not computed for loads with dry friction).
         """
         rotor, resonances = (speed_text(speed) for speed in (np.asarray(self.rotor_speed)[0], self.resonances))
         growth = {} if scene is None else growth_of_modes(self, scene)
@@ -227,14 +227,15 @@ class JamModes(AbstractJam):
         is_known = any(map(math.isfinite, growth.values()))
         notes += [f"stable: {STABILITY_OF_FREE_LOADS if is_known else STABILITY_CRITERION}"]
         notes += ["(summary(scene) computes whether they stay together)"] if scene is None else []
-        stable = [k for k in growth if bool(self.stable[self.row(k)]) and not growth[k] > 0.0]
+        stable = [k for k in growth if bool(self.stable[self.row(k)]) and growth[k] < 0.0]
         notes += ["several modes are stable: simulate(..., start='spin_up') shows which is reached"] if len(stable) > 1 else []
         return "\n".join([f"rotor {rotor}; resonances {resonances}", *rows, *notes])
 
     @validated
     def stable_with_free_loads(self, scene: Scene) -> np.ndarray:
         """Return True for each mode (2 nd + 1,) that is `stable` and whose loads stay together if each is free to move
-        separately, as in the table of `jaxvib modes`. Loads with a `ball_radius` or dry friction are assumed to stay together.
+        separately, as in the table of `jaxvib modes`. Balls count as points; loads with dry friction are assumed to
+        stay together.
 
         **Arguments**: `scene` of the modes.
 

@@ -218,8 +218,8 @@ def growth_of_free_loads(scene: Scene, omega: Array, rotor_speed: Array | None =
     """Return the `growth` (n,), 1/s, of jams of coincident loads with load speeds `omega` and the given rotor speeds (default:
     that of the scene), rad/s, with each load free to move separately.
 
-    It is NaN if there is no such jam nearby, if `omega` is NaN, or for loads with a `ball_radius` or dry friction, which are
-    not included.
+    Loads count as points, also those with a `ball_radius`. The growth is NaN if there is no such jam nearby, if `omega` is NaN,
+    or for loads with dry friction, which is not included.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
@@ -227,9 +227,10 @@ def growth_of_free_loads(scene: Scene, omega: Array, rotor_speed: Array | None =
     >>> [round(float(x), 1) for x in growth_of_free_loads(scene, jv.jam_modes(scene).omega[jnp.array([0, 1, 4])])]
     [-0.4, 19.4, 23.3]
     """
-    loads, speeds = turning_loads(scene, JAM_TERMS), np.asarray(omega)
+    turning_loads(scene, JAM_TERMS)  # raises an error for effects that jams do not include
+    speeds = np.asarray(omega)
     is_finite = np.isfinite(speeds)
-    if loads.ball_radius is not None or has_term(scene.all_effects, ContactFriction):
+    if has_term(scene.all_effects, ContactFriction):
         return np.full(speeds.shape, np.nan)
     working = float(scene.drive.speed)
     starts = np.where(is_finite, speeds, working)

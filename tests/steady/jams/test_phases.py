@@ -329,6 +329,25 @@ def test_jams_by_slope_are_judged_for_loads_that_may_part():
     assert "unstable" not in separated.summary()
 
 
+def test_touching_balls_leave_the_jams_that_points_leave():
+    """Mode 5 of these touching balls is stable by slope only: `phase_jams`, whose balls are points, has one stable jam.
+
+    In a run the balls stay in mode 1 and leave mode 5.
+    """
+    machine = jv.planar_rotor(mass=18.0, stiffness=3e4, damping="8 %", stiffness_up=4e4, damping_up="8 %")
+    balls = jv.balls(count=6, mass=0.1, radius=0.25, drag=0.15, ball_radius=0.015)
+    s = jv.Scene(machine, balls, jv.ConstantSpeed("1200 rpm"), (jv.LoadContact(stiffness=1e5, restitution=0.6),))
+    modes, phases = jv.jam_modes(s), jv.phase_jams(s)
+    assert modes.stable.tolist() == [True, False, False, False, True]
+    assert modes.stable_with_free_loads(s).tolist() == [True, False, False, False, False]
+    assert abs(float(phases.omega[int(np.flatnonzero(phases.stable)[0])]) / float(modes.omega[0]) - 1.0) < 0.02
+    text = modes.summary(s)
+    assert np.sum(phases.stable) == 1 and "if they stay together" not in text and "several modes are stable" not in text
+    for mode, stays in ((1, True), (5, False)):
+        angle = jv.simulate(s, 3.0, start="jam", mode=mode, estimate=False, samples=2).trajectory.state.angle[0]
+        assert (float(np.ptp(angle[1])) < 1.01 * float(np.ptp(angle[0]))) == stays
+
+
 def test_branch_diagram_is_dashed_where_loads_separate():
     """The loads leave mode 5, which is stable by slope, see above. A single load cannot leave it."""
     several = platforms()
