@@ -126,8 +126,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
         lines += [text] if (text := modes_found.missing_text()) else []
         if tolerances:
             lines.append(tolerance_table(ranges, tolerances))
-        unsure = {mode: " (if its loads stay together)" if math.isnan(growth[mode]) else "" for mode in measures}
-        lines += _reached_lines(scene, output, [f"mode {mode}{note}" for mode, note in unsure.items()], balanced)
+        lines += _reached_lines(scene, output, [f"mode {k}{_condition(growth[k])}" for k in measures], balanced)
         lines += [indented(f"mode {mode}:", entry) for mode, entry in measures.items()]
         if folds:
             ends = (modes_found.folds.omega, modes_found.folds.rotor_speed)
@@ -136,6 +135,11 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
         return "\n".join([*lines, *_drag_lines(scene, limits), *_imbalance_lines(scene)])
 
     output.done(document, text, "modes", modes_found)
+
+
+def _condition(growth: float) -> str:
+    """Return the condition under which a jam that is stable by slope is stable, from the growth of free loads, 1/s."""
+    return " (if its loads stay together)" if math.isnan(growth) else ""
 
 
 def _is_balance_stable(scene: jv.Scene) -> bool | None:

@@ -31,7 +31,7 @@ def test_modes_json_has_the_promised_keys(typed):
         np.testing.assert_allclose(m["amplitude"], modes.select(m["mode"]).amplitude, rtol=1e-12)
 
 
-def test_modes_of_loads_with_friction_are_stable_with_a_condition(typed, tmp_path):
+def test_modes_with_friction_are_stable_under_a_condition(typed, tmp_path):
     balls = jv.balls(count=3, mass=0.8, ball_radius=0.01, radius=0.12, drag=1.5)
     s = scene("two_mass", speed=150.0).replace(loads=balls, effects=(jv.RollingFriction(1e-6),))
     jv.save_scene(s, tmp_path / "friction.toml")
