@@ -26,6 +26,9 @@ from jaxvib.cli.document import force_lines, indented, measures_of
 from jaxvib.cli.output import csv_options, fields_of
 from jaxvib.errors import InputError
 
+_MAX_FOLD_SPEEDS = 10.0
+"""Largest rotor speed of a fold in the table, relative to the rotor speed of the scene."""
+
 
 @command("modes")
 @SPEED
@@ -110,10 +113,9 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
     }
 
     def text() -> str:
-        from jaxvib.display import speed_text, speed_unit  # slow imports, which --help does not need
+        from jaxvib.display import speed_text  # slow imports, which --help does not need
         from jaxvib.steady.jams.jam import modes_table
 
-        unit, scale = speed_unit()
         head, *rows = modes_table(modes_found, growth)
         lines = [
             f"rotor {speed_text(scene.drive.speed)}; resonances {speed_text(modes_found.resonances)}",
@@ -128,10 +130,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
             lines.append(tolerance_table(ranges, tolerances))
         lines += _reached_lines(scene, output, [f"mode {k}{_condition(growth[k])}" for k in measures], balanced)
         lines += [indented(f"mode {mode}:", entry) for mode, entry in measures.items()]
-        if folds:
-            ends = (modes_found.folds.omega, modes_found.folds.rotor_speed)
-            pairs = [[f"{scale * end[k]:.5g}" for end in ends] for k in folds]
-            lines.append(table("folds: two jams merge", [f"loads, {unit}", f"rotor, {unit}"], pairs))
+        lines += _fold_lines(float(scene.drive.speed), modes_found.folds, folds)
         return "\n".join([*lines, *_drag_lines(scene, limits), *_imbalance_lines(scene)])
 
     output.done(document, text, "modes", modes_found)
@@ -140,6 +139,18 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
 def _condition(growth: float) -> str:
     """Return the condition under which a jam that is stable by slope is stable, from the growth of free loads, 1/s."""
     return " (if its loads stay together)" if math.isnan(growth) else ""
+
+
+def _fold_lines(rotor_speed: float, folds: Any, existing: list[int]) -> list[str]:
+    """Return a table of the existing folds, and a line with the number of those far above the rotor speed, rad/s."""
+    from jaxvib.display import speed_unit  # slow import, which --help does not need
+
+    unit, scale = speed_unit()
+    near = [k for k in existing if folds.rotor_speed[k] <= _MAX_FOLD_SPEEDS * rotor_speed]
+    pairs = [[f"{scale * end[k]:.5g}" for end in (folds.omega, folds.rotor_speed)] for k in near]
+    lines = [table("folds: two jams merge", [f"loads, {unit}", f"rotor, {unit}"], pairs)] if near else []
+    far = len(existing) - len(near)
+    return lines + ([f"folds above {_MAX_FOLD_SPEEDS:g} times the rotor speed, not shown: {far}"] if far else [])
 
 
 def _is_balance_stable(scene: jv.Scene) -> bool | None:

@@ -281,7 +281,7 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
     axis.set(xscale="log", xlim=(low**1.1, high**1.1), ylim=(-0.6, len(rows) - 0.4))
     axis.set_yticks(places, [name for name, _, _ in rows])
     log_ticks(axis, "x")
-    axis.set_xlabel("after / before; amplitudes and forces zero to peak")
+    axis.set_xlabel("after / before; amplitudes and forces zero to peak, strokes peak to peak")
     axis.text(1.02, 1.0, "before → after", va="bottom", fontsize=9, fontweight="bold", transform=axis.transAxes)
     if title:
         axis.set_title(title, loc="left", pad=24.0, fontsize="medium")

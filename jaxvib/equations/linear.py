@@ -364,7 +364,7 @@ def turning_loads(
 def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
     """**Raises** `InputError` unless one load or, with `each`, all loads have drag. Traced values are not checked."""
     if when_known(lambda drag: not (np.all if each else np.any)(np.asarray(drag) > 0.0), loads.drag):
-        raise InputError("loads.drag", "is 0; loads without drag never follow the rotor; use a drag greater than 0")
+        raise InputError("loads.drag", "is 0; this function needs a viscous drag greater than 0, also with dry friction")
 
 
 def require_one_point(mounting: Mount) -> None:

@@ -430,8 +430,8 @@ def pendulums(*, count: int, mass: Numbers, radius: Number, drag: Numbers, inert
     - `count` N: number of pendulums; typical: 1 to 4
     - `mass` m of a pendulum, kg; typical: 0.05 to 1
     - `radius` R: distance of the centre of mass from the axis, m; typical: 0.05 to 0.2
-    - `drag` b_W at that radius, N s/m: a bearing with the viscous coefficient mu (N m s) has b_W = mu/R^2; typical: 0.05 to 3,
-      that is mu from 3e-4 to 0.02 N m s at R = 0.08 m
+    - `drag` b_W at that radius, N s/m: a bearing with the viscous coefficient mu (N m s) has b_W = mu/R^2; typical: 5e-4 to 3,
+      that is mu from 3e-6 to 0.02 N m s at R = 0.08 m, up to 0.05 for ball bearings, see `drag_of`
     - `inertia` J_C about the centre of mass, kg m^2 (default 0: a point mass); typical: 0 to 0.5 m R^2
 
     **Returns** `CircularLoads`. **Raises** `InputError` in the cases of `balls`.

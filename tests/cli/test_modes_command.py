@@ -8,7 +8,7 @@ import numpy as np
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.cli.modes import _drag_lines, _imbalance_lines
+from jaxvib.cli.modes import _drag_lines, _fold_lines, _imbalance_lines
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.steady.jams.phase_search import PhaseJams
 
@@ -59,6 +59,15 @@ def test_drag_limits_of_balls_at_any_phases_are_those_of_points():
     np.testing.assert_allclose(touching.factor / points.factor, chain**2, rtol=1e-2)
     said = "loads count as points: touching balls jam only up to a smaller drag"
     assert _drag_lines(table, points, points=True)[-1] == said and said not in _drag_lines(table, touching)
+
+
+def test_folds_far_above_the_rotor_speed_are_only_counted():
+    folds = jv.jam_modes(scene("two_mass", speed=150.0)).folds
+    speeds = np.sort(np.asarray(folds.rotor_speed)[np.asarray(folds.exists)])
+    shown = np.flatnonzero(np.asarray(folds.exists)).tolist()
+    far = _fold_lines(float(speeds[-1]) / 10.1, folds, shown)
+    assert f"{float(speeds[0]) * 30.0 / np.pi:.5g}" in far[0] and f"{float(speeds[-1]) * 30.0 / np.pi:.5g}" not in far[0]
+    assert far[1:] == ["folds above 10 times the rotor speed, not shown: 1"] and len(_fold_lines(150.0, folds, shown)) == 1
 
 
 def equal_points(table):

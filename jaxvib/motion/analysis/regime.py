@@ -29,6 +29,10 @@ _MAX_EQUAL_SPEED_DIFFERENCE = 3e-3
 """Relative difference below which two speeds count as equal: those of two loads, of a load and the rotor, or of a load in the
 first and the second half of the window."""
 
+_MAX_JAM_CHANGE = 0.02
+"""Change of the common speed of the loads from the first to the second half of the window, relative to this speed, up to which
+they count as jammed. Slow loads that still accelerate change their speed by little in comparison with the rotor speed."""
+
 _LOCKED_PHASE_CHANGE = 0.1
 """Change of the relative phases, rad, from one half of the window to the other below which they count as constant."""
 
@@ -185,7 +189,7 @@ def regime(scene: Scene, segment: Trajectory) -> Regime:
       loads. For a rotor that tilts the same applies to their moments
     - Loads that all turn at another speed with constant relative phases are jammed
     - A motion is not steady if the speed of a load changes by more than 0.3 % of the rotor speed from one half of the part to
-      the other
+      the other, or if the common speed of loads that turn together changes by more than 2 % of itself
 
     **Arguments**
 
@@ -219,7 +223,7 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
     end = times.shape[0] - 1
     whole, early, late = mean_speeds(times, angles, rates, first=(0, 0, half), last=(end, half - 1, end))
     speed, rotor = whole[:-1], whole[-1]
-    reference = jnp.maximum(jnp.abs(rotor), jnp.finfo(rotor.dtype).tiny)
+    mean, reference = jnp.mean(speed), jnp.maximum(jnp.abs(rotor), jnp.finfo(rotor.dtype).tiny)
     change = jnp.max(jnp.abs(late - early)[:-1]) / reference
     is_steady = change < _MAX_EQUAL_SPEED_DIFFERENCE
     # XLA's maximum of NaN is -inf on CPUs.
@@ -229,6 +233,7 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
     is_behind = jnp.abs(phi[-1] - phi[0] - (turn[-1] - turn[0])) > _LOCKED_PHASE_CHANGE
     is_behind = is_behind & (jnp.abs(lags[1] - lags[0]) < _MAX_LAG_CHANGE * jnp.abs(lags[1] + lags[0]) / 2.0)
     with_rotor = (jnp.abs(speed - rotor) < _MAX_EQUAL_SPEED_DIFFERENCE * reference) & ~is_behind
+    all_with_rotor = jnp.all(with_rotor)
     # Circular means of phi_j - phi_1. If the means of the two halves differ, the phase is not constant.
     to_first, load_phase_change = _mean_phases(phi - phi[:, :1], half)
     to_rotor, rotor_phase_change = _mean_phases(phi - turn[:, None], half)
@@ -240,18 +245,18 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
     size = jnp.sum(jnp.abs(unbalances))
     unbalance = _unbalance(scene, unbalances * jnp.exp(1j * to_rotor), imbalance, turn)
     name = RegimeName.where(is_steady, RegimeName.parted, RegimeName.unsettled)
-    name = RegimeName.where(is_steady & has_one_speed & ~jnp.any(with_rotor), RegimeName.jammed, name)
+    keeps_speed = jnp.abs(jnp.mean((late - early)[:-1])) < _MAX_JAM_CHANGE * jnp.abs(mean)
+    jam = RegimeName.where(keeps_speed, RegimeName.jammed, RegimeName.unsettled)
+    name = RegimeName.where(is_steady & has_one_speed & ~jnp.any(with_rotor), jam, name)
     name = RegimeName.where(
-        is_steady & jnp.all(with_rotor),
+        is_steady & all_with_rotor,
         RegimeName.where(unbalance < _BALANCED_UNBALANCE_SHARE, RegimeName.balanced, RegimeName.unbalanced),
         name,
     )
     name = RegimeName.where(jnp.all(swings), RegimeName.swinging, name)
 
     natural = excited_frequencies(scene, rotor)
-    mean = jnp.mean(speed)
     nearest = jnp.argmin(jnp.abs(natural - mean))
-    all_with_rotor = jnp.all(with_rotor)
     return Regime(
         name=name,
         pattern=phase_pattern(jnp.where(all_with_rotor, to_rotor, to_first)),

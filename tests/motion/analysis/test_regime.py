@@ -57,6 +57,7 @@ CASES = {
     "gaining on the rotor": (dict(phase=[0.0, 0.0, 0.1, 0.1], speed=0.9971 * 460.0, slow=0.4), "unbalanced", "together", 0),
     "below half the first resonance": (dict(phase=[0.0, 0.1, -0.1, 0.05], speed=80.0), "jammed", "together", 1),
     "parted": (dict(phase=[0.0, 0.0, 0.0, 0.0], speed=[170.0, 170.0, 460.0, 460.0]), "parted", None, 0),
+    "slow and still accelerating": (dict(phase=[0.0, 0.0, 0.0, 0.0], speed=20.0, slow=1.0), "unsettled", None, 0),
     "unsettled": (dict(phase=[0.0, 0.0, 0.0, 0.0], speed=200.0, slow=5.0), "unsettled", None, 0),
 }
 

@@ -271,7 +271,7 @@ def test_loads_that_balance_are_no_jam():
 
 
 def test_wrong_questions():
-    with pytest.raises(jv.InputError, match=r"loads.drag is 0; loads without drag"):
+    with pytest.raises(jv.InputError, match=r"loads.drag is 0; this function needs a viscous drag greater than 0"):
         jv.phase_jams(planar(0.0))
     with pytest.raises(jv.InputError, match=r"phase has shape \(3,\); one phase for each load is needed, \(2,\)"):
         phase_jam(planar(), 100.0, jnp.zeros(3))
