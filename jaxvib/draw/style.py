@@ -143,18 +143,26 @@ def panels(
     return figure, list(grid.ravel())
 
 
+_MAX_OUTER_SHARE = 0.1
+"""Largest part of an outer cell beyond its position, as a share of the range of all positions."""
+
+
 def cell_edges(places: np.ndarray, log: bool = False) -> np.ndarray:
     """Return the edges (n + 1,) of cells around ascending positions (n,), midway between neighbours on the drawn scale.
 
-    >>> cell_edges(np.array([1.0, 3.0])).tolist(), cell_edges(np.array([1.0, 100.0]), True).round(9).tolist()
-    ([0.0, 2.0, 4.0], [0.1, 10.0, 1000.0])
+    The first and the last cell reach at most `_MAX_OUTER_SHARE` of the range beyond the positions, where nothing is known.
+
+    >>> cell_edges(np.array([1.0, 3.0])).tolist(), cell_edges(np.array([1.0, 1e4]), True).round(9).tolist()
+    ([0.8, 2.0, 3.2], [0.398107171, 100.0, 25118.864315096])
     """
     if log:
         return np.exp(cell_edges(np.log(places)))
     if places.size == 1:
         return places[0] + max(abs(float(places[0])), 1.0) * np.array([-0.1, 0.1])
     between = (places[:-1] + places[1:]) / 2.0
-    return np.concatenate([[2.0 * places[0] - between[0]], between, [2.0 * places[-1] - between[-1]]])
+    most = _MAX_OUTER_SHARE * (places[-1] - places[0])
+    low, high = (min(x, most) for x in (between[0] - places[0], places[-1] - between[-1]))
+    return np.concatenate([[places[0] - low], between, [places[-1] + high]])
 
 
 def log_places(low: float, high: float, max_ticks: int = 9) -> LogLocator:

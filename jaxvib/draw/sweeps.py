@@ -74,11 +74,23 @@ def label_map(
             inside = inside or bool(np.any(within[0] & within[1]))
         if inside:
             entries.append(Line2D([], [], color="black", lw=width, ls=dashes, label=f"{kind} bifurcations of exact jams"))
+    entries += _case_points(axis, x, y)
     axis.set(xlim=edges[0], ylim=edges[1])
     _scales(axis, x_label, y_label, log)
     axis.grid(False)
     legend_above(axis, 3, handles=entries)
     return figure if ax is None else ax
+
+
+_MAX_MARKED_CASES = 150
+"""Number of cases up to which each is marked by a point in a map."""
+
+
+def _case_points(axis: Axes, x: np.ndarray, y: np.ndarray) -> list[Line2D]:
+    """Mark the cases of a map over x (n,) and y (m,) by points unless there are many, and return their entry of the legend."""
+    if x.size * y.size > _MAX_MARKED_CASES:
+        return []
+    return axis.plot(np.tile(x, y.size), np.repeat(y, x.size), "o", ms=3.0, mfc="white", mec="black", mew=0.7, label="case")
 
 
 def _to_edges(
@@ -147,6 +159,7 @@ def value_map(
     axis.set_facecolor("#dddddd")
     drawn = axis.pcolormesh(cell_edges(x, log[0]), cell_edges(y, log[1]), values, cmap="viridis", rasterized=True)
     figure.colorbar(drawn, ax=axis, label=label)
+    legend_above(axis, handles=_case_points(axis, x, y))
     _scales(axis, x_label, y_label, log)
     axis.grid(False)
     return figure if ax is None else ax
@@ -173,9 +186,10 @@ def shares_chart(
     *,
     x_label: str,
     log: bool = False,
+    intervals: bool = True,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw fractions (n,) over x (n,) by name, each with its confidence interval as a bar or a band.
+    """Draw fractions (n,) over x (n,) by name, each with its confidence interval as a bar or a band if `intervals` is True.
 
     `shares` contains for each name the fraction and the lower and the upper end of its confidence interval, of 95 %.
 
@@ -187,16 +201,20 @@ def shares_chart(
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     for k, (colour, (name, (share, low, high))) in enumerate(zip(label_colors([*shares]), shares.items(), strict=True)):
         look = {"color": colour, "ls": STROKES[k % len(STROKES)], "marker": marker_of(k)}
-        shift = 0.006 * (k - 0.5 * (len(shares) - 1)) if len(x) <= _MAX_BARS else 0.0  # bars stand beside each other
+        shift = (
+            0.006 * (k - 0.5 * (len(shares) - 1)) if intervals and len(x) <= _MAX_BARS else 0.0
+        )  # bars stand beside each other
         place = x * (x[-1] / x[0]) ** shift if log else x + shift * np.ptp(x)
         axis.plot(place, 100.0 * share, ms=3.5, lw=1.1, label=name, **look)
+        if not intervals:
+            continue
         if len(x) > _MAX_BARS:
             axis.fill_between(x, 100.0 * low, 100.0 * high, color=colour, alpha=0.15, lw=0.0)
         else:  # overlapping bands of a few wide intervals could not be distinguished
             reach = 100.0 * np.maximum([share - low, high - share], 0.0)
             axis.errorbar(place, 100.0 * share, reach, fmt="none", ecolor=colour, elinewidth=0.9, capsize=2.0)
     axis.set_ylim(-3.0, 103.0)
-    _scales(axis, x_label, "share of the cases, % (95 % confidence)", (log, False))
+    _scales(axis, x_label, f"share of the cases, %{' (95 % confidence)' if intervals else ''}", (log, False))
     legend_above(axis, 3)
     return figure if ax is None else ax
 

@@ -174,7 +174,7 @@ def plot_map(
 
 
 def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None = None) -> Drawn:
-    """Plot the share of each label (regimes with their jam modes) over one axis, with Wilson's 95 % intervals.
+    """Plot the share of each label (regimes with their jam modes) over one axis; of samples with Wilson's 95 % intervals.
 
     Each share is taken over all cases of the other axes. **Returns** a matplotlib figure, or the given `ax`.
     """
@@ -202,7 +202,8 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     shares = {name: (n / total, *wilson(n, total)) for name, n in hits.items() if np.any(n > 0)}
     log = _is_log(opened, over)
     _, scale = display_unit(opened, over)
-    return shares_chart(scale * opened.read(over), shares, x_label=axis_label(opened, over), log=log, ax=ax)
+    look: Look = {"x_label": axis_label(opened, over), "log": log, "intervals": SAMPLE in dims}
+    return shares_chart(scale * opened.read(over), shares, **look, ax=ax)
 
 
 def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
@@ -222,7 +223,15 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
     edges = np.linspace(low, high if high > low else low + max(abs(low), 1.0) * 1e-6, _HISTOGRAM_BINS + 1)
     counts = sum(np.histogram(_values(opened, name, rows), edges)[0] for rows in opened.pieces())
     _, factor = display_unit(opened, name)
-    return distribution_chart(factor * edges, np.asarray(counts), x_label=measure_label(opened, name), ax=ax)
+    return distribution_chart(
+        factor * edges, np.asarray(counts), x_label=measure_label(opened, name) + _labels_note(opened), ax=ax
+    )
+
+
+def _labels_note(opened: Store) -> str:
+    """Return a line with the labels of the cases if there are several: "all cases: 4 balanced, 2 jammed"."""
+    counts = label_counts(opened)
+    return f"\nall cases: {', '.join(f'{n} {label}' for label, n in counts)}" if len(counts) > 1 else ""
 
 
 def _no_value(opened: Store, name: str) -> InputError:
@@ -259,7 +268,7 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
         raise _no_value(opened, name)
     means = np.asarray([sums[axis][:, 0] / np.maximum(sums[axis][:, 1], 1) for axis in axes])
     means = np.where(np.asarray([sums[axis][:, 1] for axis in axes]) > 0, means, np.nan)
-    label = f"mean of {measure_label(opened, name)}"
+    label = f"mean of {measure_label(opened, name)}{_labels_note(opened)}"
     _, factor = display_unit(opened, name)
     words = [_axis_words(opened, axis) for axis in axes]
     return tornado_chart(words, *(factor * m for m in (*means.T, total[0] / total[1])), x_label=label, ax=ax)
@@ -280,7 +289,14 @@ def _thinned(store: Store, axis: str) -> tuple[np.ndarray, int]:
 
 def _is_log(store: Store, axis: str) -> bool:
     spec = store.record["axes"].get(axis)
-    return isinstance(spec, Mapping) and spec.get("scale") == "log"
+    if isinstance(spec, Mapping):
+        return spec.get("scale") == "log"
+    values = np.sort(store.read(axis, slice(0, 1 << 20)))
+    if values.size < 3 or not values[0] > 0.0 or values[0] == values[-1]:
+        return False
+    # A list of values is on the scale on which its gaps differ less.
+    linear, log = (np.diff(each)[np.diff(each) > 0.0] for each in (values, np.log(values)))
+    return bool(np.max(log) / np.min(log) < np.max(linear) / np.min(linear))
 
 
 _USUAL_SIZES = {"m": 0.01, "N/m": 1e5, "N": 100.0}

@@ -1,6 +1,7 @@
 """Figures of stores: intervals, shares, sensitivities, and which figure fits."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -12,8 +13,9 @@ from scenes import scene
 
 import jaxvib as jv
 from jaxvib.draw.sweeps import label_map
-from jaxvib.sweeps.figures import plot_distribution, plot_map, plot_shares, plot_tornado
+from jaxvib.sweeps.figures import label_counts, plot_distribution, plot_map, plot_shares, plot_tornado
 from jaxvib.sweeps.results import results_table
+from jaxvib.sweeps.store import Store
 from jaxvib.sweeps.study import study
 from jaxvib.sweeps.sweep import run_study
 from optimize import Quantity
@@ -57,6 +59,8 @@ def test_a_map_has_the_values_at_their_place(grid):
     mesh = figure.axes[0].collections[0]
     np.testing.assert_array_equal(np.asarray(mesh.get_array()), grid.data["weighted"].values.T)
     assert figure.axes[0].get_yscale() == "log" and figure.axes[0].get_xlabel() == "rotor speed, rpm"
+    cases = figure.axes[0].lines[0].get_xydata()
+    assert len(cases) == 66 and cases[-1] == pytest.approx([3000.0 / np.pi, 10.0])
     turned = plot_map(grid.store, "weighted", x="loads.drag")
     np.testing.assert_array_equal(np.asarray(turned.axes[0].collections[0].get_array()), grid.data["weighted"].values)
 
@@ -77,7 +81,13 @@ def test_each_label_has_a_colour_and_so_has_a_missing_label():
     colours = [to_hex(c) for c in mesh.to_rgba(np.asarray(mesh.get_array())).reshape(-1, 4)]
     assert colours[1] == colours[2] and len(set(colours)) == 3
     assert [(p.get_hatch(), p.get_path().vertices[0].tolist()) for p in axis.patches] == [("...", [0.5, 0.5])]
-    assert [t.get_text() for t in axis.get_legend().get_texts()] == ["a", "c", "no result", "fold bifurcations of exact jams"]
+    assert [t.get_text() for t in axis.get_legend().get_texts()] == [
+        "a",
+        "c",
+        "no result",
+        "fold bifurcations of exact jams",
+        "case",
+    ]
 
 
 def test_shares_are_counted_over_the_cases(grid):
@@ -86,6 +96,16 @@ def test_shares_are_counted_over_the_cases(grid):
     expected = np.linspace(20.0, 100.0, 11) // 40.0
     np.testing.assert_array_equal(lines["not jammed"], 100.0 * (expected == 0.0))
     np.testing.assert_array_equal(lines["jammed, mode 2"], 100.0 * (expected == 2.0))
+    assert axis.get_ylabel() == "share of the cases, %" and not axis.containers  # no confidence interval without samples
+    counted = ", ".join(f"{n} {name}" for name, n in label_counts(Store(Path(grid.store))))
+    for figure in (plot_distribution(grid.store, "weighted"), plot_tornado(grid.store, "weighted")):
+        assert figure.axes[0].get_xlabel().endswith(f"weighted, N\nall cases: {counted}")
+
+
+@pytest.mark.parametrize(("values", "scale"), [([0.1, 0.2, 2.5], "log"), ([1.0, 2.0, 3.0], "linear"), ([1.0, 9.0], "linear")])
+def test_a_list_of_values_selects_the_scale_of_its_axis(values, scale, tmp_path):
+    found = jv.sweep(SCENE, {"loads.drag": values}, [Quantity("weighted", "N", weighted)], tmp_path / "s.zarr")
+    assert found.plot().axes[0].get_xscale() == scale
 
 
 def test_a_tornado_shows_what_each_number_does(sampled):
