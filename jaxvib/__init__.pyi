@@ -60,7 +60,8 @@ from jaxvib.equations.forces import energy as energy, power as power, foundation
 from jaxvib.equations.forces import foundation_moment as foundation_moment, normal_force as normal_force
 
 # Measures of a vibration
-from jaxvib.steady.measures import vibration_measures as vibration_measures, Vibration as Vibration
+from jaxvib.steady.measures import vibration_measures as vibration_measures
+from jaxvib.steady.vibration import Vibration as Vibration
 from jaxvib.steady.measures import VibrationMeasures as VibrationMeasures
 from jaxvib.steady.measures import conveying_speed as conveying_speed
 from jaxvib.steady.zone import vibration_zone as vibration_zone

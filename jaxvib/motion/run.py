@@ -54,9 +54,10 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.measures import Vibration, VibrationMeasures
+from jaxvib.steady.measures import VibrationMeasures
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.steady.points import Harmonic, PathsOfPoints
+from jaxvib.steady.vibration import Vibration
 from jaxvib.units import Number
 from jaxvib.units.known import when_known
 
@@ -437,7 +438,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     def vibration(self) -> Vibration:
         """Return the vibration over the window, for `vibration_measures`: the fitted harmonic, measured amplitudes and force,
-        mean torques and powers of the drives.
+        mean torques and powers of the drives, and samples of the whole motion.
 
         **Raises** `InputError` with the text of `no_vibration`, unless this is empty.
         """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple, cast
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -25,6 +25,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.plane_body import PlaneBody, PlaneNetwork
 from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.machine.validation import validate_scene
+from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit, names_along
@@ -34,6 +35,7 @@ from jaxvib.steady.jams.jam import Jam
 from jaxvib.steady.jams.phases import PhaseJam
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.points import at_positive_speed, ellipse_at, read_slope, require_amplitudes, rows_in_plane
+from jaxvib.steady.vibration import Samples, Vibration, half_range, peak_acceleration, peak_forces, rms_velocity
 from jaxvib.steady.zone import vibration_zone
 from jaxvib.units import Number, number
 from jaxvib.units.known import when_known
@@ -61,39 +63,6 @@ _MAX_RATIO_IN_PERCENT = 10.0
 """Transmissibility above which texts state it as a multiple, not in percent."""
 
 
-def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
-    """Return the amplitude of the acceleration, in g, of a sine of `amplitude`, m zero to peak, and `speed`, rad/s."""
-    return speed**2 * amplitude / STANDARD_GRAVITY
-
-
-def rms_velocity_of(amplitude: Array, speed: Array | float) -> Array:
-    """Return the root mean square of the velocity, m/s, of a sine of `amplitude`, m zero to peak, and `speed`, rad/s."""
-    return speed * amplitude / np.sqrt(2.0)
-
-
-class Vibration(NamedTuple):
-    """Vibration of a machine at one speed of its exciters, q = Re(displacement exp(i w t)).
-
-    Returned by `Run.vibration`, and by the same method of envelopes, synchronous regimes and responses.
-
-    **Attributes** (nd coordinates)
-
-    - `speed` w, rad/s
-    - `displacement` (nd,): complex amplitudes, and `amplitude` (nd,), zero to peak, m (rad for rotations)
-    - `foundation_force` and `exciter_force`, N zero to peak: force on the foundation, and resultant of the centrifugal forces
-    - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive; `power` is the mean of torque times
-      speed, which differs from the product of the means if both vary within a turn
-    """
-
-    speed: Array
-    displacement: Array
-    amplitude: Array
-    foundation_force: Array
-    exciter_force: Array
-    torque: Array
-    power: Array
-
-
 class VibrationMeasures(Readable):
     """Measures of a vibration as data sheets state them.
 
@@ -103,7 +72,7 @@ class VibrationMeasures(Readable):
 
     - `speed` of the loads or unbalances, rad/s
     - `stroke` (nt,), m peak to peak; typical: 2 to 20 mm
-    - `acceleration` (nt,), amplitude in g; typical: 2 to 6 for screens
+    - `acceleration` (nt,), largest magnitude in g; typical: 2 to 6 for screens
     - `velocity` (nt,), m/s root mean square; typical: 50 to 300 mm/s
     - `exciter_force`, N zero to peak: resultant of the centrifugal forces; for forces in two directions the root of the sum of
       the squares of both peaks, that is sqrt(2) times a force that rotates
@@ -123,10 +92,14 @@ class VibrationMeasures(Readable):
     - `throughput`, kg/s, at the `point`; None if no `layer` was given
     - `coordinates` (nt,): names of the coordinates, and `directions` of the force on the foundation
 
+    For a run these are those of the whole motion in its window, with all its frequencies, except for `throw_angle` and
+    `conveying_speed`, which are those of the harmonic at `speed`. The throw number of a run is its largest acceleration toward
+    the deck's lower side, divided by the component of g in this direction.
+
     `static_deflection` and `static_load` are NaN if the supports cannot carry the weight, if the directions of the coordinates
     are unknown, and for a rotor without the effect `Gravity`, whose axis may be vertical. `dynamic_load`, `side_load`, and
-    `foundation_load` in two directions are NaN for a scene with supports that are effects (`CubicSupport`, `Stop`,
-    `FrictionSupport`), and for matrices without a foundation.
+    (except for runs) `foundation_load` in two directions are NaN for a scene with supports that are effects (`CubicSupport`,
+    `Stop`, `FrictionSupport`), and for matrices without a foundation.
     """
 
     speed: Array = eqx.field(metadata=in_unit("rad/s"))
@@ -288,6 +261,8 @@ def vibration_measures(
 
     Omega is the speed, and Y the complex amplitude of a coordinate. k and c are the stiffness and the damping of a support, u
     and s its displacements by the vibration and by the weight. M and K are the mass and stiffness matrices of the machine.
+    For a run, strokes, accelerations, velocities and forces are those of the whole motion in its window, see
+    `VibrationMeasures`.
 
     **Arguments**
 
@@ -384,21 +359,18 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
     amplitude, (displacement, w) = motion.amplitude[lengths], at_positive_speed(motion.displacement, motion.speed)
     has_weight = scene.machine.places not in ("shaft", "point") or has_term(scene.effects, GravityField)
     sag = weight_deflection(model) if has_weight else None
-    static, dynamic, side = support_loads(model, w, displacement, sag)
+    static, dynamic, side = support_loads(model, w, displacement, sag, motion.samples)
     forced = motion.exciter_force != 0.0  # True for NaN
     force = model.known_force(motion.foundation_force)
     ratio = jnp.where(forced, force / jnp.where(forced, motion.exciter_force, 1.0), jnp.inf)
-    each_direction = magnitude((carrier.foundation_stiffness + 1j * w * carrier.foundation_damping) @ displacement)
-    if model.supports or not scene.machine.has_foundation:
-        each_direction = force[None] if each_direction.shape == (1,) else jnp.full_like(each_direction, jnp.nan)
     measures = VibrationMeasures(
         speed=motion.speed,
         stroke=2.0 * amplitude,
-        acceleration=acceleration_of(amplitude, w),
-        velocity=rms_velocity_of(amplitude, w),
+        acceleration=peak_acceleration(motion)[lengths],
+        velocity=rms_velocity(motion)[lengths],
         exciter_force=motion.exciter_force,
         transmissibility=ratio,
-        foundation_load=each_direction,
+        foundation_load=_foundation_load(model, motion, force),
         static_deflection=jnp.full_like(amplitude, jnp.nan) if sag is None else sag[lengths],
         static_load=static,
         dynamic_load=dynamic,
@@ -415,18 +387,41 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
     return dataclasses.replace(measures, **stacked)
 
 
+def _foundation_load(model: LinearModel, motion: Vibration, force: Array) -> Array:
+    """Return the foundation force of each direction, N zero to peak; `force`: that of all directions."""
+    carrier, samples = model.carrier, motion.samples
+    has_harmonic = samples is None and not model.supports and model.scene.machine.has_foundation
+    if has_harmonic:
+        rows = carrier.foundation_stiffness, carrier.foundation_damping
+        return peak_forces(*rows, *at_positive_speed(motion.displacement, motion.speed), None)
+    if len(carrier.foundation_directions) == 1:
+        return force[None]
+    if samples is None or not model.scene.machine.has_foundation:
+        return jnp.full(len(carrier.foundation_directions), jnp.nan, force.dtype)
+    return half_range(samples.foundation_force)
+
+
 def _measures_at(scene: Scene, motion: Vibration, place: Place, slope: Array) -> dict[str, Array]:
     """Return the measures of a point of a body in a plane by the names of their fields."""
     displacement, w = at_positive_speed(motion.displacement, motion.speed)
-    amplitude = rows_in_plane(scene.machine, place) @ displacement
+    rows = rows_in_plane(scene.machine, place)
+    amplitude = rows @ displacement
     path = ellipse_at(amplitude, w, slope, jnp.zeros_like(w))
+    stroke, acceleration, throw = 2.0 * path.semi_major, path.acceleration, path.throw_number
+    if motion.samples is not None:
+        long_axis = jnp.stack([jnp.cos(path.direction), jnp.sin(path.direction)])
+        stroke = 2.0 * half_range(motion.samples.displacement @ (long_axis @ rows))
+        across, up = (motion.samples.acceleration @ rows.T / STANDARD_GRAVITY).T
+        acceleration = sampled_maximum(magnitude(across + 1j * up), axis=0)
+        away = jnp.sin(slope) * across - jnp.cos(slope) * up  # a deck that accelerates downward throws its material
+        throw = sampled_maximum(jnp.maximum(away, 0.0), axis=0) / jnp.cos(slope)
     at = place.at if isinstance(place, BodyPoint) else place
     return {
         "point": jnp.zeros(2, motion.amplitude.dtype) if at is None else jnp.asarray(at, motion.amplitude.dtype),
-        "point_stroke": 2.0 * path.semi_major,
-        "point_acceleration": path.acceleration,
+        "point_stroke": stroke,
+        "point_acceleration": acceleration,
         "throw_angle": path.direction,
-        "throw_number": path.throw_number,
+        "throw_number": throw,
         "conveying_speed": conveying_speed_at(amplitude, w, slope),
     }
 
@@ -452,7 +447,9 @@ def shaft_torque(model: JammedModel, omega: Array, displacement: Array) -> Array
     return jnp.where(is_close, power / omega, torque)
 
 
-def support_loads(model: LinearModel, omega: Array, displacement: Array, sag: Array | None) -> tuple[Array, Array, Array]:
+def support_loads(
+    model: LinearModel, omega: Array, displacement: Array, sag: Array | None, samples: Samples | None = None
+) -> tuple[Array, Array, Array]:
     """Return the static, the vertical dynamic and the horizontal dynamic force on each support, (ns,) N each.
 
     Dynamic forces are zero to peak, NaN for a scene with supports that are effects. The static force is NaN if `sag`, the
@@ -460,7 +457,7 @@ def support_loads(model: LinearModel, omega: Array, displacement: Array, sag: Ar
     """
     machine = model.scene.machine
     stiffness, damping = machine.support_rows()
-    forces = magnitude((stiffness + 1j * omega * damping) @ displacement)
+    forces = peak_forces(stiffness, damping, displacement, omega, samples)
     if model.supports or not machine.has_foundation:
         forces = jnp.full_like(forces, jnp.nan)
     static = jnp.full(forces.shape[0], jnp.nan) if sag is None else stiffness[:, -1] @ sag

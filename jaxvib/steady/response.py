@@ -29,10 +29,10 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import status_names
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Pieces, branch_pieces, branch_root, grid_near_poles, resampled_grid, scanned_speed
-from jaxvib.steady.measures import Vibration, acceleration_of, rms_velocity_of
 from jaxvib.steady.outcome import REFUSED, outcome, require_index
 from jaxvib.steady.regimes.local import regime_growth
 from jaxvib.steady.regimes.synchronous import require_one_speed
+from jaxvib.steady.vibration import Vibration, acceleration_of, rms_velocity_of
 from jaxvib.units import Number, Numbers, count, number, numbers
 from jaxvib.units.known import require_finite, when_known
 
@@ -98,7 +98,8 @@ class AbstractResponse(Readable):
         **Raises** `InputError` if there are fewer speeds.
         """
         require_index(index, self.speed.shape[0], "speeds")
-        return Vibration(*(getattr(self, name)[index] for name in Vibration._fields))
+        named = {name: getattr(self, name)[index] for name in Vibration._fields if name not in Vibration._field_defaults}
+        return Vibration(**named)
 
 
 class OperatingPoints(AbstractResponse):

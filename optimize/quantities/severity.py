@@ -6,7 +6,8 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.steady import measures
-from jaxvib.steady.measures import acceleration_of, exciter_force, rms_velocity_of, support_loads, weight_deflection
+from jaxvib.steady.measures import exciter_force, support_loads, weight_deflection
+from jaxvib.steady.vibration import acceleration_of, rms_velocity_of
 from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation, require_foundation
 from optimize.quantities.jams import jam_amplitude, jam_force, jam_quantity, jam_speed, pair_of, pair_text

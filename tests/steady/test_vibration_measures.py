@@ -10,7 +10,7 @@ from scenes import scene
 
 import jaxvib as jv
 import optimize
-from jaxvib.steady.measures import Vibration
+from jaxvib.steady.vibration import Vibration
 
 G = 9.80665
 
@@ -210,6 +210,33 @@ def test_run_regime_and_response_have_the_same_measures(screen):
     states, carrier = run.window.state, screen.machine.carrier()
     lost = np.einsum("ti,ij,tj->t", states.velocity, carrier.damping, states.velocity)
     np.testing.assert_allclose(np.sum(third.power), np.mean(lost), rtol=0.02)  # the window is not a whole number of turns
+
+
+def test_runs_with_two_frequencies_have_the_measures_of_both(screen):
+    """A forced and a free vibration, against differences of the saved velocities; the harmonic alone has other values."""
+    run, at, slope = jv.simulate(screen, "0.8 s", save="window"), (1.0, 0.2), np.deg2rad(-10.0)
+    motion, q, v = run.vibration(), np.asarray(run.window.state.displacement), np.asarray(run.window.state.velocity)
+    measures, alone = (
+        jv.vibration_measures(screen, each, at=at, slope=slope) for each in (motion, motion._replace(samples=None))
+    )
+    a = np.gradient(v, np.asarray(run.window.time), axis=0)[1:-1]
+    np.testing.assert_allclose(measures.velocity, np.sqrt(np.mean(v[:, :2] ** 2, axis=0)), rtol=0.02)  # not whole turns
+    np.testing.assert_allclose(measures.acceleration, np.max(abs(a[:, :2]), axis=0) / G, rtol=3e-3)
+    (x, y), u = (a @ rows_of(at).T / G).T, q @ rows_of(at).T
+    np.testing.assert_allclose(measures.point_acceleration, np.max(np.hypot(x, y)), rtol=3e-3)
+    throw = np.max(np.sin(slope) * x - np.cos(slope) * y) / np.cos(slope)
+    np.testing.assert_allclose(measures.throw_number, throw, rtol=3e-3)
+    angle = float(measures.throw_angle)
+    np.testing.assert_allclose(measures.point_stroke, np.ptp(u @ [np.cos(angle), np.sin(angle)]), rtol=3e-3)
+    np.testing.assert_allclose(measures.foundation_load, np.ptp(run.window.foundation_force, axis=0) / 2.0, rtol=3e-3)
+    for j, (place, k, c, tilt) in enumerate(TILTED):
+        turn = np.array([[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]])
+        of_spring, of_damper = ((turn.T @ np.diag(each) @ turn @ rows_of(place)).T for each in (k, c))
+        side, up = np.ptp(q @ of_spring + v @ of_damper, axis=0) / 2.0
+        np.testing.assert_allclose([measures.side_load[j], measures.dynamic_load[j]], [side, up], rtol=3e-3)
+    for name in ("velocity", "acceleration", "point_stroke", "foundation_load", "dynamic_load"):
+        assert np.max(np.abs(getattr(alone, name) / getattr(measures, name) - 1.0)) > 0.01, name
+    assert "rpm; throw angle and conveying speed are computed from this part only" in run.summary()
 
 
 def test_one_mass_has_the_measures_of_the_closed_form():

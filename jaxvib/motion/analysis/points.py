@@ -28,8 +28,9 @@ from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit
 from jaxvib.results.readable import Readable
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.measures import Vibration, VibrationMeasures, vibration_measures
+from jaxvib.steady.measures import VibrationMeasures, vibration_measures
 from jaxvib.steady.points import Harmonic, rows_in_plane
+from jaxvib.steady.vibration import Samples, Vibration
 
 _MIN_TURNS = 3
 """Smallest number of turns of the exciters to which a harmonic is fitted."""
@@ -115,15 +116,17 @@ def fit_harmonic(time: Array, displacement: Array, speed: Array) -> tuple[Array,
 
 @cached
 def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -> Vibration:
-    """Return the harmonic at the mean load speed, fitted to the displacements of a window, with the measured amplitudes
-    and the mean torques and powers of the drives (NaN for loads that spin or slide).
+    """Return the harmonic at the mean load speed, fitted to the displacements of a window, with the measured amplitudes,
+    the mean torques and powers of the drives (NaN for loads that spin or slide), and samples of the whole motion.
 
     The exciter force is NaN for a rotor with an imbalance, or with loads and an unbalance, which can turn faster than the
     loads.
     """
     time, states, model = window.time, window.state, assemble(scene)
     harmonic, _ = fit_harmonic(time, states.displacement, measured.omega)
-    torques = jax.vmap(partial(drive_torques, model, dynamics_of(model)))(time, states)
+    field = dynamics_of(model)
+    torques = jax.vmap(partial(drive_torques, model, field))(time, states)
+    acceleration = jax.vmap(field)(time, states).velocity
     hann = _hann(time.shape[0])
     weight = jnp.asarray(hann / np.sum(hann), time.dtype)
     torque, power = (weight @ torque_or_power for torque_or_power in torques)
@@ -140,6 +143,7 @@ def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -
         exciter_force=jnp.where(is_unknown, jnp.nan, force),
         torque=jnp.where(has_spin, jnp.nan, torque),
         power=jnp.where(has_spin, jnp.nan, power),
+        samples=Samples(time, states.displacement, states.velocity, acceleration, window.foundation_force),
     )
 
 
@@ -199,14 +203,16 @@ def measures_text(
     if reason:
         return [f"no vibration to measure: {reason}"]
     motion = vibration()
-    lines = (measures or vibration_measures(scene, motion)).summary().splitlines()
+    measures = measures or vibration_measures(scene, motion)
+    lines = measures.summary().splitlines()
     share = float(_harmonic_share(scene.machine, motion.displacement, motion.amplitude))
     if share >= _PURE_SHARE:
         return lines
-    note = (
-        f"only {100.0 * share:.3g} % of the amplitude is at the mean speed of the exciters, {speed_text(motion.speed, 4)}; "
-        "g and mm/s are computed from the whole amplitude and this speed, forces on supports from this part only"
-    )
+    note = f"only {100.0 * share:.3g} % of the amplitude is at the mean speed of the exciters, {speed_text(motion.speed, 4)}"
+    if motion.samples is None:
+        note += "; g and mm/s are computed from the whole amplitude and this speed, forces on supports from this part only"
+    elif measures.point is not None:
+        note += "; throw angle and conveying speed are computed from this part only"
     return [note, *lines]
 
 

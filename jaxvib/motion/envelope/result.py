@@ -29,9 +29,10 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.readable import Readable
 from jaxvib.results.result import Result
 from jaxvib.results.status import status_name
-from jaxvib.steady.measures import Vibration, VibrationMeasures
+from jaxvib.steady.measures import VibrationMeasures
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.steady.points import Harmonic, PathsOfPoints
+from jaxvib.steady.vibration import Vibration
 from jaxvib.units.known import when_known
 
 

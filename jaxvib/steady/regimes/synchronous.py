@@ -45,7 +45,6 @@ from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import solve_torques
 from jaxvib.steady.jams.phases import degrees
-from jaxvib.steady.measures import Vibration
 from jaxvib.steady.outcome import REFUSED, outcome, require_index
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.steady.regimes.local import (
@@ -58,6 +57,7 @@ from jaxvib.steady.regimes.local import (
     vibration_scale,
 )
 from jaxvib.steady.regimes.search import MAX_COMPLETE, all_regimes, is_balanced
+from jaxvib.steady.vibration import Vibration
 from jaxvib.units import Number, number, numbers
 from jaxvib.units.known import when_known
 

@@ -1,0 +1,103 @@
+"""Vibration of a machine at one speed, with or without the samples of its whole motion, and its peaks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.numerics.extrema import sampled_maximum
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.units.reading import STANDARD_GRAVITY
+
+
+class Samples(NamedTuple):
+    """Motion at nt evenly spaced times.
+
+    **Attributes**: `time` (nt,), s; `displacement`, m (rad for rotations), `velocity` and `acceleration` (nt, nd);
+    `foundation_force` (nt, nb), N.
+    """
+
+    time: Array
+    displacement: Array
+    velocity: Array
+    acceleration: Array
+    foundation_force: Array
+
+
+class Vibration(NamedTuple):
+    """Vibration of a machine at one speed of its exciters, q = Re(displacement exp(i w t)).
+
+    Returned by `Run.vibration`, and by the same method of envelopes, synchronous regimes and responses.
+
+    **Attributes** (nd coordinates)
+
+    - `speed` w, rad/s
+    - `displacement` (nd,): complex amplitudes, and `amplitude` (nd,), zero to peak, m (rad for rotations)
+    - `foundation_force` and `exciter_force`, N zero to peak: force on the foundation, and resultant of the centrifugal forces
+    - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive; `power` is the mean of torque times
+      speed, which differs from the product of the means if both vary within a turn
+    - `samples` of the whole motion of a run, which may have further frequencies; None for other motions
+    """
+
+    speed: Array
+    displacement: Array
+    amplitude: Array
+    foundation_force: Array
+    exciter_force: Array
+    torque: Array
+    power: Array
+    samples: Samples | None = None
+
+
+def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
+    """Return the amplitude of the acceleration, in g, of a sine of `amplitude`, m zero to peak, and `speed`, rad/s."""
+    return speed**2 * amplitude / STANDARD_GRAVITY
+
+
+def rms_velocity_of(amplitude: Array, speed: Array | float) -> Array:
+    """Return the root mean square of the velocity, m/s, of a sine of `amplitude`, m zero to peak, and `speed`, rad/s."""
+    return speed * amplitude / np.sqrt(2.0)
+
+
+def peak_acceleration(motion: Vibration) -> Array:
+    """Return the largest magnitude of the acceleration of each coordinate (nd,), in g."""
+    if motion.samples is None:
+        return acceleration_of(motion.amplitude, motion.speed)
+    return sampled_maximum(jnp.abs(motion.samples.acceleration), axis=0) / STANDARD_GRAVITY
+
+
+def rms_velocity(motion: Vibration) -> Array:
+    """Return the root mean square of the velocity of each coordinate (nd,), m/s."""
+    if motion.samples is None:
+        return rms_velocity_of(motion.amplitude, jnp.abs(motion.speed))
+    square = _turn_weights(motion.samples.time, motion.speed) @ motion.samples.velocity**2
+    moves = square > 0.0  # the square root has no derivative at 0
+    return jnp.where(moves, jnp.sqrt(jnp.where(moves, square, 1.0)), square)
+
+
+def peak_forces(stiffness: Array, damping: Array, displacement: Array, speed: Array, samples: Samples | None) -> Array:
+    """Return the forces (...) of rows (..., nd) of stiffness and damping, N zero to peak, of the `samples`, or without them of
+    the complex amplitudes `displacement` at a positive `speed`."""
+    if samples is None:
+        return magnitude((stiffness + 1j * speed * damping) @ displacement)
+    forces = jnp.tensordot(samples.displacement, stiffness, (1, -1)) + jnp.tensordot(samples.velocity, damping, (1, -1))
+    return half_range(forces)
+
+
+def half_range(values: Array) -> Array:
+    """Return half of the difference between the largest and the smallest value of evenly sampled functions (nt, ...)."""
+    above = values - jnp.min(values, axis=0, keepdims=True)
+    return sampled_maximum(sampled_maximum(above, axis=0)[None] - above, axis=0) / 2.0
+
+
+def _turn_weights(time: Array, speed: Array) -> Array:
+    """Return weights (nt,) with the sum 1 for a mean value. They increase linearly over the first turn and decrease over the
+    last one, so that the mean of a sine with the period of a turn does not depend on the end of the time interval."""
+    time, speed = jax.lax.stop_gradient((time, speed))
+    turn = jnp.minimum(2.0 * jnp.pi / jnp.abs(speed), 0.5 * (time[-1] - time[0]))
+    weights = jnp.clip(jnp.minimum(time - time[0], time[-1] - time) / turn, 0.0, 1.0)
+    return weights / jnp.sum(weights)
