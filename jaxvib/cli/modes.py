@@ -23,7 +23,7 @@ from jaxvib.cli.app import (
     tolerance_table,
 )
 from jaxvib.cli.document import force_lines, indented, measures_of
-from jaxvib.cli.output import csv_options, fields_of
+from jaxvib.cli.output import csv_options, fields_of, note
 from jaxvib.errors import InputError
 
 _MAX_FOLD_SPEEDS = 10.0
@@ -97,6 +97,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
     folds = [k for k, exists in enumerate(np.asarray(modes_found.folds.exists)) if exists]
     has_friction = has_term(scene.all_effects, ContactFriction)
     limits = None if has_friction else jax.device_get(jv.drag_limits(scene))
+    _note_weight(scene, [float(jam.omega) for jam in remaining])
     ranges = ranges_within(scene, [int(jam.mode) for jam in remaining], tolerances)
     balanced = _is_balance_stable(scene)
     document = {
@@ -139,6 +140,14 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
 def _condition(growth: float) -> str:
     """Return the condition under which a jam that is stable by slope is stable, from the growth of free loads, 1/s."""
     return " (if its loads stay together)" if math.isnan(growth) else ""
+
+
+def _note_weight(scene: jv.Scene, stable: list[float]) -> None:
+    """Print notes about the weight of the loads, which light-load jams omit; `stable`: load speeds of stable jams, rad/s."""
+    from jaxvib.machine.validation import load_weight_notes  # slow import, which --help does not need
+
+    for each in load_weight_notes(scene, min(stable, default=None)):
+        note(f"note: {each}")
 
 
 def _fold_lines(rotor_speed: float, folds: Any, existing: list[int]) -> list[str]:
@@ -245,6 +254,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     output.figure("phases.png", lambda: result.plot())
     jams = [result.select(k) for k in range(result.omega.shape[0])]
     measures = [measures_of(scene, jam) if jam.stable else None for jam in jams]
+    _note_weight(scene, [float(jam.omega) for jam in jams if jam.stable])
     balanced = _is_balance_stable(scene)
     document = {
         "rotor_speed": scene.drive.speed,

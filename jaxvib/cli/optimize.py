@@ -49,11 +49,12 @@ def optimize(
     continues the search."""
     from jaxvib.machine.files import read_toml
     from jaxvib.machine.rewrite import rewrite_scene
+    from jaxvib.machine.validation import load_weight_notes
     from optimize import Synthesis, load_design, synthesize, tolerance_ranges
 
     loaded = load_design(design)
     require_tolerances(loaded.space.scene, tolerances)
-    for each in loaded.notes():
+    for each in (*loaded.notes(), *load_weight_notes(loaded.space.scene)):
         note(f"note: {each}")
     overrides = {"starts": starts, "seed": seed, "searcher": searcher}
     options = {**loaded.search, **{name: value for name, value in overrides.items() if value is not None}}

@@ -23,6 +23,7 @@ from jaxvib.machine.drives.controlled import SwitchedOff
 from jaxvib.machine.drives.drive import Motor
 from jaxvib.machine.effects.base import static_imbalances, total_gravity
 from jaxvib.machine.files import rebuild_part
+from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import MAX_USUAL_SPEED, Exciter, Scene, read_unbalance, require_comparable, require_parts
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.runtime.devices import float_dtype
@@ -267,10 +268,40 @@ def weight_notes(scene: Scene, slowest: Mapping[int, float]) -> list[str]:
     k = max(shares, key=lambda k: shares[k], default=None)
     if k is None or shares[k] < _MIN_SHOWN_WEIGHT:
         return []
-    share = f"{100.0 * shares[k]:.0f} %"
-    effect = f"the weight of an unbalance, which averaging omits, changes the speed by {share} within a turn"
-    remedy = "and can make the motion unstable; synchronous_orbit and simulate include it"
-    return [f"at {speed_text(slowest[k], 6)} {effect} {remedy}"]
+    return [f"{_weight_text('an unbalance', slowest[k], shares[k])}; synchronous_orbit and simulate include it"]
+
+
+def _weight_text(what: str, speed: float, share: float) -> str:
+    effect = f"the weight of {what}, which averaging omits, changes the speed by {100.0 * share:.0f} % within a turn"
+    return f"at {speed_text(speed, 6)} {effect} and can make the motion unstable"
+
+
+def load_weight_notes(scene: Scene, slowest: float | None = None) -> list[str]:
+    """Return sentences about loads whose drag cannot turn them over the top from rest, and about the effect of their weight at
+    the speed `slowest`, rad/s, of the slowest stable jam (None: not judged).
+
+    The torque on a load at rest is at most b_W R^2 n; 0.7246 m g R is needed. The weight changes the speed w of a load within a
+    turn by the share g / (kappa R w^2).
+    """
+    gravity, notes = total_gravity(scene.all_effects), []
+    g = math.hypot(*(float(gravity.get(axis, 0.0)) for axis in (0, 1)))
+    for exciter in scene.exciters if g > 0.0 else ():
+        loads = exciter.loads
+        if not isinstance(loads, CircularLoads) or not loads.circular:
+            continue
+        need, drag = np.broadcast_arrays(
+            _SWING_SHARE * g * np.asarray(loads.mass * loads.radius),
+            np.asarray(loads.drag * loads.radius**2 * exciter.drive.speed),
+        )
+        k = np.argmax(need - drag)
+        if need.flat[k] > drag.flat[k]:
+            torques = f"the weight of a load needs {need.flat[k]:.3g} N m, its drag gives at most {drag.flat[k]:.3g} N m"
+            notes.append(f"loads at rest swing and do not turn over: {torques}; a jam needs loads that turn already")
+        if slowest is not None:
+            share = float(np.max(g / (np.asarray(loads.inertia_factor() * loads.radius) * slowest**2)))
+            if share >= _MIN_SHOWN_WEIGHT:
+                notes.append(f"{_weight_text('the loads', slowest, share)}; simulate includes it")
+    return notes
 
 
 def start_notes(scene: Scene, exciters: Iterable[int] | None = None) -> list[str]:

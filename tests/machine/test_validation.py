@@ -13,7 +13,14 @@ from scenes import BALLS, machines, scene
 import jaxvib as jv
 from jaxvib.machine import validation as module
 from jaxvib.machine.files import SCREENS, TEMPLATES
-from jaxvib.machine.validation import implausible_numbers, lifting_torques, start_notes, validate_scene, weight_notes
+from jaxvib.machine.validation import (
+    implausible_numbers,
+    lifting_torques,
+    load_weight_notes,
+    start_notes,
+    validate_scene,
+    weight_notes,
+)
 from jaxvib.show.moving import sketch_svg
 
 
@@ -267,6 +274,21 @@ def test_largest_effect_of_the_weight_on_a_speed_has_a_note():
     assert "at 190.986 rpm" in weight_notes(scene, {0: 20.0, 1: 30.0})[0]  # shares 0.061 and 0.054
     assert weight_notes(scene, {0: 23.0, 1: 32.0}) == weight_notes(scene, {}) == weight_notes(scene, {2: 1.0}) == []
     assert weight_notes(jv.Scene(machine, exciters=exciters), {0: 10.0}) == []
+
+
+def test_loads_that_their_drag_cannot_turn_over_have_a_note():
+    """0.7246 m g R is 0.512 N m; b R^2 n reaches it at b = 0.485 N s/m. The share g/(R w^2) is 0.275 at 24.4 rad/s."""
+    machine, drive = jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), jv.ConstantSpeed("2800 rpm")
+
+    def notes(drag, speed=None, gravity=True):
+        loads = jv.pendulums(count=3, mass=1.2, radius=0.06, drag=drag)
+        return load_weight_notes(jv.Scene(machine, loads, drive, (jv.Gravity(),) * gravity), speed)
+
+    assert notes(0.49) == notes(0.49, 60.0) == notes(1e-3, 1.0, gravity=False) == []
+    (stuck,) = notes([0.49, 0.49, 1e-3])
+    assert stuck.startswith("loads at rest swing and do not turn over: the weight of a load needs 0.512 N m, its drag gives")
+    (fast,) = notes(0.49, 24.4)
+    assert "the weight of the loads, which averaging omits, changes the speed by 27 % within a turn" in fast
 
 
 def test_equal_motors_that_cannot_start_have_one_note():
