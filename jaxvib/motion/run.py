@@ -33,6 +33,7 @@ from jaxvib.motion.analysis.measure import (
     turning_masses,
 )
 from jaxvib.motion.analysis.points import (
+    ZERO_VIBRATION,
     PointMotion,
     absent_vibration,
     fit_harmonic,
@@ -44,7 +45,7 @@ from jaxvib.motion.analysis.points import (
     require_vibration,
     vibration_of,
 )
-from jaxvib.motion.analysis.regime import STILL_SHARE, Regime, regime
+from jaxvib.motion.analysis.regime import STILL_SHARE, Regime, balancing_time_text, regime
 from jaxvib.motion.analysis.separation import has_collision, has_overlap, would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
 from jaxvib.motion.analysis.stays import Stay, find_stays
@@ -231,12 +232,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         self.require_single()
         if not self._has_end:
             return f"{self.message}: amplitudes, speeds and forces are unknown after {int(self.steps)} steps\n  {self._cost}"
-        error = f"estimated error of the states in the window, phase included, {float(self.error):.1e}"
-        if np.isnan(self.error):
-            error = "error not estimated"
-        elif self.error > _LARGE_ERROR:
-            error = f"the phase of the motion is not determined (estimated error of the states in the window {self.error:.1e})"
-        rotors = [w[-1] for w in self.window.rotor_speeds]
+        reason, rotors = self.no_vibration, [w[-1] for w in self.window.rotor_speeds]
         stuck = [] if np.max(np.abs(rotors)) > 1.0 else start_notes(self.scene)
         if not stuck and float(jnp.abs(self.omega)) < STILL_SHARE * float(self.scene.top_speed):
             angles = turning_angles(self.scene, lambda: self._stored.time, self._stored.state)[0]
@@ -261,15 +257,15 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 *first,
                 f"{end}: {duration_text(self.scene, self.window.time[-1])}, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
-                f"  {error}; {self._cost}",
+                f"  {self._error_text(reason)}; {self._cost}",
                 *([] if self.window.time.dtype.itemsize >= 8 else [_SINGLE_PRECISION]),
                 *([] if self.settled else [self._window_text()]),
                 f"  {self.speeds_text(self.scene, self.window.rotor_speeds)}",
-                f"  {self.amplitude_text(self.scene)}",
-                *(f"  {line}" for line in measures_text(self.scene, self.no_vibration, self.vibration, measures)),
+                *([] if reason == ZERO_VIBRATION else [f"  {self.amplitude_text(self.scene)}"]),
+                *(f"  {line}" for line in measures_text(self.scene, reason, self.vibration, measures)),
                 *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
                 *(f"  {stay.summary()}" for stay in self.stays),
-                *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
+                *(f"  {line}" for line in self._regime_lines()),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
                 *([f"  {creep}"] if creep else []),
                 *([] if unstable else self._pass_through_note()),
@@ -277,6 +273,21 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 *self._detachment(),
             ]
         )
+
+    def _error_text(self, no_vibration: str) -> str:
+        if np.isnan(self.error):
+            return "error not estimated"
+        if self.error > _LARGE_ERROR:
+            return f"the phase of the motion is not determined (estimated error of the states in the window {self.error:.1e})"
+        states = "angles in the window" if no_vibration == ZERO_VIBRATION else "states in the window, phase included,"
+        return f"estimated error of the {states} {float(self.error):.1e}"
+
+    def _regime_lines(self) -> list[str]:
+        if not self.scene.is_plain:
+            return []
+        named = self.regime
+        time = balancing_time_text(self.scene, named, self.trajectory)
+        return [named.summary(), *([time] if time else [])]
 
     def _unsettled_text(self) -> str:
         if self.scene.is_plain and (balanced := balanced_text(self.regime, self.window)):
@@ -434,7 +445,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         `vibration` raises an error, and the summary contains this reason in place of the measures.
         """
         self.require_single()
-        return absent_vibration(self.scene.machine, self.window.time, self, self.harmonic)
+        return absent_vibration(self.scene, self.window.time, self, self.harmonic)
 
     def vibration(self) -> Vibration:
         """Return the vibration over the window, for `vibration_measures`: the fitted harmonic, measured amplitudes and force,

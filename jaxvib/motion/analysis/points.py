@@ -23,6 +23,7 @@ from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory, turning_angles, turning_directions
+from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit
@@ -175,14 +176,23 @@ def has_vibration(share: Array) -> Array:
     return share >= _MIN_SHARE
 
 
-def absent_vibration(machine: Machine, time: Array, measured: AbstractMeasured, harmonic: Callable[[], Harmonic]) -> str:
+ZERO_VIBRATION = "the amplitude is zero within the error of the run"
+"""Reason for which a balanced rotor has no vibration measures."""
+
+_ZERO_AMPLITUDE = 1e-8
+"""Amplitude, relative to the natural unit of displacements, below which it is zero: the default tolerance of runs."""
+
+
+def absent_vibration(scene: Scene, time: Array, measured: AbstractMeasured, harmonic: Callable[[], Harmonic]) -> str:
     """Return the reason for which a motion has no vibration measures, an empty text if it has; see `vibration_share`."""
     turns, speed = _turns(time, measured.omega), speed_text(measured.omega, 4)
     if not turns >= _MIN_TURNS:
         return f"the exciters make {float(turns):.2g} turns in the measured window, fewer than {_MIN_TURNS}"
-    share = vibration_share(machine, time, measured, harmonic().amplitude)
+    share = vibration_share(scene.machine, time, measured, harmonic().amplitude)
     if has_vibration(share):
         return ""
+    if jnp.max(scene.machine.carrier().as_lengths(measured.amplitude)) < _ZERO_AMPLITUDE * natural_units(scene).displacement:
+        return ZERO_VIBRATION
     return (
         f"{100.0 * float(share):.2g} % of the amplitude is at the mean speed of the exciters, {speed}; their speeds change or "
         "differ, the motion is a free vibration, or the vibration is smaller than the error of the run"

@@ -300,6 +300,28 @@ def _mean_phases(angle: Array, half: int) -> tuple[Array, Array]:
     return jnp.angle(jnp.mean(point, axis=0)), jnp.abs(jnp.angle(late * jnp.conj(early)))
 
 
+def balancing_time_text(scene: Scene, motion: Regime, trajectory: Trajectory | None) -> str:
+    """Return the time after which the loads balance the rotor as text; an empty text for another `motion` at the end, and for a
+    run without a `trajectory`."""
+    if trajectory is None or not bool(motion.name == RegimeName.balanced):
+        return ""
+    away = np.flatnonzero(np.asarray(_unbalance_history(scene, trajectory)) >= _BALANCED_UNBALANCE_SHARE)
+    time = np.asarray(trajectory.time)
+    if not away.size or away[-1] + 1 == time.size:
+        return ""
+    return (
+        f"balanced within {100.0 * _BALANCED_UNBALANCE_SHARE:.3g} % of the loads' unbalance from {time[away[-1] + 1]:.4g} s on"
+    )
+
+
+@cached
+def _unbalance_history(scene: Scene, trajectory: Trajectory) -> Array:
+    turn = trajectory.rotor_angle
+    unbalances, imbalance = _unbalances(scene, turn)
+    in_rotor = jnp.exp(1j * (trajectory.state.azimuth - turn[:, None]))
+    return jax.vmap(lambda direction: _unbalance(scene, unbalances * direction, imbalance, turn))(in_rotor)
+
+
 def _unbalances(scene: Scene, turn: Array) -> tuple[Array, Array]:
     """Return the unbalances of the loads (count,), kg m, and the static imbalance of the rotor, complex, in its frame."""
     loads, origin = scene.loads, jnp.zeros_like(turn[0])

@@ -146,7 +146,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
     def no_vibration(self) -> str:
         """Reason for which the window has no vibration that can be measured, see `Run.no_vibration`."""
         self.require_single()
-        return absent_vibration(self.scene.machine, self.window.time, self, self.harmonic)
+        return absent_vibration(self.scene, self.window.time, self, self.harmonic)
 
     def vibration(self) -> Vibration:
         """Return the mean vibration over the window, for `vibration_measures`.

@@ -76,6 +76,24 @@ def test_loads_of_a_drive_that_stops_coast_down(until, says):
     assert ("coasting down" in text) == says == ("run longer" not in text)
 
 
+def test_a_balanced_rotor_has_its_time_and_no_amplitude():
+    """The balls reach their places long before the vibration is zero within the tolerance of the run."""
+    rotor = jv.Scene(
+        jv.planar_rotor(mass=10.0, stiffness=4e4, damping="20 %"),
+        jv.balls(count=2, mass=0.1, radius=0.1, drag=2.0),
+        jv.ConstantSpeed("200 rad/s"),
+        (jv.StaticImbalance(0.01),),
+    )
+    run = jv.simulate(rotor, 20.0)
+    assert run.regime.label == "balanced" and run.no_vibration == "the amplitude is zero within the error of the run"
+    text, path = run.summary(), run.trajectory
+    assert "no vibration to measure: the amplitude is zero" in text and "amplitude, zero to peak" not in text
+    assert "estimated error of the angles in the window" in text
+    moments = 0.01 * np.sum(np.exp(1j * (path.state.azimuth - path.rotor_angle[:, None])), axis=1) + 0.01
+    after = path.time[np.flatnonzero(np.abs(moments) >= 0.02 * 0.02)[-1] + 1]
+    assert f"  balanced within 2 % of the loads' unbalance from {float(after):.4g} s on" in text and 0.1 < after < 15.0
+
+
 def test_a_balanced_motion_that_decays_needs_no_longer_run():
     scene = jv.scene_from_toml(TEMPLATES["one_mass"])
     run = jv.simulate(scene, 30.0, estimate=False)
