@@ -105,6 +105,19 @@ def test_the_smaller_of_two_bands_lies_in_front_of_the_larger():
     assert [text.get_text() for text in axis.get_legend().get_texts()] == ["y1", "y2"]
 
 
+def test_a_motion_that_decays_to_rounding_errors_is_stated_as_zero():
+    time = np.linspace(0.0, 50.0, 4000)
+    motion = (1e-3 * np.sin(20.0 * time) * np.exp(-time))[:, None]
+    speed = 30.0 + np.sin(200.0 * time)[:, None]
+    arrays = (time, motion, np.ones((time.size, 0)), speed, np.ones((time.size, 1)) + 1e3 * motion)
+    axes = time_histories(arrays, arrays, names=("y",), directions=("up",), unit="rad/s").axes
+    assert [any("zero within rounding" in text.get_text() for text in axis.texts) for axis in axes] == [False, True] + 4 * [
+        False
+    ]
+    (rotor,) = axes[2].lines  # the middle of the band
+    assert np.ptp(rotor.get_ydata()[5:-5]) < 0.5 and len(axes[2].collections) == 1
+
+
 def test_growth_has_the_exponent_over_its_second_half():
     time, rates = np.arange(1.0, 9.0), np.linspace(3.0, 1.0, 8)
     axis = growth_chart(time, rates, 1.5, 0.25).axes[0]

@@ -19,7 +19,7 @@ from jaxvib.draw.style import (
     series_look,
 )
 
-_BINS = 300
+_BINS = 600
 """Maximum number of intervals of a run. The run is drawn as a band between the minimum and the maximum of each interval."""
 
 _MAX_PLAIN_PERIODS = 40
@@ -31,6 +31,9 @@ _MAX_BEATS, _SAMPLES_PER_INTERVAL, _MIN_SAMPLES = 20, 10, 1000
 
 _BEATING_BAND = "band: lowest to highest amplitude while it beats"
 """Entry of a legend for the band of an averaged history."""
+
+_ZERO_SHARE = 1e-9
+"""Ratio of the last periods and the largest value of a run below which the last periods are rounding errors."""
 
 _BAND_ALPHA = 0.22
 """Opacity of a band."""
@@ -120,7 +123,7 @@ def time_histories(
     for k, name in _equal_loads(whole[2], part[2]):
         _draw_band(left, whole[0], scale * whole[2][:, k], k, name, bins)
         right.plot(part[0], scale * part[2][:, k], **series_look(k), lw=1.2)
-    _draw_rotor_speeds(left, whole[0], scale * whole[3])
+    _draw_rotor_speeds(left, whole[0], scale * whole[3], bins)
     slowest, fastest = np.min(part[2], initial=np.inf), np.max(part[2], initial=-np.inf)
     # The ripple of loads that are much slower than the rotor would be invisible on an axis that includes the rotor.
     shown = max(fastest - slowest, _MIN_SPEED_RANGE * fastest)
@@ -139,6 +142,7 @@ def time_histories(
     for k, name in enumerate(directions):
         _draw_band(left, whole[0], whole[4][:, k], k, name, bins)
         right.plot(part[0], part[4][:, k], **series_look(k), lw=1.2)
+    _mark_zero(right, whole[4], part[4])
     left.set_ylabel("foundation force, N")
     _draw_legend(left, 2)
     first, last = float(whole[0][0]), float(whole[0][-1])
@@ -168,14 +172,29 @@ def _draw_coordinates(
     unit, label, factor = kind
     label_at_end, factor_at_end = next(x[1:] for x in _kinds(end[1], units, "displacement", "tilt") if x[0] == unit)
     depth = np.argsort(np.argsort(-np.ptp(whole[1], axis=0)))  # signals of larger range are drawn first, below smaller ones
-    for k in (k for k in range(len(names)) if units[k] == unit):
+    of_kind = [k for k in range(len(names)) if units[k] == unit]
+    for k in of_kind:
         _draw_band(left, whole[0], factor * whole[1][:, k], k, names[k], bins, depth[k])
         look = series_look(k)
         right.plot(end[0], factor_at_end * end[1][:, k], lw=1.3, **look)
     left.set_ylabel(label)
     _draw_legend(left)
+    if _mark_zero(right, whole[1][:, of_kind], end[1][:, of_kind]):
+        return
     if label_at_end != label:
         right.set_ylabel(label_at_end)
+
+
+def _mark_zero(axis: Axes, whole: np.ndarray, end: np.ndarray) -> bool:
+    """Return True for an `end` (nt, k) that is zero within rounding errors, and state it in place of its curves."""
+    is_zero = bool(np.max(np.abs(end), initial=0.0) < _ZERO_SHARE * np.max(np.abs(whole), initial=0.0))
+    if is_zero:
+        for line in axis.lines:
+            line.set_visible(False)
+        axis.set_yticks([])
+        words = "zero within rounding:\nless than 1e-9 of the\nlargest value of the run"
+        axis.text(0.5, 0.5, words, transform=axis.transAxes, ha="center", va="center", fontsize="small", color="#555555")
+    return is_zero
 
 
 def _kinds(values: np.ndarray, units: Sequence[str], length: str, tilt: str) -> list[tuple[str, str, float]]:
@@ -252,7 +271,7 @@ def _draw_legend(axis: Axes, least: int = 1, band: str = "band: lowest to highes
     if axis.collections:
         handles.append(Patch(color="#555555", alpha=_BAND_ALPHA, lw=0.0, label=band))
     if len(handles) >= least:
-        legend_above(axis, 6, handles=handles)
+        legend_above(axis, 4, handles=handles)  # a legend wider than its panel would move the columns apart
 
 
 def _smoothed_peaks(values: np.ndarray) -> np.ndarray:
@@ -266,13 +285,19 @@ def _smoothed_peaks(values: np.ndarray) -> np.ndarray:
     return (largest[:-2] + largest[1:-1] + largest[2:]) / 3.0
 
 
-def _draw_rotor_speeds(axis: Axes, time: np.ndarray, speeds: np.ndarray) -> None:
-    """Draw the speeds of the rotors (nt, exciters), negative for a clockwise rotor, as dashed lines."""
+def _draw_rotor_speeds(axis: Axes, time: np.ndarray, speeds: np.ndarray, bins: int | None = None) -> None:
+    """Draw the speeds of the rotors (nt, exciters), negative for a clockwise rotor, as dashed lines.
+
+    With `bins` they are the middles of bands, because the dashes of a fluctuating speed could not be distinguished.
+    """
     rotors = speeds.shape[1]
     for k in range(rotors):
         look = {"color": "black" if rotors == 1 else color_of(k), "ls": "--", "lw": 1.1}
         sense = " (clockwise: negative)" if np.sum(speeds[:, k]) < 0.0 else ""
-        axis.plot(time, speeds[:, k], label=f"rotor{'' if rotors == 1 else f' {k + 1}'}{sense}", **look)
+        middle, low, high = band(time, speeds[:, k], time.size if bins is None else bins)
+        if low is not high:
+            axis.fill_between(middle, low, high, color=look["color"], alpha=_BAND_ALPHA, lw=0.0)
+        axis.plot(middle, (low + high) / 2.0, label=f"rotor{'' if rotors == 1 else f' {k + 1}'}{sense}", **look)
 
 
 def amplitude_histories(
