@@ -15,6 +15,9 @@ _SENSES = {
 }
 """Colour, line and name of each sense."""
 
+_SECOND_STRAIGHT = "straight motion in the other direction"
+"""Name of the second straight motion, which has a colour of its own."""
+
 
 def campbell_diagram(
     rotor_speed: np.ndarray,
@@ -41,7 +44,11 @@ def campbell_diagram(
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
     for word, (color, line, label) in _SENSES.items():
         for k, values in enumerate(whirl_lines(speed, sense == word)):
-            axis.plot(scale * rotor_speed, scale * values, ls=line, color=color, label=None if k else label)
+            is_second = k == 1 and word == "straight"
+            look = {"color": COLORS[4] if is_second else color, "label": None if k else label}
+            axis.plot(
+                scale * rotor_speed, scale * values, ls=line, **(look | ({"label": _SECOND_STRAIGHT} if is_second else {}))
+            )
     found = np.zeros(0) if critical is None else critical[0][np.isfinite(critical[0])]
     right = scale * max(float(np.max(rotor_speed)), 0.0 if at is None else 1.05 * at)
     top = 1.12 * scale * max(float(np.nanmax(speed)), *(w for w in found if scale * w <= right), 1e-300)

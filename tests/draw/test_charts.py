@@ -105,7 +105,7 @@ def test_the_smaller_of_two_bands_lies_in_front_of_the_larger():
     assert [text.get_text() for text in axis.get_legend().get_texts()] == ["y1", "y2"]
 
 
-def test_a_motion_that_decays_to_rounding_errors_is_stated_as_zero():
+def test_a_motion_that_decays_to_rounding_errors_is_zero():
     time = np.linspace(0.0, 50.0, 4000)
     motion = (1e-3 * np.sin(20.0 * time) * np.exp(-time))[:, None]
     speed = 30.0 + np.sin(200.0 * time)[:, None]

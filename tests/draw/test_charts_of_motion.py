@@ -221,6 +221,13 @@ def test_whirls_have_a_line_for_each_sense():
     assert at_x(axis, "--") and [text.get_text() for text in axis.texts] == ["4.5 backward", "7 forward"]
 
 
+def test_two_straight_motions_have_their_own_colours():
+    n, speed = np.array([0.0, 10.0]), np.array([[5.0, 6.0], [5.0, 6.0]])
+    axis = campbell_diagram(n, speed, np.full((2, 2), "straight"), unit="rad/s").axes[0]
+    first, second = axis.lines[:2]
+    assert first.get_color() != second.get_color() and second.get_label() == "straight motion in the other direction"
+
+
 def test_critical_speeds_are_grouped_by_their_neighbour():
     speed = np.array([10.0, 10.3, 10.6, 12.0, 30.0, np.nan])
     groups = [group for group, _ in critical_groups(speed, np.full(6, "forward"), right=10.0 / 0.7)]
