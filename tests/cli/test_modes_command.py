@@ -8,7 +8,7 @@ import numpy as np
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.cli.modes import _drag_lines, _fold_lines, _imbalance_lines
+from jaxvib.cli.modes import _drag_lines, _drag_speed_notes, _fold_lines, _imbalance_lines
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.steady.jams.phase_search import PhaseJams
 
@@ -68,6 +68,16 @@ def test_folds_far_above_the_rotor_speed_are_only_counted():
     far = _fold_lines(float(speeds[-1]) / 10.1, folds, shown)
     assert f"{float(speeds[0]) * 30.0 / np.pi:.5g}" in far[0] and f"{float(speeds[-1]) * 30.0 / np.pi:.5g}" not in far[0]
     assert far[1:] == ["folds above 10 times the rotor speed, not shown: 1"] and len(_fold_lines(150.0, folds, shown)) == 1
+
+
+def test_a_drag_for_another_load_speed_has_a_note():
+    tables = {"loads": {"drag": {"cause": "bearing", "load_speed": "600 rpm"}}}
+    (note,) = _drag_speed_notes(tables, [10.0, 30.0])
+    assert note.startswith(
+        "loads.drag is for 600 rpm, and the nearest stable jam is at 286.48 rpm: repeat with load_speed = '286"
+    )
+    assert _drag_speed_notes(tables, [62.0, 30.0]) == _drag_speed_notes(tables, []) == []
+    assert _drag_speed_notes({"loads": {"drag": 1.0}}, [30.0]) == []
 
 
 def equal_points(table):
