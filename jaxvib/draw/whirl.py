@@ -15,7 +15,7 @@ _SENSES = {
 }
 """Colour, line and name of each sense."""
 
-_SECOND_STRAIGHT = "straight motion in the other direction"
+_SECOND_STRAIGHT = "second straight motion"
 """Name of the second straight motion, which has a colour of its own."""
 
 
@@ -75,7 +75,9 @@ def _critical_marks(axis: Axes, speed: np.ndarray, sense: np.ndarray, right: flo
     """
     for group, word in critical_groups(speed, sense, right):
         for k in group:
-            look = {"mfc": "white", "mec": _SENSES[str(sense[k])][0], "mew": 1.4, "zorder": 4}
+            is_second = sense[k] == "straight" and np.sum((sense == "straight") & (speed < speed[k])) == 1
+            color = COLORS[4] if is_second else _SENSES[str(sense[k])][0]
+            look = {"mfc": "white", "mec": color, "mew": 1.4, "zorder": 4}
             axis.plot([speed[k]], [speed[k]], "o" if sense[k] == "forward" else "s", ms=6.0, **look)
             axis.vlines(float(speed[k]), 0.0, float(speed[k]), color=GUIDE, lw=0.7, zorder=1.2)
         at = (speed[group[-1]], 0.02 * top)

@@ -223,9 +223,12 @@ def test_whirls_have_a_line_for_each_sense():
 
 def test_two_straight_motions_have_their_own_colours():
     n, speed = np.array([0.0, 10.0]), np.array([[5.0, 6.0], [5.0, 6.0]])
-    axis = campbell_diagram(n, speed, np.full((2, 2), "straight"), unit="rad/s").axes[0]
+    critical = np.array([5.0, 6.0]), np.full(2, "straight")
+    axis = campbell_diagram(n, speed, np.full((2, 2), "straight"), critical=critical, unit="rad/s").axes[0]
     first, second = axis.lines[:2]
-    assert first.get_color() != second.get_color() and second.get_label() == "straight motion in the other direction"
+    marks = [line.get_markeredgecolor() for line in axis.lines if line.get_zorder() == 4]
+    assert marks == [first.get_color(), second.get_color()]
+    assert first.get_color() != second.get_color() and second.get_label() == "second straight motion"
 
 
 def test_critical_speeds_are_grouped_by_their_neighbour():
