@@ -202,10 +202,11 @@ def run_text(run: jv.Run, measures: jv.VibrationMeasures | None) -> str:
     from jaxvib.motion.analysis.points import peak_time_text
 
     lines = [run.summary(measures)]
-    for at, peak, time in map(dict.values, _deck_peaks(run)):
+    peaks = [(when, *each.values()) for when, part in run.parts().items() for each in _deck_peaks(part)]
+    for when, at, peak, time in peaks:
         place, size = ", ".join(f"{x:.4g}" for x in at), quantity_text(peak, "m", 4)
-        when = peak_time_text(peak, float(run.point(at).largest_displacement), time)
-        lines.append(f"  largest on the way, zero to peak: point ({place}) m {size}{when}")
+        at_time = peak_time_text(peak, float(run.point(at).largest_displacement), time)
+        lines.append(f"  largest on the way{when}, zero to peak: point ({place}) m {size}{at_time}")
     return "\n".join(lines)
 
 
@@ -258,12 +259,18 @@ def measures_document(run: jv.Run | jv.Envelope, measures: jv.VibrationMeasures 
 def run_document(run: jv.Run, measures: jv.VibrationMeasures | None) -> dict[str, object]:
     """Return the quantities of a run in its window, its error and its cost, for a document."""
     peaks = _deck_peaks(run)
+    parts = run.parts()
     largest = ("largest_displacement", "largest_displacement_time", "largest_force", "largest_force_time")
     return {
         **measured_document(run, run.scene),
         **measures_document(run, measures),
         **({"regime": _regime(run.regime)} if run.scene.is_plain else {}),
         **({} if run.trajectory is None else fields_of(run, *largest)),
+        **(
+            {"parts": [{"part": when.strip(), **fields_of(each, *largest)} for when, each in parts.items()]}
+            if len(parts) > 1
+            else {}
+        ),
         **({"deck": peaks} if peaks else {}),
         **fields_of(run, "coincident", "error", "evaluations", "seconds"),
     }

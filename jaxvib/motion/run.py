@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import operator
 from collections.abc import Sequence
 from typing import Literal
@@ -72,6 +73,9 @@ def _detachment_times(scene: Scene, trajectory: Trajectory) -> Array:
 
 _CONTACT = "add load_contact = { stiffness = 1e5, restitution = 0.6 } to [effects], or LoadContact(1e5, restitution=0.6)"
 
+
+_MAX_CHANGES = 3
+"""Largest number of times of changes of the drives between which the summary states the largest values separately."""
 
 _LARGE_ERROR = 1.0
 """Error of the states above which the summary states that the phase is not determined."""
@@ -263,7 +267,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 f"  {self.speeds_text(self.scene, self.window.rotor_speeds)}",
                 *([] if reason == ZERO_VIBRATION else [f"  {self.amplitude_text(self.scene)}"]),
                 *(f"  {line}" for line in measures_text(self.scene, reason, self.vibration, measures)),
-                *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
+                *(f"  {part._on_the_way(when)}" for when, part in self.parts().items()),
                 *(f"  {stay.summary()}" for stay in self.stays),
                 *(f"  {line}" for line in self._regime_lines()),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
@@ -316,7 +320,29 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
             return []
         return ["  loads touch each other: derivatives of this run may be meaningless; test them by growth or check_gradients"]
 
-    def _on_the_way(self) -> str:
+    def parts(self) -> dict[str, Run]:
+        """Return the parts of the run between the times at which its drives change suddenly, such as switch-offs.
+
+        **Returns** parts by their times as text, such as " until 10 s" and " from 10 s"; the whole run with an empty text if
+        there are none or more than three such times; nothing if the run kept only its window.
+        """
+        if self.trajectory is None:
+            return {}
+        time = np.asarray(self.trajectory.time)
+        jumps = np.unique([float(t) for exciter in self.scene.exciters for t in exciter.drive.jump_ts()])
+        jumps = jumps[(jumps > time[0]) & (jumps < time[-1])]
+        if not 0 < len(jumps) <= _MAX_CHANGES:
+            return {"": self}
+        found = {}
+        for low, high in itertools.pairwise([time[0], *jumps, time[-1]]):
+            keep = np.flatnonzero((time >= low) & (time <= high))
+            states = jax.tree.map(lambda values, keep=keep: values[keep], self.trajectory)
+            first, last = low == time[0], high == time[-1]
+            name = f" until {high:.4g} s" if first else f" from {low:.4g} s" if last else f" from {low:.4g} to {high:.4g} s"
+            found[name] = eqx.tree_at(lambda run: run.trajectory, self, states)
+        return found
+
+    def _on_the_way(self, when: str) -> str:
         structure, window, stored = self.scene.machine.structure(), self.window, self._stored
         peaks, last = (
             [*np.max(np.abs(np.asarray(part.state.displacement)), axis=0), np.max(_length(part.foundation_force))]
@@ -331,7 +357,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
             strict=True,
         )
         *named, force = (f"{name} {quantity_text(x, unit, 4)}{time}" for name, x, unit, time in largest)
-        return f"largest on the way, zero to peak: {', '.join(named)}; {force}"
+        return f"largest on the way{when}, zero to peak: {', '.join(named)}; {force}"
 
     def _detachment(self) -> list[str]:
         times = np.asarray(self.detached)

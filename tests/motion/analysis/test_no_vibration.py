@@ -28,19 +28,21 @@ def stopped():
 
 
 def test_the_summary_states_the_times_of_peaks(stopped):
-    """The peaks of start and stop are distinguished by their times."""
+    """Start and stop have lines of their own."""
     path = stopped.trajectory
-    tilt, force = np.abs(path.state.displacement[:, 2]), np.linalg.norm(path.foundation_force, axis=-1)
-    line = next(each for each in stopped.summary().splitlines() if "largest on the way" in each)
-    assert f" at {float(path.time[np.argmax(tilt)]):.4g} s; magnitude of the foundation force" in line
-    assert line.endswith(f"N at {float(path.time[np.argmax(force)]):.4g} s")
+    lines = [each for each in stopped.summary().splitlines() if "largest on the way" in each]
+    for line, title, part in zip(lines, ("until 2 s", "from 2 s"), (path.time <= 2.0, path.time >= 2.0), strict=True):
+        tilt, force = np.abs(path.state.displacement[part, 2]), np.linalg.norm(path.foundation_force[part], axis=-1)
+        assert line.startswith(f"  largest on the way {title}, zero to peak: x ")
+        assert f" at {float(path.time[part][np.argmax(tilt)]):.4g} s; magnitude of the foundation force" in line
+        assert line.endswith(f"N at {float(path.time[part][np.argmax(force)]):.4g} s")
 
 
 def test_a_screen_that_coasts_down_has_no_measures(stopped):
     assert "turns in the measured window, fewer than 3" in stopped.no_vibration
     text = stopped.summary()
     assert f"no vibration to measure: {stopped.no_vibration}" in text and "% reach the foundation" not in text
-    assert "not settled: the exciters are almost at rest" in text and "largest on the way, zero to peak: x" in text
+    assert "not settled: the exciters are almost at rest" in text and "largest on the way until 2 s, zero to peak: x" in text
     with pytest.raises(jv.InputError, match="run has no vibration to measure: the exciters make"):
         stopped.vibration()
 
@@ -175,7 +177,7 @@ def test_a_deck_without_vibration_has_a_note_and_its_peak(stopped, tmp_path, mon
     peak = 1e3 * float(stopped.point(AT, part="all").largest_displacement)
     x, y, turn = np.asarray(stopped.trajectory.state.displacement).T
     time = float(stopped.trajectory.time[np.argmax(np.hypot(x - AT[1] * turn, y + AT[0] * turn))])
-    assert f"largest on the way, zero to peak: point (1.5, 0.1) m {peak:.4g} mm at {time:.4g} s\n" in text
+    assert f"largest on the way until 2 s, zero to peak: point (1.5, 0.1) m {peak:.4g} mm at {time:.4g} s\n" in text
     assert "note: --deck: no stroke, throw and conveying" in err
     given = ["--slope", "-5 deg", "--layer", "1 m,50 mm,1600"]
     assert run_command(["simulate", str(path), "--until", "60s", *given]) == 0
@@ -188,3 +190,8 @@ def test_a_deck_without_vibration_has_a_note_and_its_peak(stopped, tmp_path, mon
     force = np.linalg.norm(stopped.trajectory.foundation_force, axis=-1)
     np.testing.assert_allclose(document["largest_force_time"], stopped.trajectory.time[np.argmax(force)])
     np.testing.assert_allclose(document["largest_displacement_time"][2], stopped.trajectory.time[np.argmax(abs(turn))])
+    assert [each["part"] for each in document["parts"]] == ["until 2 s", "from 2 s"]
+    late = stopped.trajectory.time[np.argmax(force * (stopped.trajectory.time >= 2.0))]
+    np.testing.assert_allclose(
+        [each["largest_force_time"] for each in document["parts"]], [document["largest_force_time"], late]
+    )
