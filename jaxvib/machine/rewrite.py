@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import tomllib
@@ -119,8 +120,12 @@ def _rewritten_line(line: str, entry: re.Match[str], read: object, old: object, 
     if old is None or new is None or (_is_close(old, new) and not (is_other_machine and _RELATIVE.search(entry[3]))):
         return line
     comment = f"; {entry[6]}" if entry[6] else ""
+    written = _with_unit(read, old, new)
     former = in_one_line(entry[3])
-    return f"{entry[1]}{_with_unit(read, old, new)}  # was {former}{comment}"
+    if isinstance(read, dict) and isinstance(new, dict):  # only the numbers that differ
+        now = tomllib.loads(f"x = {written}")["x"]
+        former = ", ".join(f"{name} = {json.dumps(value)}" for name, value in read.items() if value != now[name])
+    return f"{entry[1]}{written}  # was {former}{comment}"
 
 
 def _with_unit(read: object, old: object, new: object) -> str:

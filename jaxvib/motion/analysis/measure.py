@@ -146,7 +146,10 @@ class AbstractMeasured(Readable):
         magnitudes = np.abs(np.asarray(self.load_speed))
         if np.ptp(magnitudes) <= _MAX_SPREAD_OF_MEAN * np.max(magnitudes):
             each = f"{speed_text(self.omega, 6)} (each: {each})"
-        return f"{turning_masses(scene)} turn at {each}{rotor}"
+        swings = [np.asarray(speeds) for speeds in rotor_speeds if np.min(speeds) < 0.0 < np.max(speeds)]
+        largest = max((float(np.max(np.abs(speeds))) for speeds in swings), default=0.0)
+        swing = f"; a rotor swings, at up to {speed_text(largest, 4)}" if largest > 0.0 else ""
+        return f"{turning_masses(scene)} turn at {each}{rotor}{swing}"
 
 
 def duration_text(scene: Scene, end: Array) -> str:

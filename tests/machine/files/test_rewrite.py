@@ -43,7 +43,10 @@ drive = { kind = "dc_motor", speed = "1500 rpm", stall_torque = 12.0, inertia = 
 """
     scene = jv.scene_from_toml(source.replace("1500 rpm", "1200 rpm").replace("0.2 kg", "0.3 kg"))
     text = rewrite_scene(source, scene)
-    assert 'drive = { kind = "dc_motor", speed = "1200 rpm", stall_torque = 12, inertia = 0.1 }  # was { kind' in text
+    assert (
+        'drive = { kind = "dc_motor", speed = "1200 rpm", stall_torque = 12, inertia = 0.1 }  # was speed = "1500 rpm"\n'
+        in text
+    )
     assert 'unbalance = "0.3 kg m"  # was "0.2 kg m"' in text and 'stiffness = "800 N/mm"' in text
 
 

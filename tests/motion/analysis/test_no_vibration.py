@@ -49,6 +49,8 @@ def test_a_screen_that_coasts_down_has_no_measures(stopped):
 
 def test_a_stopped_screen_states_the_end_of_its_last_turn(stopped):
     text = stopped.summary()
+    fastest = max(float(np.max(np.abs(w))) for w in stopped.window.rotor_speeds if np.min(w) < 0.0 < np.max(w))
+    assert f"; a rotor swings, at up to {30.0 / np.pi * fastest:.4g} rpm\n" in text
     ends = []
     for angle in stopped.trajectory.rotor_angles:
         ends.append(stopped.trajectory.time[np.flatnonzero(np.abs(angle - angle[-1]) > np.pi)[-1]])
