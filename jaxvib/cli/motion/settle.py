@@ -32,7 +32,6 @@ from jaxvib.cli.document import (
 )
 from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
-from jaxvib.machine.validation import off_notes
 
 _START_HELP = "Initial state [jam with --mode, otherwise rest]."
 _START = click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), help=_START_HELP)
@@ -65,6 +64,8 @@ def settle(
     The run consists of segments of 100 periods of the lowest natural frequency; --out saves the last one. With --drift, the
     motion must settle to this drift; a motion that is only steady in the mean (changes without a trend) does not suffice.
     """
+    from jaxvib.machine.validation import off_notes  # slow import, which --help does not need
+
     loaded = loaded_scene(scene, speed=speed, constant=True)
     require_tolerances(loaded, tolerances)
     require_deck_options(loaded)
