@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import Drawn, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, WHITE_OUTLINE, WORKING, legend_above, panels
+from jaxvib.draw.style import COLORS, GUIDE, WHITE_OUTLINE, WORKING, Look, legend_above, panels
 
 _SENSES = {
     "forward": (COLORS[0], "-", "forward whirl"),
@@ -44,11 +44,10 @@ def campbell_diagram(
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
     for word, (color, line, label) in _SENSES.items():
         for k, values in enumerate(whirl_lines(speed, sense == word)):
-            is_second = k == 1 and word == "straight"
-            look = {"color": COLORS[4] if is_second else color, "label": None if k else label}
-            axis.plot(
-                scale * rotor_speed, scale * values, ls=line, **(look | ({"label": _SECOND_STRAIGHT} if is_second else {}))
-            )
+            look: Look = {"color": color, "label": None if k else label}
+            if k == 1 and word == "straight":
+                look = {"color": COLORS[4], "label": _SECOND_STRAIGHT}
+            axis.plot(scale * rotor_speed, scale * values, ls=line, **look)
     found = np.zeros(0) if critical is None else critical[0][np.isfinite(critical[0])]
     right = scale * max(float(np.max(rotor_speed)), 0.0 if at is None else 1.05 * at)
     top = 1.12 * scale * max(float(np.nanmax(speed)), *(w for w in found if scale * w <= right), 1e-300)

@@ -16,7 +16,7 @@ from jaxvib.cli.output import csv_options
 if TYPE_CHECKING:
     import numpy as np
 
-    from jaxvib.steady.response import AbstractResponse
+    from jaxvib.steady.response import AbstractResponse, TorqueFolds
 
 
 _MEASURES = (
@@ -177,7 +177,7 @@ def _text(
     return "\n".join(lines)
 
 
-def _folds_table(of: jv.TorqueFolds, folds: list[int], unit: str, scale: float) -> str:
+def _folds_table(of: TorqueFolds, folds: list[int], unit: str, scale: float) -> str:
     rows = [
         [
             f"{scale * of.speed[k]:.5g}",

@@ -157,8 +157,8 @@ class PhaseJams(AbstractPhaseJam):
 
 def _drag_axis(drag: Array) -> tuple[float, str]:
     """Return the factor and the label of a drag axis: N s/m, or multiples of the drag of the scene if the loads differ."""
-    drag = np.ravel(drag)
-    return (float(drag[0]), "drag, N s/m") if np.all(drag == drag[0]) else (1.0, "drag / drag of the scene")
+    each = np.ravel(drag)
+    return (float(each[0]), "drag, N s/m") if np.all(each == each[0]) else (1.0, "drag / drag of the scene")
 
 
 def _shown_drags(curves: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]) -> tuple[float, float]:
