@@ -135,12 +135,21 @@ class Limit(NamedTuple):
 class Influence(NamedTuple):
     """Influence of a free parameter, named `what`, on the objective.
 
-    **Attributes**: change of the objective, percent, if only this parameter is 1 % smaller (`less`) or 1 % larger (`more`).
+    **Attributes**: change of the objective, percent, if only this parameter is 1 % smaller (`less`) or 1 % larger (`more`); the
+    demands that are not met then (`unmet_by_less`, `unmet_by_more`), in words.
     """
 
     what: str
     less: float
     more: float
+    unmet_by_less: tuple[str, ...] = ()
+    unmet_by_more: tuple[str, ...] = ()
+
+    def unmet_text(self) -> str:
+        """Return the demands that are not met after one of the changes as text; an empty text without them."""
+        changes = {"less": self.unmet_by_less, "more": self.unmet_by_more}
+        unmet = [f"1 % {change} does not meet {', '.join(demands)}" for change, demands in changes.items() if demands]
+        return f" ({'; '.join(unmet)})" if unmet else ""
 
 
 class Unresolved(NamedTuple):
@@ -287,7 +296,8 @@ class Synthesis(Result):
                 lines.append(f"  met: {limit.what} ({values})")
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
         for influence in ranked[:5]:
-            lines.append(f"  1 % less / more {influence.what}: {change_text(sign * influence.less, sign * influence.more)}")
+            changes = change_text(sign * influence.less, sign * influence.more)
+            lines.append(f"  1 % less / more {influence.what}: {changes}{influence.unmet_text()}")
         largest_percent = max((abs(change) for each in ranked[:1] for change in (each.less, each.more)), default=0.0)
         tolerance = max(_MAX_EQUAL_DIFFERENCE, _ROUNDING_SHARE * largest_percent / 100.0) * max(abs(best), 1e-300)
         equal = [m for m in self.machines if abs(m.value - best) <= tolerance]

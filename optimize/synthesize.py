@@ -173,7 +173,7 @@ def synthesize(
         unit=objective.unit,
         table=_table(initial_space, scene, named, reports[:2, : len(named)], other_tiers),
         limits=limits,
-        influences=influences_of(problem, reports[1:, len(named)]),
+        influences=influences_of(problem, demands, reports[1:, len(named) :]),
         unresolved=unresolved_of([q for _, q in named], reports[1:, : len(named)]),
         machines=machines_of(problem, result, _SAME_DESIGN_DISTANCE),
         **searched,

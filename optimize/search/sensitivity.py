@@ -92,14 +92,27 @@ def neighbours(problem: Problem, result: SearchResult) -> np.ndarray:
     return numbers + np.concatenate([np.zeros((1, len(numbers))), -changes, changes, _TINY_STEPS[:, None] * numbers])
 
 
-def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]:
-    """Return the influence of each free parameter, from the objective (5 + 2 d,) of the `neighbours`."""
-    d = problem.space.size
+def influences_of(problem: Problem, demands: Sequence[Demand], reports: np.ndarray) -> tuple[Influence, ...]:
+    """Return the influence of each free parameter.
+
+    **Arguments**: `reports` (5 + 2 d, 1 + 2 number of demands): the objective at the `neighbours`, and for each demand the
+    value of its quantity and its limit.
+    """
+    d, values = problem.space.size, reports[:, 0]
     if not values[0]:
         return ()
     change = 100.0 * (values[1:] - values[0]) / abs(values[0])
+    senses = np.array([1.0 if demand.sense == "at most" else -1.0 for demand in demands])
+    violations = senses * (reports[:, 1::2] - reports[:, 2::2]) / np.asarray(problem.scales)
+
+    def unmet(k: int) -> tuple[str, ...]:
+        """Return the demands that the design meets and its neighbour `k` does not, in words."""
+        is_lost = (violations[0] <= MAX_VIOLATION) & (violations[k] > MAX_VIOLATION)
+        return tuple(demand.words for demand, lost in zip(demands, is_lost, strict=True) if lost)
+
     return tuple(
-        Influence(word, float(change[k]), float(change[d + k])) for k, (word, _) in enumerate(problem.space.words_of_changes())
+        Influence(word, float(change[k]), float(change[d + k]), unmet(1 + k), unmet(1 + d + k))
+        for k, (word, _) in enumerate(problem.space.words_of_changes())
     )
 
 

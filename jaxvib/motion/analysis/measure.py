@@ -38,6 +38,9 @@ to the next point on each side of the extremum. It divides each of these two dis
 _MAX_SPREAD_OF_MEAN = 0.2
 """Largest difference of the speeds of turning masses, relative to the largest speed, with which their mean is stated."""
 
+_MIN_SHOWN_RIPPLE = 0.01
+"""Smallest variation of the rotor speeds about their means, relative to the largest speed, that the text of a run states."""
+
 _MAX_CONSTANT_SPREAD = 0.01
 """Largest difference of the speeds of a rotor, relative to the largest one, with which its speed counts as constant."""
 
@@ -133,9 +136,10 @@ class AbstractMeasured(Readable):
         return f"amplitude, zero to peak: {amplitude}; foundation force {force}{kind}"
 
     def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array]) -> str:
-        """Return a line of text with the speeds of the turning masses, and the last of the `rotor_speeds` (nt,), rad/s, of each
-        exciter with loads. The mean speed is left out if the speeds differ much, for example because a motor stands still. If a
-        rotor speed is not constant, the text states that it is the last one."""
+        """Return a line of text with the speeds of the turning masses, the last of the `rotor_speeds` (nt,), rad/s, of each
+        exciter with loads, and the variation of the rotor speeds in a settled motion. The mean speed is left out if the speeds
+        differ much, for example because a motor stands still. If a rotor speed is not constant, the text states that it is the
+        last one."""
         exciters = zip(scene.exciters, map(np.asarray, rotor_speeds), strict=True)
         histories = [speeds for exciter, speeds in exciters if exciter.loads is not None]
         changes = any(np.ptp(speeds) > _MAX_CONSTANT_SPREAD * np.max(np.abs(speeds)) for speeds in histories)
@@ -149,6 +153,9 @@ class AbstractMeasured(Readable):
         swings = [np.asarray(speeds) for speeds in rotor_speeds if np.min(speeds) < 0.0 < np.max(speeds)]
         largest = max((float(np.max(np.abs(speeds))) for speeds in swings), default=0.0)
         swing = f"; a rotor swings, at up to {speed_text(largest, 4)}" if largest > 0.0 else ""
+        ripple = max((float(np.ptp(speeds)) / 2.0 for speeds in map(np.asarray, rotor_speeds)), default=0.0)
+        if bool(self.settled) and not swing and ripple > _MIN_SHOWN_RIPPLE * float(np.max(magnitudes)):
+            swing = f"; rotor speeds vary by ±{speed_text(ripple, 3)}"
         return f"{turning_masses(scene)} turn at {each}{rotor}{swing}"
 
 

@@ -62,6 +62,10 @@ def test_a_run_of_two_motors_obeys_the_equations_by_hand():
     assert run.load_speed[0] > 0.0 > run.load_speed[1]
     stopped = dataclasses.replace(run, load_speed=jnp.asarray([100.0, -0.01]))  # the mean speed has no meaning
     assert stopped.speeds_text(SCENE, run.window.rotor_speeds) == "exciters turn at 954.93, -0.095493 rpm; negative: clockwise"
+    varying = dataclasses.replace(stopped, drift=jnp.asarray(1e-6))  # settled
+    speeds = [np.array([98.0, 102.0, 100.0]), np.full(3, 50.0)]
+    assert varying.speeds_text(SCENE, speeds).endswith("; negative: clockwise; rotor speeds vary by ±19.1 rpm")
+    assert varying.speeds_text(SCENE, [0.25 * each + 75.0 for each in speeds]).endswith("; negative: clockwise")
 
 
 def test_ensembles_of_two_motors_obey_the_equations_by_hand():

@@ -96,10 +96,22 @@ def test_gains_are_of_the_best_design():
 
 def test_influences_are_changes_of_the_objective():
     problem = problem_of(DesignSpace(SCENE, FREE), WISH, [])
-    first, second = influences_of(problem, np.array([-4.0, -3.0, -4.4, -5.0, -4.2, *[-4.0] * 4]))
+    first, second = influences_of(problem, [], np.array([[-4.0, -3.0, -4.4, -5.0, -4.2, *[-4.0] * 4]]).T)
     assert first.what == "stiffness of support 1" and second.what == "stiffness of support 2"
     np.testing.assert_allclose([first.less, first.more, second.less, second.more], [25.0, -25.0, -10.0, -5.0])
-    assert influences_of(problem, np.zeros(9)) == ()
+    assert influences_of(problem, [], np.zeros((9, 1))) == ()
+
+
+def test_influences_name_the_demands_that_a_change_breaks():
+    demands = [WISH < 3.0, WISH > 1.0]
+    problem = problem_of(DesignSpace(SCENE, FREE), WISH, demands)
+    values = [[3.0, 1.5], [2.9, 1.5], [3.1, 0.9], [3.0, 1.5], [2.5, 0.5], *[[3.0, 1.5]] * 4]
+    reports = np.array([[1.0, first, 3.0, second, 1.0] for first, second in values])
+    first, second = influences_of(problem, demands, reports)
+    most, least = (demand.words for demand in demands)
+    assert first[3:] == ((), ()) and first.unmet_text() == ""
+    assert second[3:] == ((most, least), (least,))
+    assert second.unmet_text() == f" (1 % less does not meet {most}, {least}; 1 % more does not meet {least})"
 
 
 @pytest.mark.parametrize(
