@@ -481,7 +481,7 @@ def test_summary_and_plot_of_regimes(two):
     torques, *circles = several.plot().axes
     titles = [each.get_title() for each in circles]
     assert [each.partition(",")[0] for each in titles] == ["300 rpm", "290.451 rpm", "280.901 rpm"]
-    assert titles[0].startswith("300 rpm, stable\nphases 0, -90 deg\ntorques ")
+    assert titles[0].startswith("300 rpm, stable\nphases in the direction of rotation\n0, -90 deg\ntorques ")
     named = {text.get_text() for text in torques.get_legend().get_texts()}
     assert torques.get_ylabel() == "torque, N m" and {"of motor 1", "of motor 2", "regime; hollow: unstable"} <= named
     (axis,) = regime.plot().axes
@@ -490,7 +490,7 @@ def test_summary_and_plot_of_regimes(two):
     assert ["unstable" in axis.get_title() for axis in mixed.plot().axes[1:]] == [False, *6 * [True]]
     same = [jv.Exciter(drive=each.drive, unbalance=each.unbalance, at=each.at) for each in TWO.exciters]
     together = eqx.tree_at(lambda r: r.scene, regime, jv.Scene(TWO.machine, exciters=same))
-    assert together.plot().axes[0].get_title().splitlines()[3].startswith("resultant")
+    assert together.plot().axes[0].get_title().splitlines()[4].startswith("resultant")
     plt.close("all")
 
 
