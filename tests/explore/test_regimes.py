@@ -83,7 +83,7 @@ def test_the_chart_shows_the_working_regime_at_each_speed(linear):
     for number, color, value in (
         (0, COLORS[0], lambda regime: RPM * regime.speed),
         (1, COLORS[1], lambda regime: 1e3 * regime.amplitude[1]),
-        (1, COLORS[2], lambda regime: 1e3 * regime.amplitude[2]),
+        (1, COLORS[2], lambda regime: np.rad2deg(regime.amplitude[2])),
         (2, COLORS[0], lambda regime: np.rad2deg(regime.phases[1])),
     ):
         is_log = number == 1

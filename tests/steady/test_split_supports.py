@@ -67,7 +67,7 @@ def test_whirls_with_a_forward_part_are_excited(up):
     exact = (np.abs(1.0 - ratio) - np.abs(1.0 + ratio)) / (np.abs(1.0 - ratio) + np.abs(1.0 + ratio))
     np.testing.assert_allclose(whirls.directivity[0], exact, atol=1e-6)
     np.testing.assert_array_equal(whirls.forward[0], exact > 0.0)
-    natural = regime._resonances(scene(machine), jnp.asarray(n))
+    natural = regime.excited_frequencies(scene(machine), jnp.asarray(n))
     assert np.isfinite(natural).tolist() == [True, up != 4e4]
 
 
