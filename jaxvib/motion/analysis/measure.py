@@ -137,10 +137,12 @@ class AbstractMeasured(Readable):
 
     def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array]) -> str:
         """Return a line of text with the speeds of the turning masses, the last of the `rotor_speeds` (nt,), rad/s, of each
-        exciter with loads, and the variation of the rotor speeds in a settled motion. The mean speed is left out if the speeds
-        differ much, for example because a motor stands still. If a rotor speed is not constant, the text states that it is the
-        last one."""
-        exciters = zip(scene.exciters, map(np.asarray, rotor_speeds), strict=True)
+        exciter with loads, and in a settled motion the variation of the speeds of the other rotors.
+
+        The mean speed is left out if the speeds differ much, for example because a motor stands still. If a rotor speed is not
+        constant, the text states that it is the last one.
+        """
+        exciters = [*zip(scene.exciters, map(np.asarray, rotor_speeds), strict=True)]
         histories = [speeds for exciter, speeds in exciters if exciter.loads is not None]
         changes = any(np.ptp(speeds) > _MAX_CONSTANT_SPREAD * np.max(np.abs(speeds)) for speeds in histories)
         last = speed_text([speeds[-1] for speeds in histories], 6) + (" at the end" if changes else "")
@@ -153,7 +155,7 @@ class AbstractMeasured(Readable):
         swings = [np.asarray(speeds) for speeds in rotor_speeds if np.min(speeds) < 0.0 < np.max(speeds)]
         largest = max((float(np.max(np.abs(speeds))) for speeds in swings), default=0.0)
         swing = f"; a rotor swings, at up to {speed_text(largest, 4)}" if largest > 0.0 else ""
-        ripple = max((float(np.ptp(speeds)) / 2.0 for speeds in map(np.asarray, rotor_speeds)), default=0.0)
+        ripple = max((float(np.ptp(speeds)) / 2.0 for exciter, speeds in exciters if exciter.loads is None), default=0.0)
         if bool(self.settled) and not swing and ripple > _MIN_SHOWN_RIPPLE * float(np.max(magnitudes)):
             swing = f"; rotor speeds vary by ±{speed_text(ripple, 3)}"
         return f"{turning_masses(scene)} turn at {each}{rotor}{swing}"
