@@ -181,8 +181,8 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     `speed_variation`). This change excites the resonance w already at the speed w/2. When the rotor reaches w, a part of this
     vibration has not decayed yet. It raises or lowers the peak, depending on the initial angle. The change of the peak is about
     this share if the motor is much stronger than `least_torque`, and larger for weaker motors: from -27 % to +62 % for a screen
-    with a variation of 18 % and a least torque of 0.95. From rest, this screen also passes with
-    0.8 times its torque. Use `simulate` from rest for peaks, and for motors near the least torque.
+    with a variation of 18 % and a least torque of 0.95. From rest, this screen also passes with 0.8 times its torque. Use
+    `simulate` from rest for peaks, and for motors near the least torque.
 
     **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between passing a
     resonance and being caught use `simulate`. The torque of a motor with currents is its steady torque here. This changes
