@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import BoundaryNorm, ListedColormap, to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
@@ -56,41 +57,81 @@ def label_map(
     colours = [look["facecolor"] if "facecolor" in look else look["color"] for look in looks]
     norm = BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present))
     places, shown = np.searchsorted(present, codes), ListedColormap(colours)
-    corners = cell_edges(x, log[0]), cell_edges(y, log[1])
-    mesh = axis.pcolormesh(*corners, places, cmap=shown, norm=norm, rasterized=True)
+    mesh = axis.pcolormesh(cell_edges(x, log[0]), cell_edges(y, log[1]), places, cmap=shown, norm=norm, rasterized=True)
     for code, look in zip(present, looks, strict=True):
         if "hatch" in look:
-            axis.add_patch(PathPatch(_cells_path(np.asarray(mesh.get_coordinates()), codes == code), rasterized=True, **look))
+            _hatch(axis, mesh, codes == code, look)
     entries: list[Patch | Line2D] = [Patch(label=names[k], **look) for k, look in zip(present, looks, strict=True)]
-    edges = axis.get_xlim(), axis.get_ylim()
+    limits = axis.get_xlim(), axis.get_ylim()
     for kind, parts in (lines or {}).items():
-        dashes, inside = _DASHES.get(kind, ":"), False
-        width = 1.1 if dashes == "-" else 2.4  # dots remain visible on a solid line at the same place
-        for part_x, part_y in parts:
-            xs, ys = _to_edges(part_x, part_y, y, edges[1]) if len(part_x) > 1 else (part_x, part_y)
-            ys, xs = _to_edges(ys, xs, x, edges[0]) if len(part_x) > 1 else (ys, xs)
-            axis.plot(xs, ys, color="black", lw=width, ls=dashes, marker="." if len(xs) == 1 else None)
-            within = [(values >= low) & (values <= high) for values, (low, high) in zip((xs, ys), edges, strict=True)]
-            inside = inside or bool(np.any(within[0] & within[1]))
-        if inside:
-            entries.append(Line2D([], [], color="black", lw=width, ls=dashes, label=f"{kind} bifurcations of exact jams"))
-    entries += _case_points(axis, x, y)
-    axis.set(xlim=edges[0], ylim=edges[1])
+        entries += _bifurcation_lines(axis, kind, parts, (x, y), limits, log)
+    entries += _case_points(axis, x, y, log)
+    axis.set(xlim=limits[0], ylim=limits[1])
     _scales(axis, x_label, y_label, log)
     axis.grid(False)
     legend_above(axis, 3, handles=entries)
     return figure if ax is None else ax
 
 
+def _bifurcation_lines(
+    axis: Axes,
+    kind: str,
+    parts: Sequence[tuple[np.ndarray, np.ndarray]],
+    centres: tuple[np.ndarray, np.ndarray],
+    limits: tuple[tuple[float, float], tuple[float, float]],
+    log: tuple[bool, bool],
+) -> list[Line2D]:
+    """Draw the lines of one kind of bifurcation up to the `limits` of a map with the `centres` of its cells, and return their
+    entry of the legend if a part of them is visible."""
+    dashes, inside = _DASHES.get(kind, ":"), False
+    width = 1.1 if dashes == "-" else 2.4  # dots remain visible on a solid line at the same place
+    # Lines are extended on the drawn scale; on a linear one, an end on a logarithmic axis could become negative.
+    drawn = [(np.log, np.exp) if is_log else (np.asarray, np.asarray) for is_log in log]
+    x, y = (scale(each) for (scale, _), each in zip(drawn, centres, strict=True))
+    x_edges, y_edges = (tuple(scale(np.asarray(each))) for (scale, _), each in zip(drawn, limits, strict=True))
+    for part in parts:
+        xs, ys = (scale(each) for (scale, _), each in zip(drawn, part, strict=True))
+        if xs.size > 1:
+            xs, ys = _to_edges(xs, ys, y, y_edges)
+            ys, xs = _to_edges(ys, xs, x, x_edges)
+        within = (x_edges[0] <= xs) & (xs <= x_edges[1]) & (y_edges[0] <= ys) & (ys <= y_edges[1])
+        inside = inside or bool(np.any(within))
+        marker = "." if xs.size == 1 else None
+        axis.plot(drawn[0][1](xs), drawn[1][1](ys), color="black", lw=width, ls=dashes, marker=marker)
+    return [Line2D([], [], color="black", lw=width, ls=dashes, label=f"{kind} bifurcations of exact jams")] if inside else []
+
+
+def _hatch(axis: Axes, mesh: QuadMesh, chosen: np.ndarray, look: Look) -> None:
+    """Draw the chosen cells (m, n) of a map in a hatched style."""
+    axis.add_patch(PathPatch(_cells_path(np.asarray(mesh.get_coordinates()), chosen), rasterized=True, **look))
+
+
 _MAX_MARKED_CASES = 150
 """Number of cases up to which each is marked by a point in a map."""
 
+_MAX_UNEVEN = 1.01
+"""Ratio of the largest to the smallest distance of neighbouring cases up to which their spacing counts as even."""
 
-def _case_points(axis: Axes, x: np.ndarray, y: np.ndarray) -> list[Line2D]:
-    """Mark the cases of a map over x (n,) and y (m,) by points unless there are many, and return their entry of the legend."""
-    if x.size * y.size > _MAX_MARKED_CASES:
-        return []
-    return axis.plot(np.tile(x, y.size), np.repeat(y, x.size), "o", ms=3.0, mfc="white", mec="black", mew=0.7, label="case")
+
+def _case_points(axis: Axes, x: np.ndarray, y: np.ndarray, log: tuple[bool, bool]) -> list[Line2D]:
+    """Mark the cases of a map over x (n,) and y (m,) by points, and return their entry of the legend.
+
+    If there are many cases, only unevenly spaced values are marked, by points on their axis. The cells of evenly spaced values
+    show by themselves where the cases are.
+    """
+    look: Look = {"ls": "none", "marker": "o", "ms": 3.0, "mfc": "white", "mec": "black", "mew": 0.7, "clip_on": False}
+    if x.size * y.size <= _MAX_MARKED_CASES:
+        return axis.plot(np.tile(x, y.size), np.repeat(y, x.size), label="case", **look)
+    entries: list[Line2D] = []
+    for values, is_log, turn, share in (
+        (x, log[0], 1, axis.get_xaxis_transform()),
+        (y, log[1], -1, axis.get_yaxis_transform()),
+    ):
+        gaps = np.diff(np.log(values) if is_log else values)
+        if gaps.size and np.max(gaps) > _MAX_UNEVEN * np.min(gaps):
+            places = (values, np.zeros(values.size))[::turn]
+            entries = axis.plot(*places, transform=share, label="values of the cases", **look)
+    return entries
 
 
 def _to_edges(
@@ -154,14 +195,20 @@ def value_map(
     log: tuple[bool, bool] = (False, False),
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw a map over x (n,) and y (m,), coloured by values (m, n); NaN is grey."""
+    """Draw a map over x (n,) and y (m,), coloured by values (m, n); cells with NaN are hatched."""
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
-    axis.set_facecolor("#dddddd")
     drawn = axis.pcolormesh(cell_edges(x, log[0]), cell_edges(y, log[1]), values, cmap="viridis", rasterized=True)
+    limits = axis.get_xlim(), axis.get_ylim()
+    entries: list[Patch | Line2D] = []
+    if np.any(np.isnan(values)):
+        _hatch(axis, drawn, np.isnan(values), HATCHED[NO_RESULT])
+        entries = [Patch(label=NO_RESULT, **HATCHED[NO_RESULT])]
     figure.colorbar(drawn, ax=axis, label=label)
-    legend_above(axis, handles=_case_points(axis, x, y))
+    entries += _case_points(axis, x, y, log)
+    axis.set(xlim=limits[0], ylim=limits[1])
     _scales(axis, x_label, y_label, log)
     axis.grid(False)
+    legend_above(axis, handles=entries)
     return figure if ax is None else ax
 
 

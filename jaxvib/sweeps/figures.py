@@ -398,7 +398,8 @@ def _theory_lines(
 
     Axes that are not in the map have their middle values, as in the cases of the map. Lines exist only if one axis is the rotor
     speed. If the other axis is a parameter of the initial state, which does not influence steady motions, the lines are
-    straight. If it is a parameter of the scene, the lines connect points that are computed for `_THEORY_ROWS` of its values.
+    straight. If it is a parameter of the scene, the lines connect points that are computed for `_THEORY_ROWS` values, evenly
+    spaced on its scale.
     """
     if _SPEED not in (x_name, y_name):
         return {}
@@ -411,7 +412,9 @@ def _theory_lines(
             scene = put_values(scene, (axis_of(scene, axis, [float(middle)]).target,), jnp.asarray([middle]))
     other_axis, values, speeds = (y_name, ys, xs) if x_name == _SPEED else (x_name, xs, ys)
     fixed = other_axis.startswith("start.")
-    rows = values[[0, -1]] if fixed else np.quantile(values, np.linspace(0.0, 1.0, _THEORY_ROWS))
+    # Between unevenly spaced values the lines must not cross a gap without a computed point.
+    spaced = np.geomspace if _is_log(store, other_axis) else np.linspace
+    rows = values[[0, -1]] if fixed else spaced(values[0], values[-1], _THEORY_ROWS)
     target = axis_of(scene, other_axis, [float(rows[0])]).target
     scene = put_values(scene, (axis_of(scene, _SPEED, [float(speeds[-1])]).target,), jnp.asarray([float(np.max(speeds))]))
     kinds_of_rows: list[dict[str, list[float]]] = []

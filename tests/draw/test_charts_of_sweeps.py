@@ -30,6 +30,39 @@ def test_cells_without_a_result_are_hatched():
     np.testing.assert_allclose(corners[:, 2], [[1.1, 0.5], [1.1, 2.2]])
 
 
+def test_cells_without_a_value_are_hatched_and_named():
+    values = np.array([[1.0, np.nan], [3.0, 4.0]])
+    axis = value_map(np.arange(2.0), np.arange(2.0), values, x_label="x", y_label="y", label="z").axes[0]
+    assert [text.get_text() for text in axis.get_legend().get_texts()] == ["no result", "case"]
+    (hatched,) = (patch for patch in axis.patches if patch.get_hatch())
+    np.testing.assert_allclose(hatched.get_path().vertices[[0, 2]], [[0.5, -0.1], [1.1, 0.5]])
+
+
+def test_uneven_values_of_many_cases_are_marked():
+    even, uneven = np.linspace(1.0, 2.0, 30), np.array([*np.linspace(1.0, 2.0, 29), 9.0])
+    labels = dict(x_label="x", y_label="y")
+    for x, y, marked in ((uneven, even, uneven), (even, uneven, uneven), (even, even, None)):
+        for axis in (
+            label_map(x, y, np.zeros((30, 30), int), ["a"], **labels).axes[0],
+            value_map(x, y, np.zeros((30, 30)), label="z", **labels).axes[0],
+        ):
+            assert len(axis.lines) == (marked is not None)
+            for line in axis.lines:
+                assert line.get_label() == "values of the cases"
+                np.testing.assert_array_equal(line.get_xdata() if x is uneven else line.get_ydata(), marked)
+
+
+@pytest.mark.parametrize("log", [(True, False), (True, True)])
+def test_lines_reach_the_edges_on_the_drawn_scale(log):
+    x, y = np.array([1.0, 10.0, 100.0]), np.array([1.0, 2.0, 20.0])
+    line = np.array([90.0, 50.0, 2.0]), y
+    drawn = label_map(x, y, np.zeros((3, 3), int), ["a"], x_label="x", y_label="y", log=log, lines={"fold": [line]}).axes[0]
+    xs, ys = drawn.lines[0].get_data()
+    assert np.all(xs > 0.0) and ys[-1] == pytest.approx(drawn.get_ylim()[1]) and len(xs) == 5
+    rise = np.diff(np.log(ys) if log[1] else ys)
+    assert np.diff(np.log(xs))[-1] / rise[-1] == pytest.approx(np.diff(np.log(xs))[-2] / rise[-2])
+
+
 def test_a_map_of_values_has_logarithmic_axes_on_request():
     x, y, values = np.array([1.0, 10.0]), np.array([1.0, 100.0]), np.array([[1.0, 2.0], [3.0, np.nan]])
     for log in ((False, False), (True, False), (False, True)):

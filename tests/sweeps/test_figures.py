@@ -195,6 +195,19 @@ def test_theory_lines_are_those_of_the_shown_cases(tmp_path, monkeypatch):
     assert seen and all(stiffness == [3e4] for stiffness in seen)
 
 
+def test_theory_lines_have_points_between_uneven_values(tmp_path, monkeypatch):
+    axes = {"drive.speed": [30.0, 50.0], "loads.drag": [1.0, 1.1, 1.2, 16.0]}
+    asked, seen = labelled(axes, ("mode",), tmp_path / "uneven.zarr"), []
+
+    def branches_of(scene):
+        seen.append(float(np.mean(scene.loads.drag)))
+        return SimpleNamespace(special=())
+
+    monkeypatch.setattr("jaxvib.sweeps.figures.exact_branches", branches_of)
+    plot_map(asked.store)
+    np.testing.assert_allclose(seen, np.geomspace(1.0, 16.0, 9))
+
+
 @pytest.mark.slow
 def test_theory_lines_pass_through_the_points_of_the_diagram(grid):
     axis = plot_map(grid.store).axes[0]
