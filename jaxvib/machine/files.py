@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import math
 import re
 import tomllib
@@ -35,6 +36,7 @@ from jaxvib.machine.templates import Templates as Templates
 from jaxvib.machine.torus import torus_balls
 from jaxvib.units import number
 from jaxvib.units.known import require_known, when_known
+from jaxvib.units.reading import to_float
 from jaxvib.units.tables import csv_column, row_names
 
 MACHINES: dict[str, Callable[..., Machine]] = {
@@ -171,7 +173,8 @@ def require_tables(tables: Tables, kind: str, allowed: list[str]) -> None:
     own, other = (f"{'an' if each == 'identification' else 'a'} {each} file" for each in (kind, found))
     if found == kind or not present[found]:
         is_outside = kind == "scene" and not isinstance(tables[name], (Mapping, list))
-        advice = "write it below the header of its table, such as [machine]" if is_outside else suggest_name(name, allowed)
+        header = "[effects]" if name in EFFECTS else "the header of its table, such as [machine]"
+        advice = f"write it below {header}" if is_outside else suggest_name(name, allowed)
         raise InputError(name, f"is not part of {own}; {advice}")
     taken = f"`jaxvib {_COMMANDS[found]}`" if found in _COMMANDS else "commands such as modes and regimes"
     new = f"`jaxvib new {'sweep' if kind == 'study' else kind}` prints {own}"
@@ -327,8 +330,37 @@ def _build_effects(chosen: object) -> tuple[Effect, ...]:
         elif value is True:
             effects.append(build_part(EFFECTS[name], {}, f"effects.{name}"))
         elif value is not False:
-            raise InputError(f"effects.{name}", f"is {quoted(value)}; write true, false or a table of its arguments")
+            arguments = inspect.signature(EFFECTS[name]).parameters.values()
+            allowed = [] if any(each.default is each.empty for each in arguments) else ["true", "false"]
+            if arguments:
+                allowed.append(_inline_table(name, value, {"": EFFECTS[name]}) or "a table of its arguments")
+            raise InputError(f"effects.{name}", f"is {quoted(value)}; write {' or '.join(allowed)}")
     return tuple(effects)
+
+
+def _inline_table(name: str, value: object, builds: Mapping[str, Callable[..., object]]) -> str:
+    """Return the inline table of TOML that is meant by a kind or a number in the place of the table `name`: that of the first
+    part in `builds`, by its kind, which has an argument with the unit of the number; "" if there is none."""
+    for kind, build in builds.items():
+        given = {"kind": json.dumps(kind)} if kind else {}
+        parameters = inspect.signature(build).parameters
+        if value != kind:
+            specs = number_specs(build) if isinstance(build, type) else {}
+            fits = (each for each in parameters if each in specs and _is_number_in(value, specs[each].unit))
+            argument = next(fits, "")
+            if not argument:
+                continue
+            given[argument] = json.dumps(value, ensure_ascii=False)
+        given |= {each: "..." for each, it in parameters.items() if it.default is it.empty and each not in given}
+        return f"{name} = {{ {', '.join(f'{each} = {text}' for each, text in given.items())} }}"
+    return ""
+
+
+def _is_number_in(value: object, unit: str) -> bool:
+    try:
+        return isinstance(value, (str, float, int)) and to_float(value, unit, "") is not None
+    except InputError:
+        return False
 
 
 def build_kind(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -> T:
@@ -337,7 +369,8 @@ def build_kind(table: object, section: str, kinds: Mapping[str, Callable[..., T]
     **Raises** `InputError` for an unknown or missing field.
     """
     if not isinstance(table, Mapping):
-        raise InputError(section, f"is {quoted(table)}; it must be a table; write [{section}]")
+        example = _inline_table(section.rpartition(".")[2], table, kinds) or f"[{section}]"
+        raise InputError(section, f"is {quoted(table)}; it must be a table; write {example}")
     if "kind" not in table:
         raise InputError(f"{section}.kind", f"is missing; allowed: {', '.join(kinds)}")
     kind = table["kind"]

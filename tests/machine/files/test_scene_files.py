@@ -120,7 +120,7 @@ def test_effects_in_a_scene_file_say_where_they_are_wrong():
         jv.scene_from_toml(wrong)
     with pytest.raises(jv.InputError, match=r"effects\.static_imbalance\.moment is missing"):
         jv.scene_from_toml(TEMPLATES["two_mass"] + "static_imbalance = true\n")
-    with pytest.raises(jv.InputError, match=r"effects\.gravity is \[\]; write true, false or a table"):
+    with pytest.raises(jv.InputError, match=r"effects\.gravity is \[\]; write true or false or a table"):
         jv.scene_from_toml(TEMPLATES["two_mass"] + "gravity = []\n")
 
 
@@ -168,7 +168,27 @@ def tables(**changed):
         (dict(drive__speed=None, drive__sped=3.0), "drive.sped is not a field here; did you mean 'speed'? allowed: speed"),
         (dict(effects=5), "effects is not a table"),
         (dict(effects={"gravty": True}), "effects.gravty is not an effect; did you mean 'gravity'? allowed: gravity"),
-        (dict(effects={"gravity": 3}), "effects.gravity is 3; write true, false or a table of its arguments"),
+        (dict(effects={"gravity": 3}), "effects.gravity is 3; write true or false or gravity = { g = 3 }"),
+        (
+            dict(effects={"static_imbalance": "72 g m"}),
+            "effects.static_imbalance is '72 g m'; write static_imbalance = { moment = \"72 g m\" }",
+        ),
+        (
+            dict(effects={"stop": "3 mm"}),
+            "effects.stop is '3 mm'; write stop = { gap = \"3 mm\", stiffness = ... }",
+        ),
+        (dict(effects={"static_imbalance": "3 s"}), "effects.static_imbalance is '3 s'; write a table of its arguments"),
+        (dict(effects={"free_spin": "on"}), "effects.free_spin is 'on'; write true or false"),
+        (
+            dict(drive="1200 rpm"),
+            'drive is \'1200 rpm\'; it must be a table; write drive = { kind = "constant_speed", speed = "1200 rpm" }',
+        ),
+        (
+            dict(machine="one_mass"),
+            "machine is 'one_mass'; it must be a table; write machine = { kind = \"one_mass\", mass = ..., stiffness = ..., ",
+        ),
+        (dict(machine="large"), "machine is 'large'; it must be a table; write [machine]"),
+        (dict(static_imbalance="72 g m"), "static_imbalance is not part of a scene file; write it below [effects]"),
         (dict(effects={"gravity": {"g": -1.0}}), "effects.gravity.g is -1 m/s^2; it must be at least 0"),
     ],
 )
