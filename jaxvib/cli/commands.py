@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
-import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -23,6 +24,9 @@ from jaxvib.cli.document import (
 from jaxvib.cli.output import csv_options, write_file
 from jaxvib.errors import InputError
 from jaxvib.machine.templates import SCREENS, TEMPLATES
+
+if TYPE_CHECKING:
+    from jaxvib.ode.progress import ProgressMeter
 
 _START_HELP = (
     "Initial state: rest (an ideal drive turns at its speed, a motor stands still), jam (with --mode), or spin_up (smooth, "
@@ -80,24 +84,20 @@ def simulate(
     scene: Path, tolerance: float | None, accuracy: float | None, window: bool, csv: Path | None, output: Output, **options: Any
 ) -> None:
     """Integrate the full equations of SCENE; --out saves the motion (run.npz) and its figure."""
-    from jaxvib.ode.progress import ProgressBar  # slow import, which --help does not need
-
     if tolerance is not None and accuracy is not None:
         raise InputError("--accuracy", "cannot be combined with --step-tolerance; give one of them")
     if csv is not None and window:
         raise InputError("--csv", "needs a trajectory, which --window does not save; leave one of them out")
     loaded = loaded_scene(scene)
     require_deck_options(loaded)
-    meter = ProgressBar() if sys.stderr.isatty() and _is_long(loaded, options["until"]) else None
-    if meter is not None:
-        output.end_waiting()
-    run = jv.simulate(
-        loaded,
-        stepsize_controller=chosen_steps(tolerance) if accuracy is None else jv.Accuracy(accuracy),
-        save="window" if window else "all",
-        progress_meter=meter,
-        **options,
-    )
+    with _progress_meter(output) if _is_long(loaded, options["until"]) else contextlib.nullcontext() as meter:
+        run = jv.simulate(
+            loaded,
+            stepsize_controller=chosen_steps(tolerance) if accuracy is None else jv.Accuracy(accuracy),
+            save="window" if window else "all",
+            progress_meter=meter,
+            **options,
+        )
     output.figure("history.png", lambda: run.plot())
     output.save_result("run.npz", run)
     output.csv(csv, run, "time")
@@ -105,9 +105,22 @@ def simulate(
     output.done(run_document(run, measures), lambda: run_text(run, measures), "simulate", run)
 
 
+@contextlib.contextmanager
+def _progress_meter(output: Output) -> Iterator[ProgressMeter]:
+    """Show the finished share of the time of a run, which the yielded meter reports."""
+    from jaxvib.ode.progress import ProgressMeter  # slow import, which --help does not need
+
+    with output.progress() as progress:
+        yield ProgressMeter(lambda share: progress("integrating", share))
+
+
+_MIN_ANGLE_OF_LONG_RUNS = 2e6
+"""Angle of the rotor, rad, from which the share of a run is shown. A program that shows it cannot be stored and is compiled for
+each run, which takes as long as a run of about this angle."""
+
+
 def _is_long(scene: jv.Scene, until: str) -> bool:
-    """Return True for a run that is so long that a progress bar is useful. Short runs have no bar, because a compiled program
-    with a progress bar cannot be stored."""
+    """Return True for a run that is so long that its finished share is useful."""
     from jaxvib.units import number
 
-    return bool(number(until, "s", "until") * scene.top_speed > 1e6)
+    return bool(number(until, "s", "until") * scene.top_speed > _MIN_ANGLE_OF_LONG_RUNS)

@@ -51,7 +51,13 @@ SECONDS_TO_FIRST_LINE = 10.0
 
 _MAX_SECONDS_BETWEEN_LINES = 600.0
 
-_COMPUTING = "computing, {} (new programs are compiled once, then stored)"
+_COMPUTING = "{}, {} (new programs are compiled once, then stored)"
+
+
+def _is_compiling() -> bool:
+    """Return True if a thread is compiling a program. The module is not imported here, in the thread that shows the time."""
+    stored = sys.modules.get("jaxvib.runtime.stored")
+    return stored is not None and hasattr(stored, "is_compiling") and stored.is_compiling()
 
 
 def duration_text(seconds: float) -> str:
@@ -153,8 +159,6 @@ class Output:
         from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn
         from rich.text import Text
 
-        from jaxvib.runtime.stored import is_compiling
-
         if not sys.stderr.isatty():
 
             def store_step(what: str, share: float) -> None:
@@ -166,7 +170,7 @@ class Output:
 
         class CompilingColumn(TextColumn):
             def render(self, task: Task) -> Text:
-                return Text("compiling, once" if is_compiling() else "")
+                return Text("compiling, once" if _is_compiling() else "")
 
         self.end_waiting()
         columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), CompilingColumn(""))
@@ -177,14 +181,18 @@ class Output:
     def _show_elapsed_time(self) -> None:
         begin = time.monotonic()
         while not self._done.wait(1.0):
-            text = _COMPUTING.format(f"{time.monotonic() - begin:.0f} s")
+            text = _COMPUTING.format("compiling" if _is_compiling() else "computing", f"{time.monotonic() - begin:.0f} s")
             click.echo(f"\r\x1b[K{text}", nl=False, err=True)
 
     def _print_lines(self) -> None:
         begin, due = time.monotonic(), SECONDS_TO_FIRST_LINE
         while not self._done.wait(min(max(begin + due - time.monotonic(), 0.0), threading.TIMEOUT_MAX)):
-            elapsed, step = duration_text(time.monotonic() - begin), self._step
-            click.echo(f"{step}, after {elapsed}" if step else _COMPUTING.format(elapsed), err=True)
+            elapsed, compiling = duration_text(time.monotonic() - begin), _is_compiling()
+            if self._step:
+                text = f"{self._step}, {'compiling, once, ' if compiling else ''}after {elapsed}"
+            else:
+                text = _COMPUTING.format("compiling" if compiling else "computing", elapsed)
+            click.echo(text, err=True)
             due += min(due, _MAX_SECONDS_BETWEEN_LINES)
 
     @staticmethod

@@ -249,13 +249,15 @@ def _coarser_control(control: StepControl) -> StepControl:
 def _run_with_estimate(plan: RunPlan) -> Run:
     """Return a run with its error, which a second run with larger steps estimates.
 
-    Both runs are computed in parallel, except with a progress meter and under a JAX transformation.
+    Both runs are computed in parallel, except under a JAX transformation. A progress meter shows the run itself, which takes
+    longer.
     """
     control = plan.integration.control
     assert isinstance(control, StepControl)
     coarser = _coarser_control(control)
-    runs = partial(_run, plan, control), partial(_run, plan, coarser, is_measured=False)
-    if plan.is_known and plan.integration.progress_meter is None:
+    silent = dataclasses.replace(plan, integration=plan.integration._replace(progress_meter=None))
+    runs = partial(_run, plan, control), partial(_run, silent, coarser, is_measured=False)
+    if plan.is_known:
         fine, coarse = in_threads(lambda k: runs[k](), 2)
     else:
         fine, coarse = (run() for run in runs)

@@ -314,7 +314,9 @@ def test_installed_command_prints_json_alone(tmp_path):
     done = subprocess.run(words, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["rotor_speed"] == 60.0
-    assert all(line.startswith("computing, ") for line in done.stderr.splitlines())  # lines of progress on a slow computer
+    assert all(
+        line.startswith(("computing, ", "compiling, ")) for line in done.stderr.splitlines()
+    )  # lines of progress on a slow computer
 
 
 def test_import_changes_no_settings_of_jax():

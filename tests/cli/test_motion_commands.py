@@ -14,6 +14,7 @@ from small_machine import small_run
 
 import jaxvib as jv
 import optimize
+from jaxvib.cli import output as output_module
 from jaxvib.cli.app import _MODULES, app, loaded_scene, run
 from jaxvib.cli.commands import _is_long
 from jaxvib.draw.motion.histories import _MIN_SAMPLES
@@ -57,10 +58,30 @@ def test_a_run_as_csv_is_its_trajectory(typed, tmp_path, monkeypatch):
         jv.write_csv(kept, "point", tmp_path / "none.csv")
 
 
-def test_long_runs_of_several_exciters_have_a_progress_bar(tmp_path):
+def test_long_runs_of_several_exciters_show_their_share(tmp_path):
     (tmp_path / "screen.toml").write_text(SCREENS["linear_screen"])
     screen = loaded_scene(tmp_path / "screen.toml")
     assert _is_long(screen, "10 h") and not _is_long(screen, "12 s")
+
+
+def test_lines_of_progress_of_a_run_have_its_share(typed, monkeypatch):
+    """A run whose meter shows 42 % waits until a line of progress has this share."""
+    kept, lines = small_run(), []
+    monkeypatch.setattr("jaxvib.cli.commands._MIN_ANGLE_OF_LONG_RUNS", 1.0)
+    monkeypatch.setattr(output_module, "SECONDS_TO_FIRST_LINE", 0.01)
+    monkeypatch.setattr(output_module.click, "echo", lambda text, **_: lines.append(text))
+
+    def run(*_, progress_meter, **__):
+        progress_meter.show(0.42)
+        for _ in range(500):
+            if lines and lines[-1].startswith("integrating: 42%, after"):
+                break
+            time.sleep(0.01)
+        return kept
+
+    monkeypatch.setattr("jaxvib.simulate", run)
+    assert typed("simulate", "machine.toml", "--until", "0.5s")[0] == 0
+    assert any(line.startswith("integrating: 42%, after") for line in lines)
 
 
 def test_largest_displacements_need_a_trajectory(typed, monkeypatch):

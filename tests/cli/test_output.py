@@ -114,6 +114,15 @@ def test_lines_of_progress_come_at_doubling_intervals(capsys, monkeypatch):
     assert lines[3:] == [*(f"descending: 50%, after {x}" for x in minutes), "descending: 50%, after 1 h 0 min"]
 
 
+@pytest.mark.parametrize("step", ["", "descending: 50%"])
+def test_lines_of_progress_state_that_programs_are_compiled(capsys, step):
+    output, ends = Output(False, None), iter([False, True])
+    output._step, output._done = step, SimpleNamespace(wait=lambda _: next(ends))
+    with stored._compilation():
+        output._print_lines()
+    assert capsys.readouterr().err.startswith(f"{step}, compiling, once, after 0 s" if step else "compiling, 0 s (")
+
+
 @pytest.mark.parametrize("is_terminal", [True, False])
 def test_a_long_command_shows_its_progress(capsys, monkeypatch, is_terminal):
     monkeypatch.setattr("sys.stderr.isatty", lambda: is_terminal, raising=False)
