@@ -13,19 +13,18 @@ from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
 from jaxvib.draw.style import (
     COLORS,
     GUIDE,
-    HATCHED,
     MARKERS,
     UNSTABLE,
     WORKING,
     Look,
     axis_unit,
-    label_colors,
     legend_above,
     legend_outside,
     log_ticks,
     numbered,
     panels,
     resonance_lines,
+    stacked_looks,
 )
 from jaxvib.errors import InputError, quoted
 
@@ -320,10 +319,6 @@ def front_chart(x: np.ndarray, y: np.ndarray, *, x_label: str, y_label: str, ax:
     return figure if ax is None else ax
 
 
-HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---", "ooo")
-"""Hatches that distinguish neighbouring areas in greyscale."""
-
-
 def regime_chart(
     drag: np.ndarray,
     shares: Mapping[str, np.ndarray],
@@ -346,9 +341,7 @@ def regime_chart(
     # Bars of a few, distant values are narrow: they must not look like statements about the values between them.
     width = min(0.9 * np.min(np.diff(np.log(drag))), 0.06 * np.log(drag[-1] / drag[0])) if len(drag) > 1 else 0.1
     low = np.zeros(len(drag))
-    for k, (kind, colour, share) in enumerate(zip(shares, label_colors([*shares]), shares.values(), strict=True)):
-        bar: Look = {"color": colour, "hatch": HATCHES[k % len(HATCHES)], "edgecolor": "white", "lw": 0.0}
-        look = HATCHED.get(kind, bar)
+    for (kind, share), look in zip(shares.items(), stacked_looks([*shares]), strict=True):
         top.bar(drag, 100.0 * share, bottom=low, width=drag * width, label=kind, **look)
         low = low + 100.0 * share
     top.set(ylabel="share of the starts, %", ylim=(0.0, 100.0))

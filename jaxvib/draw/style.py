@@ -32,6 +32,9 @@ HATCHED: dict[str, Look] = {
 }
 """Styles of the cells of a map that have no steady motion; the other cells have a colour without a hatch."""
 
+_HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---", "ooo")
+"""Hatches that distinguish neighbouring areas in greyscale."""
+
 _REGIME_COLORS = {
     "swinging": "#b3b3b3",
     "jammed": "#004488",
@@ -105,6 +108,15 @@ def label_colors(names: Sequence[str]) -> list[str]:
     own = {name: _MODE_COLORS[(int(name.rpartition(" ")[2]) - 1) % len(_MODE_COLORS)] for name in modes}
     own |= _REGIME_COLORS
     return [own.get(name, color_of(k)) for k, name in enumerate(names)]
+
+
+def stacked_looks(names: Sequence[str]) -> list[Look]:
+    """Return the style of stacked bars for each label."""
+    bars: list[Look] = [
+        {"color": colour, "hatch": _HATCHES[k % len(_HATCHES)], "edgecolor": "white", "lw": 0.0}
+        for k, colour in enumerate(label_colors(names))
+    ]
+    return [HATCHED.get(name, bar) for name, bar in zip(names, bars, strict=True)]
 
 
 def panels(

@@ -18,6 +18,7 @@ from jaxvib.draw.style import (
     HATCHED,
     NO_RESULT,
     STROKES,
+    WHITE_OUTLINE,
     Look,
     cell_edges,
     color_of,
@@ -26,6 +27,7 @@ from jaxvib.draw.style import (
     log_ticks,
     marker_of,
     panels,
+    stacked_looks,
 )
 
 _DASHES = {"fold": "-", "torus": "--", "period doubling": "-.", "symmetry": ":"}
@@ -266,15 +268,23 @@ def shares_chart(
     return figure if ax is None else ax
 
 
-def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, x_label: str, ax: Axes | None = None) -> Drawn:
-    """Draw a histogram of `counts` (n,) between edges (n + 1,), and the cumulative fraction on a second axis."""
+def distribution_chart(edges: np.ndarray, counts: Mapping[str, np.ndarray], *, x_label: str, ax: Axes | None = None) -> Drawn:
+    """Draw a stacked histogram between edges (n + 1,), and the cumulative fraction of all cases on a second axis.
+
+    `counts` contains the numbers of cases (n,) for each regime; the only entry of a study without regimes has the name "".
+    """
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
-    axis.bar(edges[:-1], counts, width=np.diff(edges), align="edge", color=COLORS[0], alpha=0.55)
+    total = np.zeros(len(edges) - 1)
+    for (name, count), look in zip(counts.items(), stacked_looks([*counts]), strict=True):
+        label = f"{name}: {np.sum(count):.0f} cases" if name else None
+        axis.bar(edges[:-1], count, width=np.diff(edges), align="edge", bottom=total, label=label, **look)
+        total = total + count
     axis.set(ylabel="cases", xlabel=x_label)
+    legend_above(axis, 3)
     share = axis.twinx()
-    share.plot(edges, 100.0 * np.concatenate([[0.0], np.cumsum(counts)]) / max(np.sum(counts), 1), color=COLORS[1])
-    share.set_ylim(0.0, 102.0)
-    share.set_ylabel("cases up to this value, %", color=COLORS[1])
+    cumulative = 100.0 * np.concatenate([[0.0], np.cumsum(total)]) / max(np.sum(total), 1)
+    share.plot(edges, cumulative, color="black", lw=1.1, ls="--", path_effects=WHITE_OUTLINE)
+    share.set(ylim=(0.0, 102.0), ylabel="cases up to this value, % (dashed)")
     share.grid(False)
     return figure if ax is None else ax
 
@@ -284,8 +294,8 @@ def tornado_chart(
 ) -> Drawn:
     """Draw bars from `middle` to `low` (n,) and from `middle` to `high` (n,), the largest difference at the top.
 
-    Each pair of bars belongs to a parameter in `names`. `middle` is the mean of a quantity over all cases. `low` is its mean
-    over the cases in the lowest fifth of the values of the parameter, `high` over those in the highest fifth.
+    Each pair of bars belongs to a parameter in `names`. `middle` is the mean of a quantity over the shown cases. `low` is its
+    mean over the fifth of them with the lowest values of the parameter, `high` over the fifth with the highest.
 
     >>> import numpy as np
     >>> figure = tornado_chart(["a", "b"], np.array([1.0, 0.0]), np.array([3.0, 9.0]), 2.0, x_label="force, N")

@@ -207,8 +207,8 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
 
 
 def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
-    """Plot the distribution of a measure over all cases that have a value. **Returns** a matplotlib figure, or the given
-    `ax`."""
+    """Plot the distribution of a measure over all cases that have a value, stacked by regime if it was measured. **Returns** a
+    matplotlib figure, or the given `ax`."""
     from jaxvib.draw.sweeps import distribution_chart
 
     opened = Store(Path(store))
@@ -221,17 +221,21 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
     if not low <= high:
         raise _no_value(opened, name)
     edges = np.linspace(low, high if high > low else low + max(abs(low), 1.0) * 1e-6, _HISTOGRAM_BINS + 1)
-    counts = sum(np.histogram(_values(opened, name, rows), edges)[0] for rows in opened.pieces())
+    counts: dict[str, np.ndarray] = {}
+    for rows in opened.pieces():
+        values, table = _values(opened, name, rows), _regimes(opened, rows)
+        for code, label in enumerate(table.names):
+            counts[label] = counts.get(label, 0) + np.histogram(values[table.codes == code], edges)[0]
+    counts = {label: count for label, count in counts.items() if np.any(count)}
     _, factor = display_unit(opened, name)
-    return distribution_chart(
-        factor * edges, np.asarray(counts), x_label=measure_label(opened, name) + _labels_note(opened), ax=ax
-    )
+    return distribution_chart(factor * edges, counts, x_label=measure_label(opened, name), ax=ax)
 
 
-def _labels_note(opened: Store) -> str:
-    """Return a line with the labels of the cases if there are several: "all cases: 4 balanced, 2 jammed"."""
-    counts = label_counts(opened)
-    return f"\nall cases: {', '.join(f'{n} {label}' for label, n in counts)}" if len(counts) > 1 else ""
+def _regimes(store: Store, region: slice | tuple[slice, ...]) -> _Labels:
+    """Return the labels of the cases of a region; without measured labels, all cases have the label ""."""
+    if _has_labels(store):
+        return case_labels(store, region)
+    return _Labels(np.zeros(store.read("status", region).shape, int), [""])
 
 
 def _no_value(opened: Store, name: str) -> InputError:
@@ -240,44 +244,56 @@ def _no_value(opened: Store, name: str) -> InputError:
 
 
 def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
-    """Plot two means of a measure for each varied parameter: over the cases with the lowest fifth of the values of this
-    parameter, and over those with the highest fifth.
+    """Plot two means of a measure for each varied parameter: over the fifth of the cases with the lowest values of this
+    parameter, and over the fifth with the highest.
 
-    The parameter with the largest influence is on top. **Returns** a matplotlib figure, or the given `ax`.
+    The cases are those of the most common regime, because a mean over several regimes describes none of them; without measured
+    regimes, all cases. The parameter with the largest influence is on top. **Returns** a matplotlib figure, or the given `ax`.
     """
     from jaxvib.draw.sweeps import tornado_chart
 
     opened = Store(Path(store))
     name, dims = _measure_name(opened, measure), opened.dims
-    axes = list(opened.record["axes"])
-    ends = {axis: _fifths(opened, axis) for axis in axes}
-    sums, total = {axis: np.zeros((2, 2)) for axis in axes}, np.zeros(2)
+    regimes: Counter[str] = Counter()
     for rows in opened.pieces():
-        values = _values(opened, name, rows)
-        has_value = np.isfinite(values)
-        total += [np.sum(values[has_value]), np.sum(has_value)]
-        for axis in axes:
-            dim = axis if axis in dims else SAMPLE
-            place = dims.index(dim)
-            along = opened.read(axis, rows if place == 0 else slice(None))
-            along = along.reshape([-1 if k == place else 1 for k in range(len(dims))])
-            for k, inside in enumerate((along <= ends[axis][0], along >= ends[axis][1])):
-                chosen = has_value & inside
-                sums[axis][k] += [np.sum(values[chosen]), np.sum(chosen)]
-    if not total[1]:
+        table = _regimes(opened, rows)
+        codes = table.codes[np.isfinite(_values(opened, name, rows)) & (table.codes >= 0)]
+        numbers = np.bincount(codes, minlength=len(table.names))
+        regimes.update({label: int(n) for label, n in zip(table.names, numbers, strict=True) if n})
+    if not regimes:
         raise _no_value(opened, name)
-    means = np.asarray([sums[axis][:, 0] / np.maximum(sums[axis][:, 1], 1) for axis in axes])
-    means = np.where(np.asarray([sums[axis][:, 1] for axis in axes]) > 0, means, np.nan)
-    label = f"mean of {measure_label(opened, name)}{_labels_note(opened)}"
+    (regime, cases), *others = regimes.most_common()
+    sums = {dim: np.zeros((2, n)) for dim, n in zip(dims, opened.shape, strict=True)}  # sums of values, numbers of cases
+    for rows in opened.pieces():
+        values, table = _values(opened, name, rows), _regimes(opened, rows)
+        chosen = np.isfinite(values) & (table.codes == table.names.index(regime))
+        for place, dim in enumerate(dims):
+            rest, at = tuple(k for k in range(len(dims)) if k != place), rows if place == 0 else slice(None)
+            sums[dim][0, at] += np.sum(values, axis=rest, where=chosen)
+            sums[dim][1, at] += np.sum(chosen, axis=rest)
+    axes = list(opened.record["axes"])
+    means = np.asarray([_means_of_fifths(opened.read(axis), *sums[axis if axis in dims else SAMPLE]) for axis in axes])
+    label = f"mean of {measure_label(opened, name)}"
+    if others:
+        label += f"\nonly the most common regime, {cases} of {regimes.total()} cases: {regime}"
     _, factor = display_unit(opened, name)
     words = [_axis_words(opened, axis) for axis in axes]
-    return tornado_chart(words, *(factor * m for m in (*means.T, total[0] / total[1])), x_label=label, ax=ax)
+    middle = np.sum(sums[dims[0]][0]) / cases
+    return tornado_chart(words, *(factor * m for m in (*means.T, middle)), x_label=label, ax=ax)
 
 
-def _fifths(store: Store, axis: str) -> tuple[float, float]:
-    """Return the quantiles 0.2 and 0.8 of the values of an axis."""
-    values = store.read(axis, slice(0, 1 << 20))
-    return float(np.nanquantile(values, 0.2)), float(np.nanquantile(values, 0.8))
+def _means_of_fifths(values: np.ndarray, sums: np.ndarray, cases: np.ndarray) -> tuple[float, float]:
+    """Return two means of a measure: over the fifth of the cases with the lowest `values` (n,) of a parameter, and over the
+    fifth with the highest. `sums` (n,) of the measure and numbers of `cases` (n,) belong to the values.
+
+    >>> _means_of_fifths(np.array([1.0, 2.0, 3.0]), np.array([4.0, 8.0, 15.0]), np.array([1, 1, 3]))
+    (4.0, 5.0)
+    """
+    means: list[float] = []
+    for along in (values, -values):
+        inside = along <= np.nanquantile(along, 0.2, weights=cases, method="inverted_cdf")
+        means.append(float(np.sum(sums[inside]) / np.sum(cases[inside])))
+    return means[0], means[1]
 
 
 def _thinned(store: Store, axis: str) -> tuple[np.ndarray, int]:

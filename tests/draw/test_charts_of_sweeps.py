@@ -124,11 +124,20 @@ def test_intervals_of_many_shares_are_bands():
 
 
 def test_a_distribution_adds_up_to_all_cases():
-    counts, share = distribution_chart(np.array([0.0, 1.0, 3.0]), np.array([1.0, 3.0]), x_label="force, N").axes
+    counts, share = distribution_chart(np.array([0.0, 1.0, 3.0]), {"": np.array([1.0, 3.0])}, x_label="force, N").axes
     assert [(bar.get_x(), bar.get_width(), bar.get_height()) for bar in counts.patches] == [(0.0, 1.0, 1.0), (1.0, 2.0, 3.0)]
+    assert counts.get_legend() is None
     assert share.lines[0].get_xydata().tolist() == [[0.0, 0.0], [1.0, 25.0], [3.0, 100.0]]
-    none = distribution_chart(np.array([0.0, 1.0]), np.zeros(1), x_label="force, N").axes[1]
+    none = distribution_chart(np.array([0.0, 1.0]), {"": np.zeros(1)}, x_label="force, N").axes[1]
     assert none.lines[0].get_ydata().tolist() == [0.0, 0.0]
+
+
+def test_a_distribution_stacks_its_regimes():
+    counts = {"jammed": np.array([1.0, 3.0]), "unsettled": np.array([2.0, 2.0])}
+    axis, share = distribution_chart(np.array([0.0, 1.0, 3.0]), counts, x_label="force, N").axes
+    assert [(bar.get_y(), bar.get_height()) for bar in axis.patches] == [(0.0, 1.0), (0.0, 3.0), (1.0, 2.0), (3.0, 2.0)]
+    assert [text.get_text() for text in axis.get_legend().get_texts()] == ["jammed: 4 cases", "unsettled: 4 cases"]
+    assert axis.patches[2].get_hatch() and share.lines[0].get_ydata().tolist() == [0.0, 37.5, 100.0]
 
 
 def test_the_largest_difference_of_a_tornado_is_at_the_top():

@@ -97,9 +97,27 @@ def test_shares_are_counted_over_the_cases(grid):
     np.testing.assert_array_equal(lines["not jammed"], 100.0 * (expected == 0.0))
     np.testing.assert_array_equal(lines["jammed, mode 2"], 100.0 * (expected == 2.0))
     assert axis.get_ylabel() == "share of the cases, %" and not axis.containers  # no confidence interval without samples
-    counted = ", ".join(f"{n} {name}" for name, n in label_counts(Store(Path(grid.store))))
-    for figure in (plot_distribution(grid.store, "weighted"), plot_tornado(grid.store, "weighted")):
-        assert figure.axes[0].get_xlabel().endswith(f"weighted, N\nall cases: {counted}")
+
+
+def test_a_distribution_separates_the_regimes(grid):
+    axis = plot_distribution(grid.store, "weighted").axes[0]
+    names = [text.get_text() for text in axis.get_legend().get_texts()]
+    assert sorted(names) == sorted(f"{name}: {n} cases" for name, n in label_counts(Store(Path(grid.store))))
+    values, modes = grid.data["weighted"].values, grid.data["mode"].values
+    for k, bars in enumerate(axis.containers):
+        assert [bar.get_height() for bar in bars] == np.histogram(
+            values[modes == k], np.linspace(values.min(), values.max(), 61)
+        )[0].tolist()
+
+
+def test_a_tornado_has_one_regime(grid):
+    axis = plot_tornado(grid.store, "weighted").axes[0]
+    assert axis.get_xlabel().endswith("only the most common regime, 30 of 66 cases: jammed, mode 1")
+    within, speed = grid.data["weighted"].sel({"drive.speed": slice(40.0, 79.0)}), [0.01 * 44.0, 0.01 * 76.0]
+    assert within.shape == (5, 6) and axis.lines[0].get_xdata()[0] == pytest.approx(within.values.mean())
+    bars = {round(bar.get_x() + bar.get_width(), 9) for bar in axis.patches if bar.get_y() < 0.0}
+    rest = within.values.mean() - 0.01 * 60.0
+    assert bars == {round(rest + each, 9) for each in speed}
 
 
 @pytest.mark.parametrize(("values", "scale"), [([0.1, 0.2, 2.5], "log"), ([1.0, 2.0, 3.0], "linear"), ([1.0, 9.0], "linear")])
