@@ -72,6 +72,7 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
     tall = _INCHES_PER_UNIT * (top - bottom) + 0.25 + 0.18 * len(title.splitlines())
     figure, (axis,) = panels(1, size=(wide, tall), ax=ax)
     set_drawing_limits(axis, limits)
+    axis.set_anchor("W")  # beside a drawing in the middle of a wider figure, the title would be cut off
     for part in parts:
         draw_part(axis, part)
     for text in texts:

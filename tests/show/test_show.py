@@ -46,6 +46,14 @@ def test_a_title_of_several_lines_has_its_space(monkeypatch):
     np.testing.assert_allclose(heights, heights[0], rtol=1e-6)
 
 
+def test_a_title_wider_than_the_drawing_is_not_cut_off(monkeypatch):
+    monkeypatch.setattr("jaxvib.show.sketch.caption", lambda scene: "3 balls, m = 1.33 kg each, R = 120 mm, drag 3.219 N s/m")
+    figure = jv.sketch(SCENE)
+    figure.canvas.draw()
+    title = figure.axes[0]._left_title.get_window_extent()
+    assert title.x0 >= 0.0 and title.x1 <= figure.bbox.x1
+
+
 def thinned(run, every):
     """The run as it had kept fewer states."""
     return eqx.tree_at(lambda r: r.trajectory, run, jax.tree.map(lambda x: x[::every], run.trajectory))
