@@ -13,6 +13,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit
 from jaxvib.equations.linear import linear_model, peak_force
+from jaxvib.equations.state import State
 from jaxvib.equations.torque_balance import mass_owners, resultant_of
 from jaxvib.machine.drives.drive import Motor
 from jaxvib.machine.effects.base import has_term
@@ -20,10 +21,11 @@ from jaxvib.machine.effects.terms import ContactFriction, RotorImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.motion.analysis.measure import AbstractMeasured, duration_text, only_exciter_value
+from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory, duration_text, only_exciter_value
 from jaxvib.motion.analysis.points import absent_vibration, measures_text, require_vibration
+from jaxvib.motion.analysis.regime import regime
 from jaxvib.motion.analysis.stays import Stay, find_stays
-from jaxvib.motion.analysis.unsettled import coasting_text
+from jaxvib.motion.analysis.unsettled import balanced_text, coasting_text
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.readable import Readable
@@ -194,7 +196,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         moves = bool(np.all(np.isfinite(self.amplitude)))
         measured = measures_text(self.scene, self.no_vibration, self.vibration, measures) if moves else []
         named, first = status_name(self.status), []
-        end, state = self.message, "settled" if bool(self.settled) else f"not settled: {self._unsettled_text()}"
+        end, state = self.message, "settled" if bool(self.settled) else self._unsettled_text()
         if named in ("would_separate", "unstable"):
             first, end = [f"not settled: {self.message}"], EnvelopeStatus[EnvelopeStatus.done]
             state = f"periodic only {'while the loads are at one angle' if named == 'would_separate' else 'until disturbed'}"
@@ -213,9 +215,15 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         )
 
     def _unsettled_text(self) -> str:
-        if not np.all(np.isfinite(np.asarray(self.window.load_speed))):
-            return "run longer"
-        return coasting_text(self.scene, np.asarray(self.window.time), np.asarray(self.window.load_speed)) or "run longer"
+        """Return the state of a motion that is not settled."""
+        time, speeds = np.asarray(self.window.time), np.asarray(self.window.load_speed)
+        if not np.all(np.isfinite(speeds)):
+            return "not settled: run longer"
+        if self.scene.is_plain:
+            motion = _motion_of(self.window)
+            if balanced := balanced_text(regime(self.scene, motion), motion):
+                return balanced
+        return f"not settled: {coasting_text(self.scene, time, speeds) or 'run longer'}"
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
@@ -225,6 +233,27 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         """
         self.require_single()
         return plot_histories(self, unit=unit, ax=ax)
+
+
+def _motion_of(window: Envelopes) -> Trajectory:
+    """Return the motion of a scene with one exciter that has the averaged values, with all angles from the start of the window.
+
+    The angle of the rotor has an unknown constant. It has no effect on the regime, because the averaged equations do not apply
+    to rotors that have loads and an imbalance.
+    """
+
+    def angle(rate: Array) -> Array:
+        return jnp.concatenate([jnp.zeros(1), jnp.cumsum((rate[1:] + rate[:-1]) / 2.0 * jnp.diff(window.time))])
+
+    mean, rotors = angle(window.omega), window.rotor_speeds
+    turn = jnp.exp(1j * mean)[:, None]
+    state = State(
+        displacement=(window.displacement * turn).real,
+        velocity=(window.velocity * turn).real,
+        angle=(mean[:, None] + window.phase,),
+        rate=(window.load_speed,),
+    )
+    return Trajectory(window.time, state, window.foundation_force, tuple(map(angle, rotors)), rotors)
 
 
 def _torque_of(exciter: Exciter, time: Array, speed: Array, load_speed: Array) -> Array:

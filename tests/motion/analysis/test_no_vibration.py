@@ -1,6 +1,7 @@
 """Ends of runs that have no vibration at the speed of the exciters."""
 
 import json
+import re
 
 import jax
 import numpy as np
@@ -108,6 +109,20 @@ def test_a_balanced_motion_that_decays_needs_no_longer_run():
     assert f"balanced within {left} of the loads' unbalance; the remaining vibration decays (drift" in first
     assert np.max(unbalance) < 1e-3
     assert "run longer" in jv.simulate(scene, 2.0, estimate=False).summary()
+
+
+def test_an_averaged_balanced_motion_needs_no_longer_run():
+    """The averaged run states the motion that the full equations have, and a jam has another text."""
+    scene = jv.scene_from_toml(TEMPLATES["one_mass"])
+    run = jv.envelope(scene, 30.0)
+    first, loads = run.summary().splitlines()[0], np.exp(1j * np.asarray(run.window.phase))
+    share = np.max(np.abs(np.mean(loads, axis=1)))
+    assert not run.settled and "not settled" not in first and share < 1e-3
+    left = re.search(r"balanced within (\S+) % of the loads' unbalance; the remaining vibration decays \(drift", first)
+    assert float(left.group(1)) <= 100.0 * share
+    assert "not settled: run longer (drift" in jv.envelope(scene, 2.0).summary()
+    jammed = jv.Scene(scene.machine, jv.balls(count=1, mass=0.8, radius=0.12, drag=0.5), scene.drive)
+    assert "not settled: run longer (drift" in jv.envelope(jammed, 8.0).summary()
 
 
 def test_a_rotor_that_slows_down_has_no_measures():
