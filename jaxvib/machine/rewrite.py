@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import tomllib
 from collections.abc import Sequence
+from typing import NamedTuple
 
-from jaxvib.machine.files import in_one_line, scene_from_toml, scene_to_toml
+from jaxvib.machine.files import Tables, in_one_line, scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.units.reading import SEVERAL
 
-_TABLE = re.compile(r"\s*\[(\[?)([\w.]+)\]")
-_ENTRY = re.compile(r"(\s*(\w+)\s*=\s*)((?:[^\"'#]|\"[^\"]*\"|'[^']*')*?)(\s*)(#\s*(.*))?")
+_BLANK = re.compile(r"(?:\s|#[^\n]*)*")
+_NAME = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+_KEY = re.compile(rf"{_NAME}(?:[ \t]*\.[ \t]*{_NAME})*")
+_HEADER = re.compile(rf"\[(\[?)[ \t]*({_KEY.pattern})[ \t]*\]+")
+_STRING = r"""\"{3}(?:[^\\]|\\.)*?\"{3,5}|'{3}.*?'{3,5}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'"""
+_SCALAR = re.compile(rf"{_STRING}|[^,\]}}#\n]*[^,\]}}#\s]", re.DOTALL)
+_STRING_OR_COMMENT = re.compile(rf"{_STRING}|#[^\n]*", re.DOTALL)
 _NUMBER_AND_UNIT = re.compile(rf"\s*((?:{SEVERAL})?)([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)")
 
 _RELATIVE = re.compile(r"%|\bloss\b")
@@ -29,12 +34,39 @@ _DIGITS = 8
 """Digits of changed numbers. Numbers with more digits are hard to read."""
 
 
+class _Value(NamedTuple):
+    """Value in a TOML text, from `start` to `end`, and the entries of a list or of an inline table by their paths in it."""
+
+    start: int
+    end: int
+    entries: tuple[tuple[_Path, _Value], ...] = ()
+
+
+class _Edit(NamedTuple):
+    """Replacement of the text from `start` to `end`, and the old value for the comment of the line, or ""."""
+
+    start: int
+    end: int
+    written: str
+    former: str
+
+
+class _Values(NamedTuple):
+    """A value as TOML reads it in the file, its old and its new value in SI, and the value `kept` that its text has beside the
+    new values."""
+
+    read: object
+    old: object
+    kept: object
+    new: object
+
+
 def rewrite_scene(text: str, scene: Scene) -> str:
     """Return the text of a scene file with the numbers of another scene of the same kind.
 
     Comments, order and units stay. A changed number has at most 8 digits, and a comment with its old value. A number that
-    differs from its default and is not in the text is added in a new line. If the text cannot be changed in this way, for
-    example because the scene has other effects, the result is `scene_to_toml(scene)`.
+    differs from its default and is not in the text is added. If the text cannot be changed in this way, for example because
+    the scene has other effects, the result is `scene_to_toml(scene)`.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
@@ -42,58 +74,141 @@ def rewrite_scene(text: str, scene: Scene) -> str:
     >>> print(rewrite_scene(TEMPLATES["one_mass"], scene).splitlines()[5])
     stiffness = "44 N/mm"  # was "50 N/mm"; of the support
     """
-    read, new = tomllib.loads(text), tomllib.loads(scene_to_toml(scene))
+    new = tomllib.loads(scene_to_toml(scene))
     try:
         old = tomllib.loads(scene_to_toml(scene_from_toml(text)))
     except ValueError:  # the text refers to a file of torques, whose folder is not known here
         return scene_to_toml(scene)
+    kept = old
+    for _ in range(2):  # the second time also values that follow from changed ones, such as a damping from its ratio
+        result = _with_edits(text, _edits(text, old, kept, new))
+        try:
+            kept = tomllib.loads(scene_to_toml(scene_from_toml(result)))
+        except ValueError:  # the changed text is not a scene file
+            break
+        if _is_close(kept, new):
+            return result
+    return scene_to_toml(scene)
+
+
+def _with_edits(text: str, edits: Sequence[_Edit]) -> str:
+    """Return the text with edits, and the old values in comments at the ends of their lines, before the comments there."""
+    comments = {found.end(): found.start() for found in _STRING_OR_COMMENT.finditer(text) if found[0].startswith("#")}
+    formers: dict[int, list[str]] = {}
+    for edit in edits:
+        if edit.former:
+            formers.setdefault(_line_end(text, edit.end), []).append(edit.former)
+    replaced = [(edit.start, edit.end, edit.written) for edit in edits]
+    for end, former in formers.items():
+        start = comments.get(end, end)
+        comment = text[start:end].lstrip("# \t")
+        replaced.append((len(text[:start].rstrip()), end, f"  # was {', '.join(former)}{comment and '; '}{comment}"))
+    for start, end, written in sorted(replaced, reverse=True):
+        text = text[:start] + written + text[end:]
+    return text
+
+
+def _line_end(text: str, at: int) -> int:
+    end = text.find("\n", at)
+    return len(text) if end < 0 else end
+
+
+def _edits(text: str, old: Tables, kept: Tables, new: Tables) -> list[_Edit]:
+    """Return the edits that make the values of a TOML text new, see `_Values`."""
+    read = tomllib.loads(text)
+    every = (read, *(_in_form_of(read, tables) for tables in (old, kept, new)))
     section: _Path = ()
     counts: dict[_Path, int] = {}
-    lines = []
-    for line in _whole_entries(text):
-        table, entry = _TABLE.match(line), _ENTRY.fullmatch(" ".join(line.split("\n")))
-        section = _section_of(table[2].split("."), bool(table[1]), counts) if table else section
-        if entry:
-            path = (*section, entry[2])
-            present, former, value = (_value_at(tables, path) for tables in (read, old, new))
-            is_other = path[0] == "machine" and not _is_close(old["machine"], new["machine"])
-            line = _rewritten_line(line, entry, present, former, value, is_other)
-        lines.append(line)
-        if table:
-            lines += _added_lines(*(_value_at(tables, section) for tables in (read, old, new)))
-    result = "\n".join(lines) + "\n"
-    try:
-        is_same = _is_close(tomllib.loads(scene_to_toml(scene_from_toml(result))), new)
-    except ValueError:  # the changed text is not a scene file
-        is_same = False
-    return result if is_same else scene_to_toml(scene)
+    edits = []
+    at = _skip_blank(text, 0)
+    while at < len(text):
+        header = _HEADER.match(text, at)
+        if header:
+            section = _section_of(_names(header[2]), bool(header[1]), counts)
+            at, end = header.end(), _line_end(text, header.end())
+            added = _added(_Values(*(_value_at(tables, section) for tables in every)))
+            edits.append(_Edit(end, end, "".join(f"\n{name} = {number}  # was {former}" for name, number, former in added), ""))
+        else:
+            names, value = _entry(text, at)
+            path, at = (*section, *names), value.end
+            values = _Values(*(_value_at(tables, path) for tables in every))
+            edits += _changes(text, value, str(names[-1]), values)
+        at = _skip_blank(text, at)
+    return edits
 
 
-def _added_lines(read: object, old: object, new: object) -> list[str]:
-    """Return lines for the numbers of a table that differ from their defaults and are not in the file."""
+def _in_form_of(read: Tables, tables: Tables) -> Tables:
+    """Return the tables of `scene_to_toml` with an exciter in `exciters` if it is there in the file."""
+    if "exciters" not in read or "exciters" in tables:
+        return tables
+    exciter = {name: tables[name] for name in ("loads", "drive")}
+    effects = read["exciters"][0].get("effects", {})
+    own = {name: each for name, each in tables["effects"].items() if name in effects}
+    others = {name: each for name, each in tables["effects"].items() if name not in effects}
+    return {"machine": tables["machine"], "exciters": [{**exciter, "effects": own}], "effects": others}
+
+
+def _skip_blank(text: str, at: int) -> int:
+    """Return the position of the next character that is neither blank nor in a comment."""
+    found = _BLANK.match(text, at)
+    return found.end() if found else at
+
+
+def _names(key: str) -> _Path:
+    """Return the names in a key.
+
+    >>> _names('exciters . "drive"')
+    ('exciters', 'drive')
+    """
+    names: list[str] = []
+    table: object = tomllib.loads(f"{key} = 0")
+    while isinstance(table, dict):
+        ((name, table),) = table.items()
+        names.append(name)
+    return tuple(names)
+
+
+def _entry(text: str, at: int) -> tuple[_Path, _Value]:
+    """Return the names and the value of the entry `key = value` at a position of a valid TOML text."""
+    key = _KEY.match(text, at)
+    assert key is not None
+    return _names(key[0]), _value(text, _skip_blank(text, text.index("=", key.end()) + 1))
+
+
+def _value(text: str, start: int) -> _Value:
+    """Return the value at a position of a valid TOML text."""
+    if text[start] not in "[{":
+        scalar = _SCALAR.match(text, start)
+        assert scalar is not None
+        return _Value(start, scalar.end())
+    entries: list[tuple[_Path, _Value]] = []
+    at = _skip_blank(text, start + 1)
+    while text[at] not in "]}":
+        path, value = ((len(entries),), _value(text, at)) if text[start] == "[" else _entry(text, at)
+        entries.append((path, value))
+        at = _skip_blank(text, value.end)
+        at = _skip_blank(text, at + 1) if text[at] == "," else at
+    return _Value(start, at + 1, tuple(entries))
+
+
+def _added(values: _Values) -> list[tuple[str, str, str]]:
+    """Return the names, the new and the former values of the numbers of a table that differ from their defaults and are not in
+    the file."""
+    read, old, _, new = values
     if not (isinstance(read, dict) and isinstance(old, dict) and isinstance(new, dict)):
         return []
     return [
-        f"{name} = {_with_unit(None, old[name], value)}  # was {_with_unit(None, None, old[name])}, the default"
+        (name, _with_unit(None, old[name], value), f"{_with_unit(None, None, old[name])}, the default")
         for name, value in new.items()
         if name in old and name not in read and isinstance(value, (float, list)) and not _is_close(old[name], value)
     ]
 
 
-def _whole_entries(text: str) -> list[str]:
-    """Return the lines of a text; the lines of a list are one entry."""
-    entries: list[str] = []
-    for line in text.splitlines():
-        is_open = bool(entries) and re.search(r"=\s*\[", entries[-1]) and entries[-1].count("[") > entries[-1].count("]")
-        entries[-1:] = [f"{entries[-1]}\n{line}"] if is_open else [*entries[-1:], line]
-    return entries
-
-
-def _section_of(names: Sequence[str], is_array: bool, counts: dict[_Path, int]) -> _Path:
+def _section_of(names: _Path, is_array: bool, counts: dict[_Path, int]) -> _Path:
     """Return the path of the table in a header; `counts` of the arrays of tables are updated.
 
     >>> counts = {}
-    >>> [_section_of(["a"], True, counts), _section_of(["a"], True, counts), _section_of(["a", "b"], False, counts)]
+    >>> [_section_of(("a",), True, counts), _section_of(("a",), True, counts), _section_of(("a", "b"), False, counts)]
     [('a', 0), ('a', 1), ('a', 1, 'b')]
     """
     path: _Path = ()
@@ -114,18 +229,30 @@ def _value_at(tables: object, path: _Path) -> object:
     return tables
 
 
-def _rewritten_line(line: str, entry: re.Match[str], read: object, old: object, new: object, is_other_machine: bool) -> str:
-    """Return a line with the value `new`, SI, in place of its value `read`, which is `old` in SI. If the machine has changed, a
-    damping ratio becomes a number: the damping is still the same, but the ratio is not."""
-    if old is None or new is None or (_is_close(old, new) and not (is_other_machine and _RELATIVE.search(entry[3]))):
-        return line
-    comment = f"; {entry[6]}" if entry[6] else ""
-    written = _with_unit(read, old, new)
-    former = in_one_line(entry[3])
-    if isinstance(read, dict) and isinstance(new, dict):  # only the numbers that differ
-        now = tomllib.loads(f"x = {written}")["x"]
-        former = ", ".join(f"{name} = {json.dumps(value)}" for name, value in read.items() if value != now[name])
-    return f"{entry[1]}{written}  # was {former}{comment}"
+def _changes(text: str, value: _Value, label: str, values: _Values) -> list[_Edit]:
+    """Return the edits that make a value of a file new. `label`: its path from the name of its entry on, for the comment."""
+    read, old, kept, new = values
+    was = in_one_line(text[value.start : value.end])
+    if old is None or new is None or (_is_close(old, new) and _is_close(kept, new)):
+        return []
+    below = label if "[" in label else label.partition(".")[2]
+    former = f"{below} = {was}" if below else was
+    is_table = isinstance(read, dict) and isinstance(new, dict)
+    if not is_table and not (isinstance(read, list) and isinstance(new, list) and len(read) == len(new)):
+        return [_Edit(value.start, value.end, _with_unit(read, old, new), former)]
+    is_plain = not is_table and "{" not in was  # a list of numbers
+    edits: list[_Edit] = []
+    for path, each in value.entries:
+        inner = label if is_plain else f"{label}.{'.'.join(map(str, path))}" if is_table else f"{label}[{path[0]}]"
+        edits += _changes(text, each, inner, _Values(*(_value_at(one, path) for one in values)))
+    if is_plain and edits and "\n" not in text[value.start : value.end]:
+        return [edits[0]._replace(former=former), *(edit._replace(former="") for edit in edits[1:])]
+    end = value.entries[-1][1].end if value.entries else value.start + 1
+    for name, written, default in _added(values):
+        edits.append(
+            _Edit(end, end, f"{', ' if value.entries else ''}{name} = {written}", f"{below}{below and '.'}{name} = {default}")
+        )
+    return edits
 
 
 def _with_unit(read: object, old: object, new: object) -> str:
@@ -134,10 +261,8 @@ def _with_unit(read: object, old: object, new: object) -> str:
         size = len(new)
         reads, olds = (each if isinstance(each, list) and len(each) == size else [each] * size for each in (read, old))
         return f"[{', '.join(map(_with_unit, reads, olds, new))}]"
-    if isinstance(new, dict) and isinstance(read, dict):
-        olds = old if isinstance(old, dict) else {}
-        each = [f"{name} = {_with_unit(value, olds.get(name), new.get(name))}" for name, value in read.items()]
-        return f"{{ {', '.join(each)} }}"
+    if isinstance(new, dict):  # an effect that the file switches on by `true`
+        return f"{{ {', '.join(f'{name} = {written}' for name, written, _ in _added(_Values({}, old, old, new)))} }}"
     written = _NUMBER_AND_UNIT.fullmatch(read) if isinstance(read, str) else None
     if isinstance(new, str):
         return f'"{new}"'
