@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import click
@@ -143,6 +144,44 @@ def measures_of(scene: jv.Scene, motion: jv.Jam | jv.PhaseJam | jv.Orbit | jv.Vi
             meta[_NOTED_KEY] = True
             note(f"note: {each}")
     return measures
+
+
+_MAX_DRAG_SPEED_DIFFERENCE = 0.05
+"""Relative difference between the load speed of a jam and that of the drag in the file, up to which there is no note."""
+
+
+def note_loads(scene: jv.Scene, stable: Sequence[float], path: Path | None, *, averaged: bool = True) -> None:
+    """Print notes about the weight of the loads, and about their drag in the scene file.
+
+    **Arguments**: `stable`: load speeds of stable jams, rad/s; `path` of the scene file; `averaged`: True for jams of light
+    loads, which omit the change of the speed by the weight within a turn.
+    """
+    from jaxvib.machine.files import read_toml  # slow imports, which --help does not need
+    from jaxvib.machine.validation import load_weight_notes
+
+    drag_notes = [] if path is None else drag_speed_notes(read_toml(path), stable)
+    for each in (*load_weight_notes(scene, min(stable, default=None) if averaged else None), *drag_notes):
+        note(f"note: {each}")
+
+
+def drag_speed_notes(tables: Mapping[str, Any], stable: Sequence[float]) -> list[str]:
+    """Return a note for each drag that the tables of a scene file compute for a load speed at which no jam is; `stable`: as
+    above."""
+    from jaxvib.display import speed_text  # slow imports, which --help does not need
+    from jaxvib.units import number
+
+    notes, owners = [], {"": tables} | {f"exciters[{k}].": table for k, table in enumerate(tables.get("exciters", []))}
+    for prefix, owner in owners.items() if stable else ():
+        loads = owner.get("loads", {})
+        drag = loads.get("drag") if isinstance(loads, Mapping) else None
+        if not isinstance(drag, Mapping) or "load_speed" not in drag:
+            continue
+        given = float(number(drag["load_speed"], "rad/s", "load_speed"))
+        nearest = min(stable, key=lambda speed: abs(speed - given))
+        if abs(nearest - given) > _MAX_DRAG_SPEED_DIFFERENCE * nearest:
+            is_at = f"{prefix}loads.drag is for {speed_text(given)}, and the nearest stable jam is at {speed_text(nearest)}"
+            notes.append(f"{is_at}: repeat with load_speed = '{speed_text(nearest)}' until both agree")
+    return notes
 
 
 def deck_of_options() -> dict[str, Any]:

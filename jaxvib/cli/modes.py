@@ -22,15 +22,12 @@ from jaxvib.cli.app import (
     table,
     tolerance_table,
 )
-from jaxvib.cli.document import force_lines, indented, measures_of
-from jaxvib.cli.output import csv_options, fields_of, note
+from jaxvib.cli.document import force_lines, indented, measures_of, note_loads
+from jaxvib.cli.output import csv_options, fields_of
 from jaxvib.errors import InputError
 
 _MAX_FOLD_SPEEDS = 10.0
 """Largest rotor speed of a fold in the table, relative to the rotor speed of the scene."""
-
-_MAX_DRAG_SPEED_DIFFERENCE = 0.05
-"""Relative difference between the load speed of a jam and that of the drag in the file, up to which there is no note."""
 
 
 @command("modes")
@@ -87,7 +84,6 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
 
     from jaxvib.machine.effects.base import has_term
     from jaxvib.machine.effects.terms import ContactFriction
-    from jaxvib.machine.files import read_toml
     from jaxvib.steady.jams.jam import STABILITY_CRITERION, STABILITY_OF_FREE_LOADS, growth_of_modes
 
     modes_found = jax.device_get(jv.jam_modes(scene))  # NumPy arrays, because indexing JAX arrays would compile programs
@@ -101,7 +97,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
     folds = [k for k, exists in enumerate(np.asarray(modes_found.folds.exists)) if exists]
     has_friction = has_term(scene.all_effects, ContactFriction)
     limits = None if has_friction else jax.device_get(jv.drag_limits(scene))
-    _note_loads(scene, [float(jam.omega) for jam in remaining], {} if output.scene is None else read_toml(output.scene))
+    note_loads(scene, [float(jam.omega) for jam in remaining], output.scene)
     ranges = ranges_within(scene, [int(jam.mode) for jam in remaining], tolerances)
     balanced = _is_balance_stable(scene)
     document = {
@@ -144,32 +140,6 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
 def _condition(growth: float) -> str:
     """Return the condition under which a jam that is stable by slope is stable, from the growth of free loads, 1/s."""
     return " (if its loads stay together)" if math.isnan(growth) else ""
-
-
-def _note_loads(scene: jv.Scene, stable: list[float], tables: Mapping[str, Any]) -> None:
-    """Print notes about the weight of the loads, which light-load jams omit, and about their drag in the `tables` of the file;
-    `stable`: load speeds of stable jams, rad/s."""
-    from jaxvib.machine.validation import load_weight_notes  # slow import, which --help does not need
-
-    for each in (*load_weight_notes(scene, min(stable, default=None)), *_drag_speed_notes(tables, stable)):
-        note(f"note: {each}")
-
-
-def _drag_speed_notes(tables: Mapping[str, Any], stable: list[float]) -> list[str]:
-    """Return a note if the tables of a scene file compute the drag for a load speed at which no jam is; `stable`: as above."""
-    from jaxvib.display import speed_text  # slow imports, which --help does not need
-    from jaxvib.units import number
-
-    loads = tables.get("loads", {})
-    drag = loads.get("drag") if isinstance(loads, Mapping) else None
-    if not stable or not isinstance(drag, Mapping) or "load_speed" not in drag:
-        return []
-    given = float(number(drag["load_speed"], "rad/s", "load_speed"))
-    nearest = min(stable, key=lambda speed: abs(speed - given))
-    if abs(nearest - given) <= _MAX_DRAG_SPEED_DIFFERENCE * nearest:
-        return []
-    is_at = f"loads.drag is for {speed_text(given)}, and the nearest stable jam is at {speed_text(nearest)}"
-    return [f"{is_at}: repeat with load_speed = '{speed_text(nearest)}' until both agree"]
 
 
 def _fold_lines(rotor_speed: float, folds: Any, existing: list[int]) -> list[str]:
@@ -276,7 +246,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     output.figure("phases.png", lambda: result.plot())
     jams = [result.select(k) for k in range(result.omega.shape[0])]
     measures = [measures_of(scene, jam) if jam.stable else None for jam in jams]
-    _note_loads(scene, [float(jam.omega) for jam in jams if jam.stable], {})
+    note_loads(scene, [float(jam.omega) for jam in jams if jam.stable], output.scene)
     balanced = _is_balance_stable(scene)
     document = {
         "rotor_speed": scene.drive.speed,
@@ -372,6 +342,7 @@ def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None
     jams = {k: jv.jam_orbit(scene, mode=k, throw=False) for k in numbers}
     existing = {k: jam for k, jam in jams.items() if math.isfinite(jam.rotor_speed)}
     measures = {k: measures_of(scene, jam) for k, jam in existing.items() if jam.stable}
+    note_loads(scene, [float(existing[k].omega) for k in measures], output.scene, averaged=False)
     balanced = _is_balance_stable(scene)
     diagram = jv.branches(scene, exact=True)
     output.figure("branches.png", lambda: diagram.plot())

@@ -72,8 +72,15 @@ def fields_of(result: object, *names: str) -> dict[str, object]:
     return {name: getattr(result, name) for name in names}
 
 
+_NOTES = "jaxvib.notes"
+"""Key of the printed notes in the context of click."""
+
+
 def note(text: str) -> None:
-    """Print a text on stderr; on a terminal in lines that fit, in place of the line of the elapsed time."""
+    """Print a text on stderr, on a terminal in lines that fit, in place of the line of the elapsed time; reports contain it."""
+    context = click.get_current_context(silent=True)
+    if context is not None:
+        context.meta.setdefault(_NOTES, []).append(text.removeprefix("note: "))
     click.echo(f"\r\x1b[K{_wrapped(text)}" if sys.stderr.isatty() else text, err=True)
 
 
@@ -298,6 +305,7 @@ class Output:
             scene=scene,
             sketch=None if scene is None or draw_sketch is None else draw_sketch(scene),
             figures=self.figures,
+            notes=click.get_current_context().meta.get(_NOTES, ()),
         )
         write_file(path, page.html())
         self.files.append(str(path))

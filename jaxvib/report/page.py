@@ -34,7 +34,7 @@ class Report:
 
     **Arguments**: `title`; `document`: the result as plain values; `units` of its numbers, by name; `command`: the command line
     that computed the result; `text`: the result as printed on the terminal; `scene` of the result, and a `sketch` of the scene;
-    `figures`: pairs of a name and a figure; `author`.
+    `figures`: pairs of a name and a figure; `author`; `notes`: sentences about input and results that are probably wrong.
     """
 
     title: str
@@ -46,6 +46,7 @@ class Report:
     figures: Sequence[tuple[str, Figure]] = ()
     sketch: Figure | None = None
     author: str = ""
+    notes: Sequence[str] = ()
 
     def html(self) -> str:
         """Return the page as HTML with embedded style and figures. The page loads nothing from a network; all text is
@@ -59,6 +60,7 @@ class Report:
         document, units = in_display_units(self.document, self.units, coordinate_units)
         tables = result_tables(document, units, has_text=bool(self.text))
         numbers = [_section("Accuracy", accuracy_table(document, units)), _section("Numbers", tables)]
+        parts.append(_section("Notes", "".join(f"<p>{escaped(each)}</p>" for each in self.notes)))
         if self.text:
             parts.append(_section("Results", f"<pre>{escaped(self.text)}</pre>"))
         parts.append(_section("Figures", "".join(_figure(name, figure) for name, figure in self.figures)))

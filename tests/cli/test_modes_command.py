@@ -1,6 +1,8 @@
 """The command `modes`."""
 
+import html
 import json
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,7 +10,8 @@ import numpy as np
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.cli.modes import _drag_lines, _drag_speed_notes, _fold_lines, _imbalance_lines
+from jaxvib.cli.document import drag_speed_notes
+from jaxvib.cli.modes import _drag_lines, _fold_lines, _imbalance_lines
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.steady.jams.phase_search import PhaseJams
 
@@ -72,12 +75,55 @@ def test_folds_far_above_the_rotor_speed_are_only_counted():
 
 def test_a_drag_for_another_load_speed_has_a_note():
     tables = {"loads": {"drag": {"cause": "bearing", "load_speed": "600 rpm"}}}
-    (note,) = _drag_speed_notes(tables, [10.0, 30.0])
+    (note,) = drag_speed_notes(tables, [10.0, 30.0])
     assert note.startswith(
         "loads.drag is for 600 rpm, and the nearest stable jam is at 286.48 rpm: repeat with load_speed = '286"
     )
-    assert _drag_speed_notes(tables, [62.0, 30.0]) == _drag_speed_notes(tables, []) == []
-    assert _drag_speed_notes({"loads": {"drag": 1.0}}, [30.0]) == []
+    assert drag_speed_notes(tables, [62.0, 30.0]) == drag_speed_notes(tables, []) == []
+    assert drag_speed_notes({"loads": {"drag": 1.0}}, [30.0]) == []
+    (of_exciter,) = drag_speed_notes({"exciters": [{"unbalance": 0.1}, tables]}, [10.0, 30.0])
+    assert of_exciter == f"exciters[1].{note}"
+
+
+WEAK_DRAG = """
+machine = { kind = "one_mass", mass = 300.0, stiffness = 6e4, damping = 600.0 }
+effects = { gravity = true }
+
+[[exciters]]
+drive = { kind = "constant_speed", speed = "1400 rpm" }
+[exciters.loads]
+kind = "pendulum"
+count = 3
+mass = 1.2
+radius = 0.06
+drag = { cause = "bearing", load_speed = "600 rpm", rotor_speed = "1400 rpm", mass = 1.2, friction = 0.005, diameter = "20 mm" }
+"""
+
+
+def test_notes_on_loads_are_in_reports(typed, tmp_path):
+    (tmp_path / "weak.toml").write_text(WEAK_DRAG)
+    code, _, err = typed("modes", "weak.toml", "--report", "r.html")
+    report, notes = html.unescape((tmp_path / "r.html").read_text()), err.splitlines()
+    assert code == 0 and len(notes) == 3 and notes[0].startswith("note: loads at rest swing and do not turn over:")
+    assert "which averaging omits" in notes[1] and "exciters[0].loads.drag is for 600 rpm" in notes[2]
+    assert all(report.count(each.removeprefix("note: ")) == 1 for each in notes)
+
+
+def test_exact_jams_have_notes_on_loads_but_not_on_averaging(typed, tmp_path, monkeypatch):
+    """The computation ends after the notes."""
+    (tmp_path / "weak.toml").write_text(WEAK_DRAG)
+    monkeypatch.setattr("jaxvib.steady.orbits.search.exact_mode_speeds", lambda *_: {})
+    monkeypatch.setattr("jaxvib.jam_orbit", lambda *_, **__: SimpleNamespace(rotor_speed=146.6, omega=13.45, stable=True))
+    monkeypatch.setattr("jaxvib.cli.modes.measures_of", lambda *_: None)
+
+    def end(scene):
+        raise jv.InputError("scene", "has notes")
+
+    monkeypatch.setattr("jaxvib.cli.modes._is_balance_stable", end)
+    code, _, err = typed("modes", "weak.toml", "--exact")
+    notes = err.splitlines()
+    assert code == 2 and len(notes) == 3 and notes[0].startswith("note: loads at rest swing and do not turn over:")
+    assert "exciters[0].loads.drag is for 600 rpm" in notes[1] and "has notes" in notes[2]
 
 
 def equal_points(table):
