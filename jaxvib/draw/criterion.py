@@ -103,12 +103,12 @@ def criterion_chart(
             linewidth=0,
         )
     for start, end in exact or []:
-        ax.axvspan(scale * start, scale * end, ymax=0.03, color="black", linewidth=0)
+        ax.axvspan(scale * start, scale * end, ymax=0.03, color="black", linewidth=0)  # below the text at 0.08
     legend: list[Patch | Line2D] = [Patch(color=_KINDS[1][1], alpha=0.5, label="balancing, by the criterion")]
     legend += [Patch(color="black", label="balancing, exactly")] if exact is not None else []
     if at is not None:
         legend.append(ax.axvline(scale * at, label="working speed", **WORKING))
     legend_above(ax, handles=legend)
-    for y, words in ((0.96, "f > 0: loads gather"), (0.05, "f < 0: loads balance the rotor")):
+    for y, words in ((0.96, "f > 0: loads gather"), (0.08, "f < 0: loads balance the rotor")):
         ax.text(0.99, y, words, transform=ax.transAxes, ha="right", va="center", fontsize="small", color="#555555")
     ax.set(xlim=(speed[0], speed[-1]), xlabel=f"rotor speed, {unit}", ylabel="criterion f, kg m²")

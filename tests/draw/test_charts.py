@@ -93,8 +93,10 @@ def test_the_smaller_of_two_bands_lies_in_front_of_the_larger():
     arrays = (time, motion, np.ones((time.size, 2)), 2.0 * np.ones((time.size, 1)), motion[:, :1])
     figure = time_histories(arrays, arrays, names=("y1", "y2"), directions=("up",))
     axis = figure.axes[0]
-    depths = {line.get_label(): line.get_zorder() for line in axis.lines}
-    assert depths["y1"] > depths["y2"] > axis.xaxis.get_zorder()  # of the grid
+    areas, lines = ([each.get_zorder() for each in kind] for kind in (axis.collections, axis.lines))
+    assert areas[0] > areas[1] > axis.xaxis.get_zorder()  # of the grid
+    assert [line.get_label() for line in axis.lines[::2]] == ["y1", "y2"]
+    assert max(areas) < min(lines[:2]) < min(lines[2:])  # dashes of y2 are visible on the solid line of y1
     assert axis.texts[0].get_text() == "the whole run"
     legends = [[text.get_text() for text in figure.axes[k].get_legend().get_texts()] for k in (0, 4)]
     assert legends == [["y1", "y2", "band: lowest to highest value"], ["up", "band: lowest to highest value"]]
@@ -184,6 +186,16 @@ def test_a_history_says_at_what_time_it_begins():
         arrays = (begin + time, motion, motion, motion, motion)
         figure = time_histories(arrays, arrays, names=("y1",), directions=("up",))
         assert figure.axes[0].texts[0].get_text() == words
+
+
+def test_exact_intervals_of_the_criterion_cover_no_text():
+    figure = Figure(figsize=(7.0, 3.0))
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    criterion_chart(axis, np.linspace(1.0, 3.0, 5), np.linspace(-2.0, 2.0, 5), [[2.0, None]], exact=[[1.5, 3.0]])
+    figure.canvas.draw()
+    (bar,) = (patch for patch in axis.patches if patch.get_facecolor()[:3] == (0.0, 0.0, 0.0))
+    assert all(not bar.get_window_extent().overlaps(text.get_window_extent()) for text in axis.texts)
 
 
 def test_the_scale_of_the_criterion_has_no_kink():

@@ -254,15 +254,19 @@ def _group_name(group: Sequence[int]) -> str:
 def _draw_band(
     axis: Axes, time: np.ndarray, values: np.ndarray, k: int, name: str | None, bins: int, depth: float | np.ndarray = 0.0
 ) -> None:
-    """Draw the signal number `k` as a band, or as a curve if it has fewer than 2 samples for each of `bins` intervals."""
+    """Draw the signal number `k` as a band, or as a curve if it has fewer than 2 samples for each of `bins` intervals.
+
+    Areas lie above each other in the order of `depth`, and lines above them in the order of the signals, because the solid line
+    of the first signal would hide the dashes of an equal one.
+    """
     middle, low, high = band(time, values, bins)
     if low is not high:
         low, high = -_smoothed_peaks(-low), _smoothed_peaks(high)
-    look = {**series_look(k), "lw": 1.1, "zorder": 2.0 + 0.01 * float(depth)}
+    look = {**series_look(k), "lw": 1.1, "zorder": 2.0 + 0.001 * k}
     axis.plot(middle, high, label=name, **look)
     if low is not high:
         axis.plot(middle, low, **look)
-        axis.fill_between(middle, low, high, color=look["color"], alpha=_BAND_ALPHA, lw=0.0, zorder=look["zorder"])
+        axis.fill_between(middle, low, high, color=look["color"], alpha=_BAND_ALPHA, lw=0.0, zorder=1.5 + 0.001 * float(depth))
 
 
 def _draw_legend(axis: Axes, least: int = 1, band: str = "band: lowest to highest value") -> None:
@@ -292,7 +296,7 @@ def _draw_rotor_speeds(axis: Axes, time: np.ndarray, speeds: np.ndarray, bins: i
     """
     rotors = speeds.shape[1]
     for k in range(rotors):
-        look = {"color": "black" if rotors == 1 else color_of(k), "ls": "--", "lw": 1.1}
+        look = {"color": "black" if rotors == 1 else color_of(k), "ls": "--", "lw": 1.1, "zorder": 2.5}
         sense = " (clockwise: negative)" if np.sum(speeds[:, k]) < 0.0 else ""
         middle, low, high = band(time, speeds[:, k], time.size if bins is None else bins)
         if low is not high:
