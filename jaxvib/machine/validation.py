@@ -20,7 +20,7 @@ from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drives.controlled import SwitchedOff
-from jaxvib.machine.drives.drive import Motor
+from jaxvib.machine.drives.drive import Drive, Motor
 from jaxvib.machine.effects.base import static_imbalances, total_gravity
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.loads import CircularLoads
@@ -142,6 +142,23 @@ _MIN_POWER = 0.05
 """Smallest usual rated power of a motor for each kg of the machine, W; usual values are about 1."""
 
 
+_SUPPLIES, _SUPPLY_TOLERANCE = (50.0, 60.0), 0.01
+"""Frequencies of electrical supplies, Hz, and the relative difference of a plain number that probably means one of them."""
+
+
+def _is_short(speed: float) -> bool:
+    """Return True for a speed, rad/s, of few digits. One that was given in rpm or Hz has many digits in rad/s."""
+    return math.isclose(speed, float(f"{speed:.{_DIGITS_OF_SPEEDS}g}"), rel_tol=1e-9)
+
+
+def _supply_frequency(drive: Drive) -> tuple[str, float]:
+    """Return the name and the value, rad/s, of the supply frequency of a drive or of the motor in it; 0 if it has none."""
+    name = "drive"
+    while (motor := getattr(drive, "motor", None)) is not None:
+        name, drive = f"{name}.motor", motor
+    return f"{name}.frequency", float(getattr(drive, "frequency", 0.0))
+
+
 def _largest_lever(machine: Machine) -> float:
     """Return the largest distance of a support from the centre of mass, m; 0 for a machine without positions of supports."""
     places = [np.linalg.norm(each.at) for each in getattr(machine, "supports", ())]
@@ -167,9 +184,11 @@ def implausible_numbers(scene: Scene) -> list[str]:
     for k, exciter in enumerate(scene.exciters):
         place, loads = scene.prefix_of(k), exciter.loads
         speed = float(exciter.drive.speed)
-        is_short = math.isclose(speed, float(f"{speed:.{_DIGITS_OF_SPEEDS}g}"), rel_tol=1e-9)
-        if speed > MAX_USUAL_SPEED and is_short:  # a speed that was given in rpm has many digits in rad/s
+        if speed > MAX_USUAL_SPEED and _is_short(speed):
             note(f"{place}drive.speed", speed_text(speed), "rad/s", f"{speed:g} rpm")
+        name, frequency = _supply_frequency(exciter.drive)
+        if _is_short(frequency) and any(math.isclose(frequency, hertz, rel_tol=_SUPPLY_TOLERANCE) for hertz in _SUPPLIES):
+            note(f"{place}{name}", f"{frequency / (2.0 * np.pi):.4g} Hz", "rad/s", f"{frequency:g} Hz")
         power = float(getattr(exciter.drive, "power", np.inf))
         if mass >= _MIN_MASS and power < _MIN_POWER * likely_mass:
             note(f"{place}drive.power", f"{power:g} W for a machine of {likely_mass:g} kg", "W", f"{power:g} kW")

@@ -238,6 +238,20 @@ def test_implausible_bodies_in_a_plane_are_noted():
     assert note == "machine.supports[0].angle is 15 rad; a plain number is in rad: did you mean '15 deg'?"
 
 
+@pytest.mark.parametrize(
+    ("frequency", "meant"), [(60, "60 Hz"), (50.2, "50.2 Hz"), ("50 Hz", ""), ("9.55 Hz", ""), (51.0, ""), (314.16, "")]
+)
+@pytest.mark.parametrize("driven", [lambda motor: motor, lambda motor: jv.BeltDrive(motor, ratio=1.5, shaft_inertia=0.1)])
+def test_a_supply_frequency_in_hertz_is_noted(frequency, meant, driven):
+    data = {"stator_resistance": 1.0, "rotor_resistance": 0.8, "stator_leakage": 3e-3, "rotor_leakage": 3e-3}
+    motor = jv.InductionMotorCircuit(400.0, frequency, 2, **data, magnetizing_inductance=0.1, inertia=0.1)
+    machine = jv.one_mass(mass=60.0, stiffness=2.5e5, damping=1200.0)
+    notes = implausible_numbers(jv.Scene(machine, exciters=[jv.Exciter(unbalance=0.05, drive=driven(motor))]))
+    name = "drive.motor.frequency" if hasattr(driven(motor), "motor") else "drive.frequency"
+    says = f"{name} is {float(motor.frequency) / (2 * np.pi):.4g} Hz; a plain number is in rad/s: did you mean '{meant}'?"
+    assert notes == [says] * bool(meant)
+
+
 def test_unbalance_of_a_tenth_of_a_metre_is_noted():
     machine = jv.one_mass(mass=12.0, stiffness=1e5, damping=100.0)
     motor = jv.Exciter(drive=jv.ConstantSpeed(150.0), unbalance=1.2)

@@ -255,7 +255,7 @@ class InductionMotorCircuit(Motor):
     give reactances X = w L.
 
     - `voltage` of the supply between two lines, root mean square, V; typical: 400
-    - `frequency` of the supply, rad/s; typical: "50 Hz"
+    - `frequency` of the supply, rad/s; typical: "50 Hz"; a plain number is in rad/s, as everywhere: 314.16
     - `pole_pairs` p; typical: 1 to 4
     - `stator_resistance` R_s and `rotor_resistance` R_r of a phase, ohm; typical: 0.2 to 10
     - `stator_leakage` and `rotor_leakage`: leakage inductances of a phase, H; typical: 1e-3 to 0.03
