@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED_TYPE, Output, command, loaded_scene, table
 from jaxvib.cli.output import csv_options
+
+_MOTION = ("forward", "straight", "angle")
+"""Attributes of `Whirl` and `CriticalSpeeds` on the sense of each motion."""
 
 
 @command("whirl")
@@ -22,7 +25,7 @@ from jaxvib.cli.output import csv_options
 )
 @csv_options
 def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: Path | None, output: Output) -> None:
-    """List the whirl frequencies of the rotor in SCENE, forward, backward or straight (the axis moves on a straight line), and
+    """List the whirl frequencies of the rotor in SCENE, forward, backward or straight (on a line at an angle), and
     its critical speeds; --out adds the Campbell diagram."""
     import numpy as np  # slow imports, which --help does not need
 
@@ -31,10 +34,11 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: 
     loaded = loaded_scene(scene)
     rotor_speed = float(loaded.exciter.drive.speed) if speed is None else float(number(speed, "rad/s", "--speed", low=0.0))
     result = jv.whirl(loaded, [rotor_speed], loads=loads)
-    critical_speeds = zip(result.critical.speed, result.critical.forward, result.critical.straight, strict=True)
-    critical = [{"speed": float(w), "forward": bool(f), "straight": bool(s)} for w, f, s in critical_speeds if np.isfinite(w)]
-    whirl_speeds = zip(result.speed[0], result.decay[0], result.forward[0], result.straight[0], strict=True)
-    whirls = [{"speed": float(w), "decay": float(d), "forward": bool(f), "straight": bool(s)} for w, d, f, s in whirl_speeds]
+    exists = np.isfinite(result.critical.speed)
+    named = {name: np.asarray(getattr(result.critical, name))[exists].tolist() for name in ("speed", *_MOTION)}
+    critical = [dict(zip(named, values, strict=True)) for values in zip(*named.values(), strict=True)]
+    named = {name: np.asarray(getattr(result, name))[0].tolist() for name in ("speed", "decay", *_MOTION)}
+    whirls = [dict(zip(named, values, strict=True)) for values in zip(*named.values(), strict=True)]
     top = 1.3 * max([rotor_speed, *(entry["speed"] for entry in critical)])
     speeds = np.linspace(0.0, top, 161)
     output.figure("campbell.png", lambda: jv.whirl(loaded, speeds, loads=loads).plot(at=rotor_speed))
@@ -47,11 +51,10 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: 
 
         unit, scale = speed_unit()
 
-        def sense(entry: dict[str, Any]) -> str:
-            return "straight" if entry["straight"] else "forward" if entry["forward"] else "backward"
-
-        rows = [[sense(w), f"{scale * w['speed']:.6g}"] for w in critical]
-        whirl_speeds = [[sense(w), f"{scale * w['speed']:.6g}", f"{w['decay']:.4g}"] for w in whirls]
+        pairs = zip(critical, result.critical.sense[exists], strict=True)
+        rows = [[sense, f"{scale * w['speed']:.6g}"] for w, sense in pairs]
+        whirl_pairs = zip(whirls, result.sense[0], strict=True)
+        whirl_speeds = [[sense, f"{scale * w['speed']:.6g}", f"{w['decay']:.4g}"] for w, sense in whirl_pairs]
         return "\n".join(
             [
                 table("critical speeds: whirl frequency = rotor speed", ["", unit], rows),

@@ -11,12 +11,11 @@ from jaxvib.draw.style import COLORS, GUIDE, WHITE_OUTLINE, WORKING, Look, legen
 _SENSES = {
     "forward": (COLORS[0], "-", "forward whirl"),
     "backward": (COLORS[1], "--", "backward whirl"),
-    "straight": (COLORS[2], "-.", "straight motion"),
 }
 """Colour, line and name of each sense."""
 
-_SECOND_STRAIGHT = "second straight motion"
-"""Name of the second straight motion, which has a colour of its own."""
+_STRAIGHT_COLORS = (COLORS[2], COLORS[4])
+"""Colours of straight motions, in the order of their angles."""
 
 
 def campbell_diagram(
@@ -35,25 +34,26 @@ def campbell_diagram(
     **Arguments** (ns rotor speeds, at least 2, and nd whirls at each)
 
     - `rotor_speed` (ns,), `speed` (ns, nd): rotor speed and whirl frequencies, rad/s, drawn in `unit`
-    - `sense` (ns, nd): "forward", "backward" or "straight"
+    - `sense` (ns, nd): "forward", "backward" or the angle of a straight motion such as "straight at 90 deg"
     - `critical`: critical speeds (k,), rad/s, and their senses (k,), marked with their values on the line whirl frequency =
       rotor speed
     - `at`: working speed, rad/s; default: none
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
-    for word, (color, line, label) in _SENSES.items():
+    senses = dict(_SENSES)
+    for k, word in enumerate(np.setdiff1d(sense if critical is None else [*sense.flat, *critical[1]], list(senses)).tolist()):
+        senses[word] = (_STRAIGHT_COLORS[k % 2], "-.", word.replace("straight", "straight motion"))
+    for word, (color, line, label) in senses.items():
         for k, values in enumerate(whirl_lines(speed, sense == word)):
             look: Look = {"color": color, "label": None if k else label}
-            if k == 1 and word == "straight":
-                look = {"color": COLORS[4], "label": _SECOND_STRAIGHT}
             axis.plot(scale * rotor_speed, scale * values, ls=line, **look)
     found = np.zeros(0) if critical is None else critical[0][np.isfinite(critical[0])]
     right = scale * max(float(np.max(rotor_speed)), 0.0 if at is None else 1.05 * at)
     top = 1.12 * scale * max(float(np.nanmax(speed)), *(w for w in found if scale * w <= right), 1e-300)
     axis.plot([0.0, top], [0.0, top], color=GUIDE, lw=0.9, ls=":", label="whirl frequency = rotor speed")
     if critical is not None:
-        _critical_marks(axis, scale * critical[0], critical[1], right, top)
+        _critical_marks(axis, scale * critical[0], critical[1], {word: look[0] for word, look in senses.items()}, right, top)
         axis.plot([], [], "o", ms=6.0, mfc="white", mec="black", label=f"critical speeds (no damping), {unit}", ls="")
     if at is not None:
         axis.axvline(scale * at, label="working speed", **WORKING)
@@ -67,16 +67,16 @@ def campbell_diagram(
     return figure if ax is None else ax
 
 
-def _critical_marks(axis: Axes, speed: np.ndarray, sense: np.ndarray, right: float, top: float) -> None:
+def _critical_marks(axis: Axes, speed: np.ndarray, sense: np.ndarray, colors: dict[str, str], right: float, top: float) -> None:
     """Draw critical speeds as points on the line whirl frequency = rotor speed, with their values beside vertical lines.
 
     Close critical speeds share a text.
+
+    **Arguments**: `colors` of the senses.
     """
     for group, word in critical_groups(speed, sense, right):
         for k in group:
-            is_second = sense[k] == "straight" and np.sum((sense == "straight") & (speed < speed[k])) == 1
-            color = COLORS[4] if is_second else _SENSES[str(sense[k])][0]
-            look = {"mfc": "white", "mec": color, "mew": 1.4, "zorder": 4}
+            look = {"mfc": "white", "mec": colors[str(sense[k])], "mew": 1.4, "zorder": 4}
             axis.plot([speed[k]], [speed[k]], "o" if sense[k] == "forward" else "s", ms=6.0, **look)
             axis.vlines(float(speed[k]), 0.0, float(speed[k]), color=GUIDE, lw=0.7, zorder=1.2)
         at = (speed[group[-1]], 0.02 * top)

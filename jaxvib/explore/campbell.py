@@ -62,12 +62,15 @@ def campbell(result: Whirl, at: float) -> str:
     panel = Panel(LEFT_MARGIN, "whirl frequency, rpm", (0.0, right), (0.0, top), width=3.0 * PANEL_WIDTH + 2.0 * PANEL_GAP)
     parts, texts = panel.frame(), panel.texts()
     for word, look in _SENSE_STYLES.items():
-        parts += [panel.line(scale * rotor_speed, scale * values, look) for values in whirl_lines(speed, sense == word)]
+        parts += [
+            panel.line(scale * rotor_speed, scale * values, look)
+            for values in whirl_lines(speed, np.char.startswith(sense, word))
+        ]
     end = min(top, right)
     parts += [panel.line([0.0, end], [0.0, end], ROTOR), panel.line([scale * at] * 2, panel.y, WORKING)]
     for k in shown:
         w = float(critical[k])
-        look = {**_CRITICAL, "ec": _SENSE_STYLES[str(critical_sense[k])]["color"]}
+        look = {**_CRITICAL, "ec": _SENSE_STYLES[str(critical_sense[k]).split()[0]]["color"]}
         square = critical_sense[k] != "forward"
         parts += [panel.line([w, w], [0.0, w], _DROP_LINE), dot(*panel.at(w, w), look, square=square)]
     ends: list[float] = []  # right end of the texts in each row, from the lowest row upward

@@ -57,6 +57,7 @@ class CriticalSpeeds(Result):
       imbalance excites forward whirls only. If horizontal and vertical supports differ, it excites all whirls; between
       the two speeds into which a critical speed is split, the rotor's axis then whirls backward
     - `straight` (nd,): True if the axis moves on a straight line, which needs different horizontal and vertical supports
+    - `angle` (nd,), rad: anticlockwise angle of this line from the first direction, x, from -45 to 135 degrees; NaN for others
     - `status`: a `WhirlStatus`
     """
 
@@ -64,11 +65,12 @@ class CriticalSpeeds(Result):
     speed: Array = eqx.field(metadata=in_unit("rad/s", "whirl"))
     forward: Array = eqx.field(metadata=in_unit("", "whirl"))
     straight: Array = eqx.field(metadata=in_unit("", "whirl"))
+    angle: Array = eqx.field(metadata=in_unit("rad", "whirl"))
 
     @property
     def sense(self) -> np.ndarray:
-        """Sense of each whirl, (nd,): "forward", "backward" or "straight"."""
-        return _sense_words(self.forward, self.straight)
+        """Sense of each whirl, (nd,): "forward", "backward", or for a straight line its angle, "straight at 90 deg"."""
+        return _sense_words(self.forward, self.straight, self.angle)
 
     def summary(self) -> str:
         """Return a line of text for each speed."""
@@ -82,7 +84,7 @@ class CriticalSpeeds(Result):
         from jaxvib.draw.results import speeds_chart  # slow import
 
         speed, sense = np.asarray(self.speed), self.sense
-        shown = [word for word in ("forward", "backward", "straight") if word != "straight" or word in sense]
+        shown = ["forward", "backward", *np.unique(sense[np.asarray(self.straight)]).tolist()]
         return speeds_chart([(word, speed[sense == word]) for word in shown], unit=unit, ax=ax)
 
 
@@ -99,6 +101,8 @@ class Whirl(Result):
       one, with which the displacement creeps back. Several overdamped motions are in the order of increasing decay
     - `forward`: (ns, nd) True if the motion turns with the rotor, False if it turns against the rotor or not at all
     - `straight`: (ns, nd) True if the axis moves on a straight line, which needs different horizontal and vertical supports
+    - `angle`: (ns, nd), rad, anticlockwise angle of this line from the first direction, x, from -45 to 135 degrees; NaN for
+      other motions
     - `directivity`: (ns, nd) (f - b)/(f + b), where the ellipse of the motion is the sum of a forward circle of the radius f
       and a backward circle of the radius b. It is 1 for a forward circle, 0 for a straight line, and -1 for a backward circle.
       No force that turns with the rotor excites a motion of the directivity -1. For a rotor that tilts, f and b are root sums
@@ -113,13 +117,15 @@ class Whirl(Result):
     decay: Array = eqx.field(metadata=in_unit("1/s", "rotor_speed", "whirl"))
     forward: Array = eqx.field(metadata=in_unit("", "rotor_speed", "whirl"))
     straight: Array = eqx.field(metadata=in_unit("", "rotor_speed", "whirl"))
+    angle: Array = eqx.field(metadata=in_unit("rad", "rotor_speed", "whirl"))
     directivity: Array = eqx.field(metadata=in_unit("", "rotor_speed", "whirl"))
     critical: CriticalSpeeds = eqx.field(metadata=part(prefix="critical_"))
 
     @property
     def sense(self) -> np.ndarray:
-        """Sense of each whirl, (ns, nd): "forward", "backward" (including a motion that does not oscillate) or "straight"."""
-        return _sense_words(self.forward, self.straight)
+        """Sense of each whirl, (ns, nd): "forward", "backward" (including a motion that does not oscillate), or for a straight
+        line its angle, "straight at 90 deg"."""
+        return _sense_words(self.forward, self.straight, self.angle)
 
     def summary(self) -> str:
         """Return the whirls at each rotor speed, and the critical speeds, as text."""
@@ -191,9 +197,10 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: LoadMasses
     return outcome(_whirl(model, jnp.atleast_1d(speeds), loads), scene)
 
 
-def _sense_words(forward: Array, straight: Array) -> np.ndarray:
-    """Return "forward", "backward" or "straight" for each whirl."""
-    return np.where(np.asarray(straight), "straight", np.where(np.asarray(forward), "forward", "backward"))
+def _sense_words(forward: Array, straight: Array, angle: Array) -> np.ndarray:
+    """Return "forward", "backward" or the angle of a straight line as text for each whirl."""
+    lines = np.vectorize(lambda a: f"straight at {np.degrees(a) + 0.0:.0f} deg", otypes=[object])(np.round(angle, 6))
+    return np.where(straight, lines, np.where(forward, "forward", "backward")).astype(str)
 
 
 @cached
@@ -236,14 +243,16 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
             -values.real[chosen],
             turns & (_sense(model.mount, chosen_shapes) > 0.0) & ~straight,
             straight,
+            jnp.where(straight, _line_angle(model, chosen_shapes), jnp.nan),
             jnp.where(turns, _directivity(model.mount, chosen_shapes), jnp.nan),
             ~(error[nearest][chosen] <= MAX_EIGENVALUE_ERROR),  # True for NaN
         )
 
-    speed, decay, forward, straight, directivity, lost = jax.vmap(at)(speeds)
+    speed, decay, forward, straight, angle, directivity, lost = jax.vmap(at)(speeds)
     status = WhirlStatus.where(jnp.any(lost), WhirlStatus.lost_digits, WhirlStatus.done)
     speed, decay = (jnp.where(lost, jnp.nan, x) for x in (speed, decay))
-    return Whirl(status, speeds, speed, decay, forward, straight, directivity, critical=_critical_speeds(model, loads))
+    critical = _critical_speeds(model, loads)
+    return Whirl(status, speeds, speed, decay, forward, straight, angle, directivity, critical)
 
 
 def _coupling_size(dtype: np.dtype) -> float:
@@ -313,7 +322,8 @@ def _critical_speeds(model: LinearModel, loads: LoadMasses) -> CriticalSpeeds:
     speed = jnp.where(exists, 1.0 / jnp.sqrt(jnp.where(exists, values, 1.0)), jnp.inf)
     status = WhirlStatus.where(jnp.any(lost), WhirlStatus.lost_digits, WhirlStatus.done)
     straight = _is_straight(model, shapes)
-    return CriticalSpeeds(status, jnp.where(lost, jnp.nan, speed), (_sense(mount, shapes) > 0.0) & ~straight, straight)
+    angle = jnp.where(straight, _line_angle(model, shapes), jnp.nan)
+    return CriticalSpeeds(status, jnp.where(lost, jnp.nan, speed), (_sense(mount, shapes) > 0.0) & ~straight, straight, angle)
 
 
 def _two_directions(scene: Scene) -> LinearModel:
@@ -384,3 +394,13 @@ def _is_straight(model: LinearModel, shapes: Array) -> Array:
     """Return True for shapes (nd, k) in which the axis moves on straight lines, which needs supports that differ."""
     moved = jnp.stack(model.mount.rows).astype(shapes.dtype) @ shapes
     return jnp.abs(_sense(model.mount, shapes)) < _STRAIGHT * jnp.sum(jnp.abs(moved) ** 2, axis=(0, 1)) / 2.0
+
+
+def _line_angle(model: LinearModel, shapes: Array) -> Array:
+    """Return the angle, rad, of the straight line of each of the shapes (nd, k), from -pi/4 to 3 pi/4: neither 0 nor pi/2 is at
+    a limit, where rounding errors would decide the sign."""
+    x, y = jnp.moveaxis(jnp.stack(model.mount.rows).astype(shapes.dtype) @ shapes, 1, 0)
+    # `_mirrored` has reversed the second direction of a clockwise rotor.
+    product = 2.0 * model.scene.exciter.direction * jnp.sum((x * jnp.conj(y)).real, axis=0)
+    angle = jnp.arctan2(product, jnp.sum(jnp.abs(x) ** 2 - jnp.abs(y) ** 2, axis=0)) / 2.0
+    return jnp.mod(angle + jnp.pi / 4.0, jnp.pi) - jnp.pi / 4.0

@@ -208,11 +208,15 @@ def test_the_axis_of_torques_contains_negative_ones(needed, torque, limits):
 
 def test_whirls_have_a_line_for_each_sense():
     n, speed = np.array([0.0, 10.0]), np.array([[5.0, 6.0], [4.0, 8.0]])
-    sense = np.array([["straight", "backward"], ["backward", "forward"]])
+    sense = np.array([["straight at 0 deg", "backward"], ["backward", "forward"]])
     critical = np.array([4.5, 7.0, np.nan, 40.0]), np.array(["backward", "forward", "forward", "forward"])
     axis = campbell_diagram(n, speed, sense, critical=critical, at=9.0, unit="rad/s").axes[0]
     lines = named(axis)
-    for name, values in (("forward whirl", [np.nan, 8.0]), ("backward whirl", [6.0, 4.0]), ("straight motion", [5.0, np.nan])):
+    for name, values in (
+        ("forward whirl", [np.nan, 8.0]),
+        ("backward whirl", [6.0, 4.0]),
+        ("straight motion at 0 deg", [5.0, np.nan]),
+    ):
         np.testing.assert_array_equal(lines[name], np.stack([n, values], axis=1))
     assert lines["whirl frequency = rotor speed"] == [[0.0, 0.0], [pytest.approx(8.96)] * 2]
     marks = [(line.get_xydata().tolist(), line.get_marker()) for line in axis.lines if line.get_zorder() == 4]
@@ -223,12 +227,14 @@ def test_whirls_have_a_line_for_each_sense():
 
 def test_two_straight_motions_have_their_own_colours():
     n, speed = np.array([0.0, 10.0]), np.array([[5.0, 6.0], [5.0, 6.0]])
-    critical = np.array([5.0, 6.0]), np.full(2, "straight")
-    axis = campbell_diagram(n, speed, np.full((2, 2), "straight"), critical=critical, unit="rad/s").axes[0]
+    words = np.array(["straight at 0 deg", "straight at 90 deg"])
+    critical = np.array([5.0, 6.0]), words
+    axis = campbell_diagram(n, speed, np.tile(words, (2, 1)), critical=critical, unit="rad/s").axes[0]
     first, second = axis.lines[:2]
     marks = [line.get_markeredgecolor() for line in axis.lines if line.get_zorder() == 4]
     assert marks == [first.get_color(), second.get_color()]
-    assert first.get_color() != second.get_color() and second.get_label() == "second straight motion"
+    assert first.get_color() != second.get_color()
+    assert [line.get_label() for line in (first, second)] == ["straight motion at 0 deg", "straight motion at 90 deg"]
 
 
 def test_critical_speeds_are_grouped_by_their_neighbour():

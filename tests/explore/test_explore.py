@@ -319,9 +319,14 @@ def test_both_charts_are_as_wide_as_the_page():
 
 
 def test_colours_of_whirls_are_those_of_figures():
-    assert {sense: look["color"] for sense, look in _SENSE_STYLES.items()} == {
-        sense: look[0] for sense, look in whirl._SENSES.items()
-    }
+    colors = {sense: look[0] for sense, look in whirl._SENSES.items()} | {"straight": whirl._STRAIGHT_COLORS[0]}
+    assert {sense: look["color"] for sense, look in _SENSE_STYLES.items()} == colors
+
+
+def test_straight_motions_have_lines_in_their_style():
+    rotor = TEMPLATES["planar_rotor"].replace("[loads]", 'stiffness_up = "9 N/um"\n[loads]', 1)
+    drawn = figures.diagram(jv.scene_from_toml(rotor), 600.0)
+    assert "straight at 0 deg" in drawn and _SENSE_STYLES["straight"]["color"] in drawn
 
 
 def test_the_machine_moves_as_its_jam_says(two_platforms):

@@ -95,9 +95,27 @@ def test_whirl_is_the_fixed_frame_eigenproblem(speed):
 def test_a_rotor_without_tilt_moves_on_straight_lines():
     found = jv.critical_speeds(scene(planar()), loads="none")
     np.testing.assert_allclose(found.speed, np.sqrt(np.array([4e4, 9e4]) / 20.0), rtol=1e-12)
-    assert found.sense.tolist() == ["straight"] * 2 and not np.any(found.forward)
-    assert jv.critical_speeds(scene(planar(stiffness_up=None, damping_up=None))).sense.tolist() == ["backward", "forward"]
-    assert found.summary().count("straight") == 2 and jv.whirl(scene(planar()), [10.0]).sense.tolist() == [["straight"] * 2]
+    equal = dict(stiffness_up=None, damping_up=None)
+    words = ["straight at 0 deg", "straight at 90 deg"]
+    assert found.sense.tolist() == words and not np.any(found.forward)
+    np.testing.assert_allclose(found.angle, [0.0, np.pi / 2.0], atol=1e-7)
+    assert jv.critical_speeds(scene(planar(**equal))).sense.tolist() == ["backward", "forward"]
+    assert found.summary().count("straight") == 2 and jv.whirl(scene(planar()), [10.0]).sense.tolist() == [words]
+    stiff_x = jv.whirl(scene(planar(stiffness_up=1e4)), [10.0])
+    assert stiff_x.sense.tolist() == [words[::-1]] and np.all(np.isnan(jv.whirl(scene(planar(**equal)), [10.0]).angle))
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_straight_motions_have_the_angles_of_inclined_springs(direction):
+    """Springs of 4e4 N/m along a line at 30 degrees, and of 9e4 N/m across it: the axis moves along one of the two lines."""
+    along, across = np.array([np.sqrt(3.0), 1.0]) / 2.0, np.array([-1.0, np.sqrt(3.0)]) / 2.0
+    stiffness = 4e4 * np.outer(along, along) + 9e4 * np.outer(across, across)
+    machine = jv.from_matrices(20.0 * np.eye(2), 60.0 * np.eye(2), stiffness, places=[[[1.0, 0.0], [0.0, 1.0]]])
+    exciter = jv.Exciter(drive=jv.ConstantSpeed(100.0), unbalance=1e-3, direction=direction)
+    found = jv.whirl(jv.Scene(machine, exciters=[exciter]), [10.0])
+    np.testing.assert_allclose(np.degrees(found.angle), [[30.0, 120.0]], atol=1e-4)
+    np.testing.assert_allclose(np.degrees(found.critical.angle), [30.0, 120.0], atol=1e-4)
+    assert found.sense.tolist() == [["straight at 30 deg", "straight at 120 deg"]]
 
 
 def test_an_unbalance_whirls_backward_between_split_speeds():

@@ -199,7 +199,7 @@ def test_single_precision_says_which_whirls_it_loses(soft):
 def test_machines_from_matrices_have_the_same_sense_of_whirls():
     """Two springs of different stiffness move the axis on straight lines, equal ones on circles in both directions."""
     loads, drive = jv.balls(count=2, mass=0.05, radius=0.08, drag=1.0), jv.ConstantSpeed(100.0)
-    for up, sense in ((1.4e6, ["straight", "straight"]), (1e6, ["backward", "forward"])):
+    for up, sense in ((1.4e6, ["straight at 0 deg", "straight at 90 deg"]), (1e6, ["backward", "forward"])):
         other = {} if up == 1e6 else {"stiffness_up": up}
         matrices = {"mass": 37.0 * np.eye(2), "damping": 100.0 * np.eye(2), "stiffness": np.diag([1e6, up])}
         for machine in (
