@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from jaxvib.cli.document import TypeWithUnit
-from jaxvib.cli.output import Output, note
+from jaxvib.cli.output import TABLES, Output, note
 from jaxvib.errors import ComputationError, InputError, legible, quoted
 
 if TYPE_CHECKING:
@@ -175,12 +175,20 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
     """Return a table with a title, column headers and lines; the first column is aligned to the left, the others to the right.
 
     Empty columns are omitted. The table fits into a terminal of 80 columns; longer headers and texts continue on a new line.
+    For a report, return a mark that stands for the table.
     """
+    shown_columns = [k for k in range(len(columns)) if not rows or any(row[k] for row in rows)]
+    context = click.get_current_context(silent=True)
+    if context is not None and TABLES in context.meta:
+        from jaxvib.report.tables import TextTable, mark_of  # slow import, which is needed for reports only
+
+        tables = context.meta[TABLES]
+        tables.append(TextTable(title, [columns[k] for k in shown_columns], [[row[k] for k in shown_columns] for row in rows]))
+        return mark_of(len(tables) - 1)
     from rich.console import Console  # slow import, which --json does not need
     from rich.table import Table
 
     rich_table = Table()
-    shown_columns = [k for k in range(len(columns)) if not rows or any(row[k] for row in rows)]
     for k in shown_columns:
         rich_table.add_column(columns[k], justify="left" if k == 0 else "right", overflow="fold")
     for row in rows:

@@ -86,10 +86,12 @@ def optimize(
         **({"chosen": chosen} if chosen else {}),
         **({"tolerances": [ranges_of_quantity._asdict() for ranges_of_quantity in ranges]} if tolerances else {}),
     }
-    parts = [*chosen]
-    if tolerances:
-        parts += [tolerance_table(ranges, tolerances), *_few_machines_texts(ranges, loaded.subject_to)]
-    output.done(document, lambda: "\n".join([_text(best), *parts]), "optimize", best)
+
+    def text() -> str:
+        of_ranges = [tolerance_table(ranges, tolerances), *_few_machines_texts(ranges, loaded.subject_to)] if tolerances else []
+        return "\n".join([_text(best), *chosen, *of_ranges])
+
+    output.done(document, text, "optimize", best)
 
 
 def _with_time_left(progress: Callable[[str, float], None]) -> Callable[[str, float], None]:

@@ -76,6 +76,10 @@ _NOTES = "jaxvib.notes"
 """Key of the printed notes in the context of click."""
 
 
+TABLES = "jaxvib.tables"
+"""Key in the context of click. Its value is the list to which `table` adds tables of the text of a report."""
+
+
 def note(text: str) -> None:
     """Print a text on stderr, on a terminal in lines that fit, in place of the line of the elapsed time; reports contain it."""
     context = click.get_current_context(silent=True)
@@ -294,18 +298,23 @@ class Output:
         if not isinstance(scene, Scene):
             scene = None if self.scene is None else load_scene(self.scene)
         draw_sketch = getattr(jv, "sketch", None)
-        arguments = click.get_current_context().find_root().obj or [name]
+        context = click.get_current_context()
+        arguments = context.find_root().obj or [name]
+        tables = context.meta[TABLES] = []
+        text_with_marks = click.unstyle(text())  # without colours and bold print of the terminal
+        del context.meta[TABLES]
         page = Report(
             title=self.title or name,
             author=self.author or "",
             command=shlex.join(["jaxvib", *arguments]),
             document=document,
             units=units_of_document(document, result),
-            text=click.unstyle(text()),  # colours and bold print of the terminal
+            text=text_with_marks,
+            tables=tables,
             scene=scene,
             sketch=None if scene is None or draw_sketch is None else draw_sketch(scene),
             figures=self.figures,
-            notes=click.get_current_context().meta.get(_NOTES, ()),
+            notes=context.meta.get(_NOTES, ()),
         )
         write_file(path, page.html())
         self.files.append(str(path))

@@ -20,7 +20,17 @@ from jaxvib.display import Figure
 from jaxvib.errors import written
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.regime import Regime
-from jaxvib.report.tables import COMPLEX, Units, accuracy_table, escaped, in_display_units, parameter_tables, result_tables
+from jaxvib.report.tables import (
+    COMPLEX,
+    TextTable,
+    Units,
+    accuracy_table,
+    escaped,
+    in_display_units,
+    parameter_tables,
+    result_tables,
+    text_with_tables,
+)
 from jaxvib.results.fields import Plain, as_dict
 from jaxvib.results.result import Result
 from jaxvib.steady.measures import VibrationMeasures
@@ -33,8 +43,9 @@ class Report:
     """Contents of a page.
 
     **Arguments**: `title`; `document`: the result as plain values; `units` of its numbers, by name; `command`: the command line
-    that computed the result; `text`: the result as printed on the terminal; `scene` of the result, and a `sketch` of the scene;
-    `figures`: pairs of a name and a figure; `author`; `notes`: sentences about input and results that are probably wrong.
+    that computed the result; `text`: the result as printed on the terminal, with marks in place of its `tables`; `scene` of the
+    result, and a `sketch` of the scene; `figures`: pairs of a name and a figure; `author`; `notes`: sentences about input and
+    results that are probably wrong.
     """
 
     title: str
@@ -47,6 +58,7 @@ class Report:
     sketch: Figure | None = None
     author: str = ""
     notes: Sequence[str] = ()
+    tables: Sequence[TextTable] = ()
 
     def html(self) -> str:
         """Return the page as HTML with embedded style and figures. The page loads nothing from a network; all text is
@@ -58,11 +70,11 @@ class Report:
             parts.append(f'<p class="command"><code>{escaped(self.command)}</code></p>')
         coordinate_units = () if self.scene is None else self.scene.machine.structure().units
         document, units = in_display_units(self.document, self.units, coordinate_units)
-        tables = result_tables(document, units, has_text=bool(self.text))
+        tables = result_tables(document, units, has_text=bool(self.text), tables=self.tables)
         numbers = [_section("Accuracy", accuracy_table(document, units)), _section("Numbers", tables)]
         parts.append(_section("Notes", "".join(f"<p>{escaped(each)}</p>" for each in self.notes)))
         if self.text:
-            parts.append(_section("Results", f"<pre>{escaped(self.text)}</pre>"))
+            parts.append(_section("Results", text_with_tables(self.text, self.tables)))
         parts.append(_section("Figures", "".join(_figure(name, figure) for name, figure in self.figures)))
         if not self.text:
             parts += numbers

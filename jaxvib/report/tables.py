@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import html
 import math
+import re
 import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import TypeAlias, TypeGuard, cast
+from typing import NamedTuple, TypeAlias, TypeGuard, cast
 
 import equinox as eqx
 
@@ -128,10 +129,65 @@ def accuracy_table(document: Mapping[str, Plain], units: Units) -> str:
     )
 
 
-def result_tables(document: Mapping[str, Plain], units: Units, inner: bool = False, *, has_text: bool = False) -> str:
+class TextTable(NamedTuple):
+    """Table in the text of a result: `title`, `columns` (headers) and `rows` of texts."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    def html(self) -> str:
+        """Return the table with its title as HTML; all columns except the first are aligned to the right."""
+
+        def line(tag: str, cells: Sequence[str]) -> str:
+            classes = ["", *[" class='n'"] * (len(cells) - 1)]
+            return f"<tr>{''.join(f'<{tag}{c}>{escaped(cell)}</{tag}>' for c, cell in zip(classes, cells, strict=True))}</tr>"
+
+        lines = "".join([line("th", self.columns), *(line("td", row) for row in self.rows)])
+        return f"<h3>{escaped(self.title)}</h3><div class='wide'><table>{lines}</table></div>"
+
+    def shows(self, rows: Sequence[Mapping[str, Plain]]) -> bool:
+        """Return True if all numbers of a column, which are not only counts, are those of one entry of the `rows`."""
+        entries = [
+            [x for row in rows if isinstance(x := row.get(name), (int, float)) and not isinstance(x, bool)] for name in rows[0]
+        ]
+        for column in zip(*self.rows, strict=True):
+            try:
+                numbers = [float(cell) for cell in column]
+            except ValueError:
+                continue
+            if all(x.is_integer() for x in numbers):
+                continue
+            if any(all(any(math.isclose(x, y, rel_tol=1e-3) for y in values) for x in numbers) for values in entries):
+                return True
+        return False
+
+
+def mark_of(place: int) -> str:
+    """Return the text that stands for the table at this place in the text of a result."""
+    return f"\0{place}\0"
+
+
+def text_with_tables(text: str, tables: Sequence[TextTable]) -> str:
+    """Return the text of a result as HTML, with the `tables` in place of their marks."""
+    pieces = re.split("\0([0-9]+)\0", text)
+    shown = [f"<pre>{escaped(piece)}</pre>" if (piece := each.strip("\n")) else "" for each in pieces[::2]]
+    shown[1:] = [tables[int(place)].html() + after for place, after in zip(pieces[1::2], shown[1:], strict=True)]
+    return "".join(shown)
+
+
+def result_tables(
+    document: Mapping[str, Plain],
+    units: Units,
+    inner: bool = False,
+    *,
+    has_text: bool = False,
+    tables: Sequence[TextTable] = (),
+) -> str:
     """Return a document as tables: one table for all single values, and a table with a heading for each list or mapping.
 
-    `has_text`: True if the page also has the text of the result; fields that the text shows better are left out.
+    **Arguments**: `has_text`: True if the page also has the text of the result; fields that the text shows better are left out;
+    `tables` of this text, which are not repeated.
     """
     single, below = [], []
     hidden = (*_HIDDEN_FIELDS, *_FIELDS_OF_TEXT) if has_text else _HIDDEN_FIELDS
@@ -145,7 +201,8 @@ def result_tables(document: Mapping[str, Plain], units: Units, inner: bool = Fal
         elif isinstance(value, Mapping):
             below.append((name, result_tables(value, units, inner=True)))
         elif _entries(value):
-            below.append((name, _row_table(value, units)))
+            if not any(each.shows(value) for each in tables):
+                below.append((name, _row_table(value, units)))
         elif isinstance(value, list) and value:
             below.append((name, _grid_table(value)))
     heads = "".join(f"<h3>{escaped(_words(name))}{_unit_of(name, units)}</h3>{body}" for name, body in below if body)

@@ -30,8 +30,8 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
     - `result`: result of any class
     - `axis`: name of the axis in the metadata of the fields, such as "time" or "point"
     - `path`: path of the file, which is overwritten
-    - `display`: True for the units of `display_units` and names in words, such as "rotor speed" for `rotor_speed`; default: SI
-      units and the names of the fields
+    - `display`: True for the units of `display_units` and names in words, such as "rotor speed" for `rotor_speed`, without a
+      prefix that the axis and all columns have, such as "trajectory_"; default: SI units and the names of the fields
     - `decimal_comma`: True for decimal commas, and semicolons between columns, as German and Russian spreadsheets expect;
       default: decimal points and commas
 
@@ -82,7 +82,8 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
     """
     labels = labels_of(result)
     units = labels.get("unit", ())
-    in_words: Callable[[str], str] = (lambda name: name.replace("_", " ")) if display else str
+    prefix = _common_prefix(result, axis) if display else ""
+    in_words: Callable[[str], str] = (lambda name: name.removeprefix(prefix).replace("_", " ")) if display else str
     table: dict[str, np.ndarray] = {}
     for name, axes, values, unit in columns(result):
         if values.ndim != len(axes):
@@ -112,6 +113,12 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
     named = (axis, "unit") if axis == "coordinate" and len(set(units)) > 1 else (axis,)
     rows = len(next(iter(table.values())))
     return {in_words(name): np.array(labels[name]) for name in named if len(labels.get(name, ())) == rows} | table
+
+
+def _common_prefix(result: eqx.Module, axis: str) -> str:
+    """Return the prefix, such as "trajectory_", of the name of an axis and of all columns along it; "" without one."""
+    prefix = axis[: axis.find("_") + 1]
+    return prefix if all(name.startswith(prefix) for name, axes, *_ in columns(result) if axes[:1] == (axis,)) else ""
 
 
 def _label(labels: Labels, axis: str, k: int, n: int) -> str:

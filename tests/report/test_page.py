@@ -16,6 +16,7 @@ import jaxvib as jv
 from jaxvib.cli.app import run
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.report.page import Report, units_of, units_of_document
+from jaxvib.report.tables import TextTable, mark_of
 from jaxvib.study.accuracy.cost import CostRow
 
 RESULT = jv.Cost("amplitude", [1.0], 1e-9, [CostRow("full", "Tsit5", "float64", "1e-3", math.nan, 0.1, 1.0)])
@@ -80,7 +81,7 @@ def test_a_scene_file_with_a_hostile_name(tmp_path, monkeypatch, capsys):
     said = " ".join(page.text)
     assert name in said and "evil.example" not in text
     assert "Machine" in said and "N s/m" in said and "free to move separately" in said and len(page.links) == 2
-    assert "amplitude, mm" in said and "m or rad" not in said and "omega, rpm" in said and "jaxvib" in said
+    assert "y1, mm" in said and "m or rad" not in said and "rotor, rpm" in said and "jaxvib" in said
 
 
 def test_numbers_that_are_not_finite_and_long_lists():
@@ -155,6 +156,25 @@ def test_a_page_with_a_text_has_no_numbers_without_units():
     page = Report("", document | {"unverified": ""}, {}, text="speed 997 rpm").html()
     assert "speed 997 rpm" in page and "y1" in page
     assert not re.search("104.4|rad/s|kkt|768|unverified|<td>m</td>", page)
+
+
+def test_tables_of_a_text_are_not_repeated():
+    """The table of jams shows the speeds of the jams; the text of other rows is not in it, and they stay."""
+    table = TextTable("<jams>", ["mode", "rpm"], [["1", "95.49"], ["2", "190.99"]])
+    document = {"modes": [{"omega": 10.0}, {"omega": 20.0}], "folds": [{"omega": 30.0}]}
+    text = f"(above)\n{mark_of(0)}\n(below)"
+    page = Report("", document, {"omega": "rad/s"}, text=text, tables=[table]).html()
+    checked(page)
+    assert page.count("95.49") == 1 and page.count("286.4") == 1 and "\0" not in page
+    assert page.index("(above)") < page.index("&lt;jams&gt;") < page.index("190.99") < page.index("(below)")
+
+
+def test_a_report_of_a_command_has_no_table_in_characters(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "machine.toml").write_text(jv.scene_to_toml(scene("two_mass", speed=150.0)))
+    assert run(["modes", "machine.toml", "--report", "r.html"]) == 0
+    page = (tmp_path / "r.html").read_text()
+    assert "<h3>jam modes (light loads)</h3>" in page and not re.search("[┏┃│]|<h3>(modes|folds)</h3>", page)
 
 
 def test_regimes_phases_and_exact_ranges_have_units():

@@ -77,9 +77,12 @@ def settle(
     document = run_document(run, measures) | (
         {"tolerances": [ranges_of_quantity._asdict() for ranges_of_quantity in ranges]} if tolerances else {}
     )
-    table = [tolerance_table(ranges, tolerances)] if tolerances else []
-    text = "\n".join([*off_notes(loaded), run_text(run, measures), *table])
-    output.done(document, lambda: text, "settle", run)
+
+    def text() -> str:
+        table = [tolerance_table(ranges, tolerances)] if tolerances else []
+        return "\n".join([*off_notes(loaded), run_text(run, measures), *table])
+
+    output.done(document, text, "settle", run)
 
 
 def _modes_of(run: jv.Run) -> list[int] | None:
