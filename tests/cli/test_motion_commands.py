@@ -6,6 +6,7 @@ import itertools
 import json
 import subprocess
 import sys
+import textwrap
 import time
 
 import numpy as np
@@ -21,6 +22,7 @@ from jaxvib.draw.motion.histories import _MIN_SAMPLES
 from jaxvib.machine.files import EFFECTS, SCREENS, SECTIONS, TEMPLATES
 from jaxvib.report.arguments import GROUPS, arguments_of
 from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
+from jaxvib.sweeps.study import load_study
 from optimize.files import TEMPLATES as DESIGNS
 
 UNBALANCED = """
@@ -427,6 +429,16 @@ def test_options_change_scenes_of_several_exciters(tmp_path, capsys):
         ("constant_speed", 95.0),
     ]
     assert capsys.readouterr().err.count("the final speed of the drive (spin_up)") == 2
+
+
+def test_help_of_run_up_maps_has_a_study_of_other_parameters(typed, tmp_path):
+    drive = jv.DCMotor("1500 rpm", stall_torque=40.0, inertia=0.1)
+    machine = jv.load_scene("machine.toml")
+    jv.save_scene(jv.Scene(machine.machine, machine.loads, drive), tmp_path / "machine.toml")
+    shown = typed("run-up-map", "--help")[1]
+    begin, end = shown.index("scene ="), shown.index("Options:")
+    (tmp_path / "study.toml").write_text(textwrap.dedent(" " * 4 + shown[begin:end]))
+    assert load_study(tmp_path / "study.toml").grid.shape == (3, 8)
 
 
 def test_run_up_command_gives_the_result_of_python(typed, tmp_path):

@@ -43,7 +43,20 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
 @click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-7].")
 @click.option("--batch", type=int, default=16, help="Number of run-ups that advance together on each core.")
 def run_up_map(scene: Path, drags: tuple[str, ...], tolerance: float | None, output: Output, **options: Any) -> None:
-    """Compute run-ups of SCENE from rest for each drag and each set of initial angles, and report the final regimes."""
+    """Compute run-ups of SCENE from rest for each drag and each set of initial angles, and report the final regimes.
+
+    \b
+    For other parameters, such as a torque, use `jaxvib sweep` with a study:
+      scene = "machine.toml"
+      samples = 8               # initial angles for each torque
+      [axes]
+      "drive.stall_torque" = { from = 10.0, to = 80.0, count = 3 }
+      "start.angle" = { from = "0 deg", to = "360 deg" }
+      [run]
+      until = "6 s"
+      [[measure]]
+      quantity = "run.regime"
+    """
     from jaxvib.units import number
 
     drag_values = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None
