@@ -140,7 +140,8 @@ def stability_chart(
     """Draw a band for each `value` (n,) of the varied parameter, between the first and the last one. A band is shaded at the
     load speeds `omega` (n, P) of `stable` (n, P) jams.
 
-    `marks` contains points (k, 2), each with a load speed and a value, by their kind. Speeds are in rad/s and drawn in `unit`.
+    Points on the axis show the values, because a band reaches midway to the next one. `marks` contains points (k, 2), each with
+    a load speed and a value, by their kind. Speeds are in rad/s and drawn in `unit`.
     """
     unit, scale = speed_unit(unit)
     figure, (axes,) = panels(1, size=(7.5, 5.0), ax=ax)
@@ -163,6 +164,8 @@ def stability_chart(
     if logarithmic:
         log_ticks(axes)
     axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
+    on_axis: Look = {"transform": axes.get_yaxis_transform(), "clip_on": False}
+    axes.plot(np.zeros(value.size), value, "o", ms=3.0, mfc="white", mec="black", label="computed values", **on_axis)
     axes.set(xlabel=f"load speed, {unit}", ylabel=label)
     legend_above(axes, 1)
     return figure if ax is None else ax

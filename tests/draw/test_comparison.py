@@ -85,6 +85,8 @@ def test_bands_of_stable_jams_meet_midway(value, scale, edges):
     assert axis.get_xlim() == pytest.approx((1.0 / turn, 3.0 / turn))
     np.testing.assert_allclose(axis.lines[0].get_xydata(), [[2.0 / turn, value[0]]])
     assert axis.get_xlabel() == "load speed, Hz"
+    (computed,) = (line for line in axis.lines if line.get_label() == "computed values")
+    np.testing.assert_array_equal(computed.get_xydata(), [[0.0, each] for each in value])
 
 
 def test_an_audit_shows_changes_in_percent_from_the_least():
