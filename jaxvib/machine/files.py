@@ -212,8 +212,14 @@ def _with_torque_tables(value: Any, folder: Path) -> Any:
     if value.get("kind") == "torque_table" and isinstance(value.get("file"), str):
         path, rest = folder / value["file"], {name: each for name, each in value.items() if name != "file"}
         speeds, torques = csv_column(path, "rad/s"), csv_column(path, "N m")
-        if row_names(path, "rad/s") != row_names(path, "N m"):
+        rows = row_names(path, "rad/s")
+        if rows != row_names(path, "N m"):
             raise InputError(str(path), "has a row with only one of speed and torque; complete this row or remove it")
+        steps = np.diff(speeds) * (-1.0 if speeds[-1] < speeds[0] else 1.0)
+        if np.any(steps <= 0.0):
+            k = int(np.argmax(steps <= 0.0))
+            problem = f"has {speeds[k + 1]:g} rad/s in {rows[k + 1]} after {speeds[k]:g} rad/s"
+            raise InputError(str(path), f"{problem}; list the speeds in ascending or descending order")
         return {**rest, "speeds": speeds.tolist(), "torques": torques.tolist()}
     return {name: _with_torque_tables(each, folder) for name, each in value.items()}
 

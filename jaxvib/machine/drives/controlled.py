@@ -30,14 +30,14 @@ class TorqueTable(Motor):
 
     **Arguments** (SI, or strings with a unit)
 
-    - `speeds` of the points, rad/s, in ascending order, at least 2; typical: ["0 rpm", "1000 rpm", "1500 rpm"]
+    - `speeds` of the points, rad/s, ascending or descending, at least 2; typical: ["0 rpm", "1000 rpm", "1500 rpm"]
     - `torques` at these speeds, N m: the first must be positive, the last 0 or negative and not above the one before it;
       typical: -10 to 200
     - `inertia` I of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
     **Attributes**: the arguments; the no-load `speed`, the largest speed at which the torque falls to 0.
 
-    **Raises** `InputError` for a wrong unit, for speeds that do not ascend, for torques that do not fall to 0, and for torques
+    **Raises** `InputError` for a wrong unit, for speeds in no order, for torques that do not fall to 0, and for torques
     that rise at the end.
 
     >>> import jaxvib as jv
@@ -91,7 +91,8 @@ class TorqueTable(Motor):
 def _points(part: type[eqx.Module], **lists: Numbers) -> list[Array]:
     """Return the lists of a table of points as arrays.
 
-    **Raises** `InputError` if the first list does not ascend or has fewer than 2 values, and for lists of another length.
+    **Raises** `InputError` if the first list has fewer than 2 values or does not ascend (the speeds of a torque table may also
+    descend; the lists are then reversed), and for lists of another length.
     """
     (first, *others), (name, *names) = (found := read_numbers(part, "drive", **lists)).values(), found
     n = np.size(first)
@@ -100,15 +101,21 @@ def _points(part: type[eqx.Module], **lists: Numbers) -> list[Array]:
     for other, values in zip(names, others, strict=True):
         if np.shape(values) != (n,):
             raise InputError(f"drive.{other}", f"has {counted(np.size(values))}; {n} are needed, one for each of the {name}")
-    when_known(lambda known: _require_ascending(known, name), first)
+    may_descend = part is TorqueTable
+    if may_descend and when_known(lambda known: bool(np.all(np.diff(known) < 0.0)), first):
+        return [values[::-1] for values in (first, *others)]
+    when_known(lambda known: _require_ascending(known, name, may_descend), first)
     return [first, *others]
 
 
-def _require_ascending(values: np.ndarray, name: str) -> None:
+def _require_ascending(values: np.ndarray, name: str, may_descend: bool) -> None:
     steps = np.diff(values)
+    if may_descend and steps[0] < 0.0:
+        steps = -steps
     if np.any(steps <= 0.0):
         k = int(np.argmax(steps <= 0.0)) + 1
-        raise InputError(f"drive.{name}[{k}]", f"is {values[k]:g} after {values[k - 1]:g}; list the {name} in ascending order")
+        order = "ascending or descending order" if may_descend else "ascending order"
+        raise InputError(f"drive.{name}[{k}]", f"is {values[k]:g} after {values[k - 1]:g}; list the {name} in {order}")
 
 
 _at_each_time = partial(jnp.vectorize, excluded=(0,))

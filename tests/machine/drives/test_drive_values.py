@@ -177,7 +177,7 @@ REFUSED = {
     ),
     "equal speeds": (
         lambda: jv.TorqueTable([0.0, 5.0, 5.0, 4.0], [1.0, 1.0, 1.0, -1.0], 0.1),
-        "drive.speeds[2] is 5 after 5; list the speeds in ascending order",
+        "drive.speeds[2] is 5 after 5; list the speeds in ascending or descending order",
     ),
     "falling times": (
         lambda: jv.SpeedProfile([2.0, 1.0, 3.0], [1.0, 2.0, 3.0]),
@@ -455,3 +455,11 @@ def test_run_with_a_belt_equals_that_of_the_referred_motor():
         referred = jv.InductionMotor(150.0 / ratio, 70.0 * ratio, 0.2, inertia=0.05 + 0.3 * ratio**2)
         found = final_angle(jv.BeltDrive(motor, ratio=ratio, shaft_inertia=0.05))
         assert found == pytest.approx(final_angle(referred), rel=1e-7)
+
+
+def test_a_torque_table_may_descend():
+    down = jv.TorqueTable(["1500 rpm", "1000 rpm", "0 rpm"], [-4.0, 20.0, 10.0], inertia=0.02)
+    up = jv.TorqueTable(["0 rpm", "1000 rpm", "1500 rpm"], [10.0, 20.0, -4.0], inertia=0.02)
+    assert repr(down) == repr(up)
+    with pytest.raises(jv.InputError, match=r"speeds\[2\] is 7 after 5; list the speeds in ascending or descending"):
+        jv.TorqueTable([8.0, 5.0, 7.0], [-1.0, 2.0, 3.0], inertia=0.02)

@@ -94,6 +94,13 @@ def test_a_torque_table_is_read_beside_its_scene(tmp_path):
     np.testing.assert_allclose(drive.speeds, same.speeds, rtol=1e-14)
     with pytest.raises(jv.InputError, match=r"drive\.file is not a field here"):
         jv.scene_from_toml(SCENE)
+    (tmp_path / "curves" / "motor.csv").write_text("speed (rpm);torque (Nm)\n1500;0\n1000;22,5\n0;15\n")
+    assert repr(jv.load_scene(tmp_path / "machine.toml").drive) == repr(drive)
+    (tmp_path / "curves" / "motor.csv").write_text("speed (rad/s);torque (Nm)\n150;0\n100;22,5\n100;15\n")
+    with pytest.raises(
+        jv.InputError, match=r"has 100 rad/s in row 4 of motor\.csv after 100 rad/s; list the speeds in ascending"
+    ):
+        jv.load_scene(tmp_path / "machine.toml")
     (tmp_path / "curves" / "motor.csv").write_text("speed (rpm);torque (Nm)\n0;15\n800;\n;18\n1500;0\n")
     with pytest.raises(jv.InputError, match="has a row with only one of speed and torque"):
         jv.load_scene(tmp_path / "machine.toml")
