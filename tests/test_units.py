@@ -62,6 +62,21 @@ from jaxvib.units.reading import _FACTORS, in_own_unit, to_float, unit_ratio
         ("2 PS", "W", 1470.9975),
         ("5 kgm^2", "kg m^2", 5.0),
         ("5 %", "", 0.05),
+        ("72 gm", "kg m", 0.072),
+        ("2 oz-in", "kg m", 2.0 * 0.028349523125 * 0.0254),
+        ("10 kg-m²", "kg m^2", 10.0),
+        ("30 N-s/m", "N s/m", 30.0),
+        ("10 lbf-ft", "N m", 10.0 * 4.4482216152605 * 0.3048),
+        ("3 kp/mm", "N/m", 3.0 * 9806.65),
+        ("150 ppi", "N/m", 150.0 * 4.4482216152605 / 0.0254),
+        ("10 lbm", "kg", 4.5359237),
+        ("3.5 KG", "kg", 3.5),
+        ("10 mils", "m", 2.54e-4),
+        ("0.3 ips", "m/s", 7.62e-3),
+        ("1500 u/min", "rad/s", 50 * np.pi),
+        ("1500 CPM", "rad/s", 50 * np.pi),
+        ("25 Hertz", "rad/s", 50 * np.pi),
+        ("5.5 KW", "W", 5500.0),
         ("4.4e4", "N/m", 4.4e4),
         (44, "N/m", 44.0),
         (np.float32(2.5), "kg", 2.5),
@@ -195,6 +210,21 @@ def test_masses_with_several_meanings_are_refused(text, meanings):
     with pytest.raises(jv.InputError, match=f"^mass is '{text}', which can mean {meanings}"):
         number(text, "kg", "mass")
     assert float(number("1.5 metric_ton", "kg", "mass")) == 1500.0
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "advice"),
+    [
+        ("150 lb/in", "N/m", "a pound is a mass; for the force write '150 lbf/in', or N"),
+        ("10 ft-lb", "N m", "a pound is a mass; for the force write '10 ft-lbf', or N"),
+        ("10 oz in", "N m", "an ounce is a mass; for the force write '10 ozf in', or N"),
+        ("3 kg/mm", "N/m", "a kilogram is a mass; for the force write '3 kgf/mm', or N"),
+        ("10 lbs", "N", "a pound is a mass; for the force write '10 lbf', or N"),
+    ],
+)
+def test_a_mass_in_place_of_a_force_is_refused(text, unit, advice):
+    with pytest.raises(jv.InputError, match=re.escape(f"field is '{text}'; {advice}")):
+        to_float(text, unit, "field")
 
 
 @pytest.mark.parametrize("text", ["25 s^-1", "25 1/s", "25 /s", "25 Bq", "25 count/s"])

@@ -62,7 +62,16 @@ _THOUSANDS = re.compile(r"[+-]?\d{1,3},\d{3}(?!\d)")
 _SPELLINGS = {
     **dict.fromkeys(("RPM", "Rpm", "upm", "Upm", "UPM", "r/min", "U/min", "rev/min"), "rpm"),
     **dict.fromkeys(("cps", "rps", "r/s", "U/s", "rev/s"), "turn/s"),
-    "Kg": "kg",
+    **dict.fromkeys(("1/Min", "U/Min", "u/min", "revs/min", "tr/min", "r.p.m.", "cpm", "CPM"), "rpm"),
+    **dict.fromkeys(("Kg", "KG", "kgs"), "kg"),
+    **dict.fromkeys(("HP", "Hp", "bhp"), "hp"),
+    **dict.fromkeys(("kw", "KW"), "kW"),
+    **dict.fromkeys(("Hertz", "HERTZ"), "Hz"),
+    **dict.fromkeys(("ips", "IPS"), "in/s"),
+    **dict.fromkeys(("ppi", "pli"), "lbf/in"),
+    "KN": "kN",
+    "Ohm": "ohm",
+    "Prozent": "%",
     "PS": "metric_horsepower",
     "hz": "Hz",
     "HZ": "Hz",
@@ -87,18 +96,28 @@ _JOINED = {
     "kgcm": "kg cm",
     "gmm": "g mm",
     "gcm": "g cm",
+    "gm": "g m",
+    "daNm": "daN m",
+    "kpm": "kgf m",
+    "kp": "kgf",
+    "lbm": "lb",
+    "mil": "thou",
+    "mils": "thou",
     "Pas": "Pa s",
     "mPas": "mPa s",
 }
-"""Products that are often written without a space. Without this list, pint would read "Nm" as `number_meter`, meters per
-gram."""
+"""Products that are often written without a space, and units that pint does not know. Without this list, pint would read "Nm"
+as `number_meter`, meters per gram, and "mil" as an angle."""
 
 _JOINED_PATTERN = re.compile(rf"(?<![^\W\d_])({'|'.join(_JOINED)})((?:\^|\*\*)\d|[²³])?(?![^\W\d_])")
 
 _PLAIN_POWER = re.compile(r"(?<=[^\W\d_])([23])(?!\w)")
 """Power of a unit without a sign, as in "kg m2"."""
 
-_KILOGRAM = re.compile(r"(?<![^\W\d])kg(?!\w)")
+_HYPHEN = re.compile(r"(?<=[^\W\d_])-(?=[^\W\d_])")
+"""Hyphen between the factors of a product, as in "lb-in"."""
+
+_MASS_UNIT = re.compile(r"(?<![^\W\d])(kg|lb|oz)s?(?!\w)")
 
 _AMBIGUOUS = (
     (re.compile(r"(?<![^\W\d_])grad(?![^\W\d_])", re.IGNORECASE), "degrees or gon; write deg or gon"),
@@ -271,14 +290,15 @@ def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
         return InputError(
             field, f"is {quoted(value)}, a deflection; write {under} with the mass (or force) that this spring carries"
         )
-    as_force = _KILOGRAM.sub("kgf", value)
+    as_force = _MASS_UNIT.sub(r"\1f", value)
     if unit and as_force != value:
         try:
             to_float(as_force, unit, field)
         except InputError:
             pass
         else:
-            return InputError(field, f"is {quoted(value)}; a kilogram is a mass; for the force write {quoted(as_force)}, or N")
+            mass = "a pound" if "lbf" in as_force else "an ounce" if "ozf" in as_force else "a kilogram"
+            return InputError(field, f"is {quoted(value)}; {mass} is a mass; for the force write {quoted(as_force)}, or N")
     wanted = "not a number with a unit" if unit is None else f"not in {unit}" if unit else "not a plain number"
     return InputError(
         field, f"is {quoted(value)}, which is {wanted}; write for example {_example('m' if unit is None else unit)}"
@@ -293,7 +313,7 @@ def _parsed(unit: str) -> Any:
         raise ValueError("a name with several meanings")
     if len(unit) > _MAX_UNIT_CHARACTERS or re.search(f"{_SIGN}|{_RAISED}", _POWER.sub("", unit)):
         raise ValueError("a long text, or a large power")
-    name = _PLAIN_POWER.sub(r"^\1", _SPELLINGS.get(unit, unit))
+    name = _PLAIN_POWER.sub(r"^\1", _HYPHEN.sub(" ", _SPELLINGS.get(unit, unit)))
     return pint.get_application_registry().Unit(
         _JOINED_PATTERN.sub(lambda found: f"({_JOINED[found[1]]}{found[2] or ''})", name) or "dimensionless"
     )
