@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -217,22 +217,34 @@ class Response(AbstractResponse, Result):
         names = ("speed", "amplitude", "phase", "foundation_force")
 
         def arrays(of: AbstractResponse) -> dict[str, np.ndarray]:
-            torques = {name: np.sum(np.asarray(getattr(of, name)), axis=1) for name in ("torque", "motor_torque")}
-            return {name: np.asarray(getattr(of, name)) for name in names} | torques
+            return {name: np.asarray(getattr(of, name)) for name in names} | {"torque": np.sum(np.asarray(of.torque), axis=1)}
 
         points = arrays(self.operating) | {"stable": np.asarray(self.operating.stable)}
+        points = {name: values[exists] for name, values in points.items()}
+        is_ideal = any(exciter.drive.ideal for exciter in self.scene.exciters)
         return response_chart(
             arrays(self),
-            {name: values[exists] for name, values in points.items()},
+            points,
             {"speed": np.asarray(folds.speed), "torque": np.asarray(folds.torque)},
             np.asarray(self.resonances),
             names=structure.coordinates,
             units=structure.units,
-            motors=0 if any(exciter.drive.ideal for exciter in self.scene.exciters) else len(self.scene.exciters),
+            motors=0 if is_ideal else len(self.scene.exciters),
+            motor={} if is_ideal else self._motor_curve(points),
             unit=unit,
             show=show,
             ax=ax,
         )
+
+    def _motor_curve(self, points: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the torque of all motors over the speed. The speeds of the response lie close together at resonances only;
+        those of the operating `points` let the curve pass through them."""
+        speed, torque = (np.asarray(each) for each in _common_torques(self.scene))
+        inside = speed <= np.max(self.speed)
+        speeds = np.concatenate([self.speed, speed[inside], points["speed"]])
+        torques = np.concatenate([np.sum(np.asarray(self.motor_torque), axis=1), torque[inside], points["torque"]])
+        order = np.argsort(speeds)
+        return {"speed": speeds[order], "torque": torques[order]}
 
 
 @validated

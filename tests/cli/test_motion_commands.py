@@ -378,6 +378,12 @@ def test_response_at_an_undamped_resonance_is_unbounded(typed, tmp_path):
     assert " unbounded " in out and " inf " in out
 
 
+def test_tables_of_a_response_with_a_large_peak_are_in_mm(typed, tmp_path):
+    (tmp_path / "table.toml").write_text(UNBALANCED.replace("damping = 600.0", "damping = 0.01"))
+    out = typed("response", "table.toml", "--points", "300")[1]
+    assert "y1, mm" in out and "y1, m " not in out
+
+
 def test_response_lists_operating_points_peaks_and_folds(typed, tmp_path):
     (tmp_path / "table.toml").write_text(UNBALANCED)
     motor = jv.NamePlateMotor("7.5 kW", "1460 rpm", breakdown_ratio=2.8, inertia=1.3, starting_ratio=2.2)

@@ -295,7 +295,7 @@ def test_a_response_ends_at_half_the_least_and_twice_the_most():
     force = np.array([2.0, 30.0, 100.0])
     curve = {"speed": np.arange(3.0), "amplitude": 1e-3 * np.array([[1e-7], [2.0], [1.0]]), "foundation_force": force}
     points = {**{name: each[:0] for name, each in curve.items()}, "stable": np.zeros(0, bool)}
-    about = {"names": ["y"], "units": ["m"], "motors": 0, "show": ["amplitude", "force"]}
+    about = {"names": ["y"], "units": ["m"], "motors": 0, "motor": {}, "show": ["amplitude", "force"]}
     axes = response_chart(curve, points, {}, np.zeros(0), **about).axes
     assert axes[1].get_ylim() == pytest.approx((1.0, 200.0))
     assert axes[0].get_ylim() == pytest.approx((4e-4, 4.0))  # mm, four decades

@@ -65,14 +65,14 @@ CURVE = {
     "phase": np.array([[0.0, np.nan], [3.0, 1.0], [-3.0, 2.0]]),
     "foundation_force": np.array([1.0, 4.0, 2.0]),
     "torque": np.array([0.0, 5.0, 3.0]),
-    "motor_torque": np.array([4.0, 3.0, 0.0]),
 }
 POINTS = {name: values[1:] for name, values in CURVE.items()} | {"stable": np.array([False, True])}
 FOLDS = {"speed": np.array([15.0]), "torque": np.array([2.5])}
+MOTOR = {"speed": SPEED, "torque": np.array([4.0, 3.0, 0.0])}
 
 
 def response(**options):
-    about = {"names": ["y", "tilt"], "units": ["m", "rad"], "unit": "rad/s", "motors": 1}
+    about = {"names": ["y", "tilt"], "units": ["m", "rad"], "unit": "rad/s", "motors": 1, "motor": MOTOR}
     return response_chart(CURVE, POINTS, FOLDS, np.array([0.0, 9.0, 21.0]), **{**about, **options}).axes
 
 
@@ -97,15 +97,15 @@ def test_a_response_has_its_amplitudes_phases_and_force():
     ("motor", "top"), [([4.0, 3.0, 0.0], 5.0), ([1.0, 0.5, 0.0], 5.0), ([8.0, 1.0, 0.0], 8.0), (None, 5.0)]
 )
 def test_the_torque_of_the_motor_bounds_the_axis(motor, top):
-    curve = CURVE if motor is None else CURVE | {"motor_torque": np.asarray(motor)}
     about = {
         "names": ["y", "tilt"],
         "units": ["m", "rad"],
         "unit": "rad/s",
         "motors": int(motor is not None),
+        "motor": {} if motor is None else MOTOR | {"torque": np.asarray(motor)},
         "show": ["torque"],
     }
-    (axis,) = response_chart(curve, POINTS, FOLDS, np.zeros(0), **about).axes
+    (axis,) = response_chart(CURVE, POINTS, FOLDS, np.zeros(0), **about).axes
     lines = named(axis)
     assert axis.get_ylim() == pytest.approx((-0.03 * top, 1.08 * top))
     assert lines["needed by the vibration"] == [[0.0, 0.0], [10.0, 5.0], [20.0, 3.0]]
@@ -116,7 +116,7 @@ def test_the_torque_of_the_motor_bounds_the_axis(motor, top):
 
 
 def test_the_axis_of_the_torque_contains_each_fold():
-    about = {"names": ["y", "tilt"], "units": ["m", "rad"], "motors": 1, "show": ["torque"]}
+    about = {"names": ["y", "tilt"], "units": ["m", "rad"], "motors": 1, "motor": MOTOR, "show": ["torque"]}
     for torque, scale in ((39.0, "linear"), (41.0, "log")):  # a motor of 4 N m
         (axis,) = response_chart(CURVE, POINTS, FOLDS | {"torque": np.array([torque])}, np.zeros(0), **about).axes
         assert axis.get_yscale() == scale and axis.get_ylim()[1] > torque
@@ -125,7 +125,7 @@ def test_the_axis_of_the_torque_contains_each_fold():
 def test_a_response_at_one_speed_is_a_point():
     curve, points = ({name: values[:1] for name, values in each.items()} for each in (CURVE | {"speed": SPEED[1:]}, POINTS))
     none = {name: values[:0] for name, values in points.items()}
-    about = {"names": ["y", "tilt"], "units": ["m", "rad"], "unit": "rad/s", "motors": 0}
+    about = {"names": ["y", "tilt"], "units": ["m", "rad"], "unit": "rad/s", "motors": 0, "motor": {}}
     lengths = response_chart(curve, none, {}, np.array([9.0]), **about).axes[0]
     assert named(lengths)["y"] == [[10.0, 1.0]] and lengths.lines[-1].get_marker() == "."
     assert lengths.get_ylim() == pytest.approx((0.5, 2.0))

@@ -133,7 +133,8 @@ def _text(
 
     unit, scale = speed_unit()
     structure = result.scene.machine.structure()
-    kinds = [shown_unit(each, float(np.max(result.amplitude[:, k]))) for k, each in enumerate(structure.units)]
+    # A peak of more than 1 m does not change the unit of the other rows.
+    kinds = [shown_unit(each, min(float(np.max(result.amplitude[:, k])), 0.999)) for k, each in enumerate(structure.units)]
     force_unit, force_scale = shown_unit("N", float(np.max(result.foundation_force)))
     moves = [f"{name}, {shown}" for name, (shown, _) in zip(structure.coordinates, kinds, strict=True)]
 

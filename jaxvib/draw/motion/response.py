@@ -43,6 +43,7 @@ def response_chart(
     names: Sequence[str],
     units: Sequence[str],
     motors: int,
+    motor: Arrays,
     unit: SpeedUnit | None = None,
     show: Sequence[str] = PARTS,
     ax: Onto = None,
@@ -52,12 +53,13 @@ def response_chart(
     **Arguments** (n speeds, nd coordinates)
 
     - `curve`: the arrays `speed` (n,), rad/s; `amplitude` (n, nd), m or rad; `phase` (n, nd), rad; `foundation_force` (n,), N;
-      `torque` (n,), which the vibration needs, and `motor_torque` (n,), N m
+      `torque` (n,), N m, which the vibration needs
     - `points`: the same arrays for the operating points, and the Boolean array `stable`
     - `folds`: `speed` and `torque` of the folds
     - `resonances` (k,), rad/s, drawn as dotted lines
     - `names` and `units` (nd,) of the coordinates; lengths are drawn in mm or µm, tilts in deg
     - `motors`: number of motors, whose torques are added in one curve; 0 for an ideal drive, which has no such curve
+    - `motor`: `speed` and `torque` of this curve, ascending in speed
     - `unit` of the speeds; `show`: names of panels; `ax`: axes to draw onto
 
     **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for an unknown panel.
@@ -65,7 +67,10 @@ def response_chart(
     if isinstance(show, str) or not show or any(name not in PARTS for name in show):
         raise InputError("show", f"is {quoted(show)}; it must be a list of {', '.join(PARTS)}")
     unit, scale = speed_unit(unit)
-    curve, points = ({**arrays, "speed": scale * arrays["speed"]} for arrays in (curve, points))
+    curve, points, folds, motor = (
+        {name: scale * values if name == "speed" else values for name, values in arrays.items()}
+        for arrays in (curve, points, folds, motor)
+    )
     last = float(np.max(curve["speed"]))
     resonances = scale * resonances
     resonances = resonances[(resonances > 0.0) & (resonances <= last)]
@@ -92,7 +97,7 @@ def response_chart(
             _line(axis, curve, points, curve["foundation_force"], points["foundation_force"], look)
             axis.set_ylabel("force, N")
         else:
-            _torque(axis, curve, points, folds, scale, motors)
+            _torque(axis, curve, points, folds, motors, motor)
             axis.set_ylabel("torque, N m")
         if name in ("amplitude", "force"):
             _logarithmic(axis)
@@ -108,9 +113,8 @@ def _line(axis: Axes, curve: Arrays, points: Arrays, line: np.ndarray, at_points
         axis.plot([x], [y], "o", ms=5.0, mfc=look["color"] if stable else "white", mec=look["color"], zorder=4)
 
 
-def _torque(axis: Axes, curve: Arrays, points: Arrays, folds: Arrays, scale: float, motors: int) -> None:
-    """Draw the torque that the vibration needs, the torque of the motors, the operating points and the folds, whose speeds are
-    drawn times `scale`."""
+def _torque(axis: Axes, curve: Arrays, points: Arrays, folds: Arrays, motors: int, motor: Arrays) -> None:
+    """Draw the torque that the vibration needs, the torque of the motors, the operating points and the folds."""
     look = {"color": COLORS[0], "label": "needed by the vibration"}
     _line(axis, curve, points, curve["torque"], points["torque"], look)
     if points["speed"].size:
@@ -119,13 +123,12 @@ def _torque(axis: Axes, curve: Arrays, points: Arrays, folds: Arrays, scale: flo
     finite = curve["torque"][np.isfinite(curve["torque"])]
     top = float(np.max(finite, initial=0.0))
     if motors:
-        motor = curve["motor_torque"]
         label = "of the motor" if motors == 1 else "of all motors"
-        axis.plot(curve["speed"], motor, color=COLORS[1], ls=STROKES[1], label=label)
+        axis.plot(motor["speed"], motor["torque"], color=COLORS[1], ls=STROKES[1], label=label)
         if np.any(np.isfinite(folds["speed"])):
             look = {"ms": 5.0, "mfc": "white", "mec": COLORS[4], "label": "fold: the speed jumps"}
-            axis.plot(scale * folds["speed"], folds["torque"], "D", **look)
-        drives = float(np.max(motor))
+            axis.plot(folds["speed"], folds["torque"], "D", **look)
+        drives = float(np.max(motor["torque"]))
         markers = np.concatenate([points["torque"], folds["torque"]])
         top = max(drives, min(top, 3.0 * drives), float(np.max(markers[np.isfinite(markers)], initial=0.0)))
         if top > _MAX_TORQUE_RATIO * drives > 0.0:
