@@ -199,7 +199,8 @@ class Synthesis(Result):
       the best design
     - `designs` (starts, d) in [0, 1]: the final design of each search; `values` (starts,): its objective, infinite for a design
       that does not meet all demands; `done` (starts,): True if the search converged
-    - `history` (steps, starts): the objective after each step of the descent and of the polishing
+    - `history` (steps, starts): the objective after each step of the descent and of the polishing; `history_violation`
+      (steps, starts): the largest relative violation of demands and kept quantities
     - `objective` and `unit`: name and unit of the objective
     """
 
@@ -218,6 +219,7 @@ class Synthesis(Result):
     values: np.ndarray = eqx.field(metadata=in_unit("", "start"))
     done: np.ndarray = eqx.field(metadata=in_unit("", "start"))
     history: np.ndarray = eqx.field(metadata=in_unit("", "iteration", "start"))
+    history_violation: np.ndarray = eqx.field(metadata=in_unit("", "iteration", "start"))
     objective: str
     unit: str
     kkt: float = math.nan
@@ -326,14 +328,18 @@ class Synthesis(Result):
     def plot_convergence(self, *, ax: Axes | None = None) -> Drawn:
         """Plot the objective of every start over the iterations.
 
+        The descent allows violations, and its long steps overshoot: the objective may increase, until the polishing at the end.
+        Designs that do not meet the demands are dashed.
+
         **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.charts import convergence
+        from optimize.search.polish import MAX_VIOLATION
 
         best = int(np.argmin(self.values)) if np.any(np.isfinite(self.values)) else 0
         unit, factor = shown_unit(self.unit, float(np.max(np.abs(self.history), initial=0.0, where=np.isfinite(self.history))))
         label = f"{self.objective.replace('_', ' ')}, {unit}".rstrip(", ")
-        return convergence(factor * self.history, best=best, label=label, ax=ax)
+        return convergence(factor * self.history, self.history_violation < MAX_VIOLATION, best=best, label=label, ax=ax)
 
 
 def _align_columns(rows: Sequence[Sequence[str]]) -> list[list[str]]:

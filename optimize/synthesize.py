@@ -227,7 +227,8 @@ def _describe_searches(result: SearchResult, space: DesignSpace) -> tuple[Synthe
             "designs": z,
             "values": result.feasible_values,
             "done": done,
-            "history": result.history,
+            "history": result.history[..., 0],
+            "history_violation": result.history[..., 1],
             "kkt": float(result.optimality.kkt[best]),
         },
     )

@@ -92,7 +92,8 @@ def tiers():
 def synthesis():
     outcome = Outcome({"machine.stiffness": [4e4]}, True, 27.0, (1e-3,), 100.0, 1e5)
     rest = dict(unverified="not requested", starts=2, drawn=9, converged=1, same=1, objective="amplitude", unit="m")
-    found = dict(designs=np.zeros((2, 1)), values=np.ones(2), done=np.array([True, False]), history=np.ones((3, 2)))
+    found = dict(designs=np.zeros((2, 1)), values=np.ones(2), done=np.array([True, False]))
+    found |= dict(history=np.ones((3, 2)), history_violation=np.zeros((3, 2)))
     told = dict(
         status=SynthesisStatus.done,
         kkt=1e-9,

@@ -280,7 +280,8 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
     axis.set(xscale="log", xlim=(low**1.1, high**1.1), ylim=(-0.6, len(rows) - 0.4))
     axis.set_yticks(places, [name for name, _, _ in rows])
     log_ticks(axis, "x")
-    axis.set_xlabel("after / before; amplitudes and forces zero to peak, strokes peak to peak")
+    strokes = ", strokes peak to peak" if any("stroke" in name for name, _, _ in rows) else ""
+    axis.set_xlabel(f"after / before; amplitudes and forces zero to peak{strokes}")
     axis.text(1.02, 1.0, "before → after", va="bottom", fontsize=9, fontweight="bold", transform=axis.transAxes)
     if title:
         axis.set_title(title, loc="left", pad=24.0, fontsize="medium")
@@ -292,16 +293,20 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
     return figure if ax is None else ax
 
 
-def convergence(history: np.ndarray, *, best: int, label: str, ax: Axes | None = None) -> Drawn:
-    """Draw the objective of every start (iterations, starts) over the iterations, with the start of index `best` in bold."""
+def convergence(history: np.ndarray, is_met: np.ndarray, *, best: int, label: str, ax: Axes | None = None) -> Drawn:
+    """Draw the objective of every start (iterations, starts) over the iterations, with the start of index `best` in bold where
+    `is_met`, True (iterations, starts) for designs that meet the demands; elsewhere it is dashed."""
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     axis.plot(history, color=GUIDE, lw=0.5, alpha=0.5)
     axis.plot([], [], color=GUIDE, lw=0.8, label="other starts")
-    axis.plot(history[:, best], color=COLORS[1], lw=2.0, label="best start")
+    value, met = history[:, best], is_met[:, best]
+    axis.plot(np.where(met, value, np.nan), color=COLORS[1], lw=2.0, label="best start")
+    if not np.all(met):
+        axis.plot(value, color=COLORS[1], lw=1.0, ls="--", label="best start, before it meets the demands")
     if np.nanmin(history) > 0.0:
         axis.set_yscale("log")
         log_ticks(axis)
-    axis.set(xlabel="iteration", ylabel=label)
+    axis.set(xlabel="iteration (descent, then polishing)", ylabel=label)
     legend_above(axis)
     return figure if ax is None else ax
 

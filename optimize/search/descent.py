@@ -54,7 +54,8 @@ class _SearchState(NamedTuple):
 
 
 class Descended(NamedTuple):
-    """Result of the descent: a `Point`, the multipliers of the demands and the history of the objective (steps, starts)."""
+    """Result of the descent: a `Point`, the multipliers of the demands and the history (steps, starts, 2) of the objective and
+    the largest violation."""
 
     point: Point
     multipliers: np.ndarray
@@ -134,7 +135,8 @@ def _step(problem: Problem, state: _SearchState, rate: Array) -> tuple[_SearchSt
         z, values, slopes, speeds, speed_slopes, adam, length, multipliers, weight,
         jnp.where(update, worst, state.worst), state.scale, state.steps + 1,
     )  # fmt: skip
-    return state, values[0]
+    violation = jnp.maximum(worst, jnp.max(jnp.abs(values[1 : 1 + m]), initial=0.0))
+    return state, jnp.stack([values[0], violation])
 
 
 def _extrapolate(speeds: Array, speed_slopes: Array, step: Array) -> Array:
@@ -148,7 +150,7 @@ def _run_steps(problem: Problem, states: _SearchState, rates: Array) -> tuple[_S
         return mapped(lambda state: _step(problem, state, rate), one_by_one=problem.forward_only)(states)
 
     states, history = jax.lax.scan(step, states, rates)
-    return states, history.T
+    return states, history.swapaxes(0, 1)
 
 
 def descend(problem: Problem, point: Point, steps: int, rate: float, report: Callable[[float, Point], None]) -> Descended:
@@ -174,7 +176,7 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, report: Cal
         history.append(values)
         report((k + 1) / len(rates), _point(states))
     values = np.concatenate(history, axis=1)[:, :steps]
-    return Descended(_point(states), states.multipliers, values.T)
+    return Descended(_point(states), states.multipliers, values.swapaxes(0, 1))
 
 
 def _point(states: _SearchState) -> Point:

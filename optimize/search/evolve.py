@@ -39,9 +39,9 @@ _MERIT_WITHOUT_OBJECTIVE = 1e12
 class Evolved(NamedTuple):
     """Result of an evolution.
 
-    **Attributes**: `point`: the best distinct designs, None if the objective exists for no design; `history` (g, 1): the best
-    objective of each generation; `drawn`: number of computed designs; `existing`: number of these for which the objective
-    exists; `interrupted`: True if the user interrupted the search.
+    **Attributes**: `point`: the best distinct designs, None if the objective exists for no design; `history` (g, 1, 2): the
+    objective and the largest violation of the best design of each generation; `drawn`: number of computed designs; `existing`:
+    number of these for which the objective exists; `interrupted`: True if the user interrupted the search.
     """
 
     point: Point | None
@@ -138,7 +138,8 @@ def evolve(problem: Problem, evaluations: int, seed: int, report: Callable[[floa
                 )
                 strategy.tell(list(samples), list(merit))
                 merits, designs = _best(np.concatenate([merits, merit]), np.concatenate([designs, z]))
-                history.append(float(values[np.argmin(merit), 0]))
+                least = np.argmin(merit)
+                history.append((values[least, 0], np.max(problem.violations(values)[least], initial=0.0)))
                 report(
                     drawn / evaluations, merits[0] * size if len(merits) and merits[0] < _MERIT_WITHOUT_OBJECTIVE else np.nan
                 )
@@ -147,7 +148,7 @@ def evolve(problem: Problem, evaluations: int, seed: int, report: Callable[[floa
         interrupted = True
     designs = designs[merits < _MERIT_WITHOUT_OBJECTIVE]
     point = evaluate(problem, designs, find_speeds(problem, designs)) if len(designs) else None
-    return Evolved(point, np.asarray(history).reshape(-1, 1), drawn, existing, interrupted)
+    return Evolved(point, np.asarray(history).reshape(-1, 1, 2), drawn, existing, interrupted)
 
 
 def _best(merits: np.ndarray, designs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

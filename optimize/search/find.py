@@ -15,7 +15,7 @@ from optimize.quantities.cases import Robust
 from optimize.quantities.quantity import walk
 from optimize.search.descent import descend
 from optimize.search.evolve import evolve, require_cma
-from optimize.search.polish import MAX_VIOLATION, Optimality, Polished, draw_starts, optimality, polish, violation
+from optimize.search.polish import MAX_VIOLATION, Optimality, Polished, draw_starts, optimality, polish, progress_at, violation
 from optimize.search.problem import Point, Problem, evaluate, find_speeds
 from optimize.space import Choice, DesignSpace
 
@@ -174,7 +174,7 @@ def _search_from_starts(problem: Problem, options: Options, report: Progress) ->
             point = point.take(_distinct(point, violation(problem, point))[:_STARTS_WITH_RUNS])
     if point is None or len(point.z) == 0:
         return None
-    history.append(point.values[None, :, 0])
+    history.append(progress_at(problem, point)[None])
     initial = last = point
 
     def progress_of(what: str, low: float, high: float) -> Callable[[float, Point], None]:
@@ -202,7 +202,7 @@ def _search_from_starts(problem: Problem, options: Options, report: Progress) ->
     bounds = np.asarray(problem.space.low), np.asarray(problem.space.high)
     # The history of an evolution has one column; that of the polishing has one column for each start.
     width = max(part.shape[1] for part in history)
-    joined = np.concatenate([np.broadcast_to(part, (len(part), width)) for part in history])
+    joined = np.concatenate([np.broadcast_to(part, (len(part), width, 2)) for part in history])
     return SearchResult(*polished._replace(history=joined), drawn, existing, interrupted, bounds)
 
 

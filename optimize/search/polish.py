@@ -74,8 +74,8 @@ class Optimality(NamedTuple):
 class Polished(NamedTuple):
     """Results of searches.
 
-    **Attributes**: the final `point`; `history` (steps, starts) of the objective; `remaining_decrease` of the objective that
-    the model still predicts, relative; the largest `violation`; the `optimality`.
+    **Attributes**: the final `point`; `history` (steps, starts, 2) of the objective and the largest violation;
+    `remaining_decrease` of the objective that the model still predicts, relative; the largest `violation`; the `optimality`.
     """
 
     point: Point
@@ -89,6 +89,11 @@ def violation(problem: Problem, point: Point) -> np.ndarray:
     """Return the largest relative violation (s,) of held quantities and demands; infinite for designs whose quantities do not
     exist."""
     return np.where(point.exists(), np.max(problem.violations(point.values), axis=1, initial=0.0), np.inf)
+
+
+def progress_at(problem: Problem, point: Point) -> np.ndarray:
+    """Return an entry of a history: the objective and the largest violation (s, 2) of designs."""
+    return np.stack([point.values[:, 0], violation(problem, point)], axis=1)
 
 
 def restore(
@@ -209,7 +214,7 @@ def polish(problem: Problem, point: Point, steps: int, report: Callable[[float, 
     violation does not vanish at the largest penalty, the constraints contradict each other.
     """
     searches = _begin(problem, point)
-    history = [searches.point.values[:, 0]]
+    history = [progress_at(problem, searches.point)]
     for k in range(steps + 1):
         index = np.flatnonzero(searches.active)
         if len(index):
@@ -218,7 +223,7 @@ def polish(problem: Problem, point: Point, steps: int, report: Callable[[float, 
             if k == steps:
                 break
             _move(problem, searches, index, here, models, penalty_is_small)
-        history.append(searches.point.values[:, 0])
+        history.append(progress_at(problem, searches.point))
         report(min(k + 1, steps) / max(steps, 1), searches.point)
     point = searches.point
     return Polished(

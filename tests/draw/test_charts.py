@@ -324,4 +324,6 @@ def test_bars_of_changes_lie_inside_their_axis():
     (axis, *_) = before_after([("force, N", 100.0, 2.0), ("power, W", 1.0, 30.0)]).axes
     low, high = axis.get_xlim()
     assert low < 0.02 and high > 30.0
-    assert axis.get_xlabel().endswith("zero to peak, strokes peak to peak")
+    assert axis.get_xlabel().endswith("zero to peak")
+    with_stroke = before_after([("stroke (at = 2), mm", 2.0, 3.0)]).axes[0]
+    assert with_stroke.get_xlabel().endswith("zero to peak, strokes peak to peak")

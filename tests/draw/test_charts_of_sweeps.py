@@ -161,6 +161,12 @@ def test_a_front_is_a_line_of_numbered_machines():
 @pytest.mark.parametrize(("least", "scale"), [(1.0, "log"), (0.0, "linear"), (-1.0, "linear")])
 def test_convergence_has_the_best_start_in_bold(least, scale):
     history = np.array([[5.0, 4.0], [3.0, least], [np.nan, least]])
-    axis = convergence(history, best=1, label="force, N").axes[0]
-    bold = next(line for line in axis.lines if line.get_label() == "best start")
-    assert bold.get_ydata().tolist() == [4.0, least, least] and axis.get_yscale() == scale
+    is_met = np.array([[True, False], [True, True], [True, True]])
+    axis = convergence(history, is_met, best=1, label="force, N").axes[0]
+    lines = {line.get_label(): line for line in axis.lines}
+    np.testing.assert_array_equal(lines["best start"].get_ydata(), [np.nan, least, least])
+    dashed = lines["best start, before it meets the demands"]
+    assert dashed.get_ydata().tolist() == [4.0, least, least] and dashed.get_linestyle() == "--"
+    assert axis.get_yscale() == scale
+    always = convergence(history, np.ones((3, 2), bool), best=1, label="force, N").axes[0]
+    assert [line.get_label() for line in always.lines].count("best start, before it meets the demands") == 0

@@ -120,9 +120,11 @@ def test_figures_show_the_results(searched, monkeypatch):
     dataclasses.replace(searched, table=(Row("a", "N/m", 500.0, 2e3, math.nan, math.nan),)).plot()
     assert shown["before_after"] == (([("a, N/mm", 0.5, 2.0)],), {"title": "search for least off by", "ax": None})
     history, values = np.array([[5e4, math.nan, 7e4], [3e4, 1e4, 2e4]]), np.array([3e4, 1e4, math.inf])
-    dataclasses.replace(searched, values=values, history=history, objective="peak_force").plot_convergence()
-    (drawn,), how = shown["convergence"]
+    histories = {"history": history, "history_violation": np.array([[0.0, 0.1, 0.0], [0.0, 0.0, 0.2]])}
+    dataclasses.replace(searched, values=values, **histories, objective="peak_force").plot_convergence()
+    (drawn, met), how = shown["convergence"]
     np.testing.assert_allclose(drawn, history / 1e3)
+    assert met.tolist() == [[True, False, True], [True, True, False]]
     assert how == {"best": 1, "label": "peak force, kN", "ax": None}
     front = Front(values=np.array([[0.5, 2e4], [0.25, 3e4]]), names=("one", "two"), units=("m", "N"), machines=("", ""))
     front.plot()

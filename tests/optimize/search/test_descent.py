@@ -75,13 +75,14 @@ def test_the_descent_is_adam_with_an_augmented_lagrangian():
 
     for k, start in enumerate(starts):
         z, multipliers, history = adam(value, slope, excess, rows, start)
-        np.testing.assert_allclose(found.history[:, k], history, rtol=1e-5)
+        np.testing.assert_allclose(found.history[:, k, 0], history, rtol=1e-5)
+        np.testing.assert_allclose(found.history[-1, k, 1], max(0.0, *excess(z)), rtol=1e-3, atol=1e-5)
         np.testing.assert_allclose(found.point.z[k], z, atol=1e-6)
         np.testing.assert_allclose(found.multipliers[k], multipliers, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(found.point.slopes[k, 0], slope(z), rtol=1e-4, atol=1e-5)
-    assert found.history.shape == (STEPS, 2)
+    assert found.history.shape == (STEPS, 2, 2)
     assert [share for share, _ in told] == [0.5, 1.0]
-    np.testing.assert_array_equal(told[0][1], found.history[STEPS_PER_CALL - 1])
+    np.testing.assert_array_equal(told[0][1], found.history[STEPS_PER_CALL - 1, :, 0])
 
 
 def test_step_to_a_missing_objective_is_rejected():
@@ -95,7 +96,7 @@ def test_step_to_a_missing_objective_is_rejected():
     found = run(problem, start)
     nothing = lambda z: np.zeros(0)  # noqa: E731
     z, _, history = adam(lambda z: edge(*(1.0 + 8.0 * z)), slope, nothing, lambda z: np.zeros((0, 2)), start[0])
-    np.testing.assert_allclose(found.history[:, 0], history, rtol=1e-5)
+    np.testing.assert_allclose(found.history[:, 0, 0], history, rtol=1e-5)
     np.testing.assert_allclose(found.point.z[0], z, atol=1e-6)
     assert np.sum(np.diff(history) == 0.0) > 3  # there were such steps
 

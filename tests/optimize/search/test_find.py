@@ -104,12 +104,14 @@ def test_search_reports_progress_and_history():
     assert shares == sorted(shares) and ("descending, best 2.063", 0.7) in told and told[-1] == ("polishing, best 2", 0.9)
     random = np.random.default_rng(0).uniform(size=(4, 2))
     starts = 1.0 + 8.0 * random
-    np.testing.assert_allclose(found.history[0], np.sum((starts - [6.0, 5.0]) ** 2, axis=1) + 2.0, rtol=1e-12)
+    np.testing.assert_allclose(found.history[0, :, 0], np.sum((starts - [6.0, 5.0]) ** 2, axis=1) + 2.0, rtol=1e-12)
     assert len(found.history) >= 1 + 25 + 2 and found.drawn == found.existing == 4 and not found.interrupted
-    np.testing.assert_allclose(found.history[-1], 2.0, rtol=1e-12)
+    np.testing.assert_allclose(found.history[-1, :, 0], 2.0, rtol=1e-12)
     np.testing.assert_array_equal(found.bounds, BOUNDS)
     begun = find(problem, Options(4, 0, 25, 0.05, 8, begin=np.array([[0.1, 0.2], [0.3, 0.9]])), lambda *_: None)
-    np.testing.assert_allclose(begun.history[0], [(1.8 - 6.0) ** 2 + (2.6 - 5.0) ** 2 + 2.0, 2.6**2 + 3.2**2 + 2.0], rtol=1e-12)
+    np.testing.assert_allclose(
+        begun.history[0, :, 0], [(1.8 - 6.0) ** 2 + (2.6 - 5.0) ** 2 + 2.0, 2.6**2 + 3.2**2 + 2.0], rtol=1e-12
+    )
     assert begun.drawn == begun.existing == 2
     nowhere = problem_of(DesignSpace(SCENE, FREE), plain("no", lambda x, y: x * np.nan), [], 4)
     assert find(nowhere, OPTIONS, lambda *_: None) is None
@@ -126,7 +128,7 @@ def test_searches_with_runs_descend_from_the_eight_best_starts():
     assert found.drawn == found.existing == 20 and found.history.shape[1] == 8
     random = 1.0 + 8.0 * np.random.default_rng(0).uniform(size=(20, 2))
     best = np.sort(np.sum((random - [6.0, 5.0]) ** 2, axis=1))[:8] + 2.0
-    np.testing.assert_allclose(found.history[0], best, rtol=1e-12)
+    np.testing.assert_allclose(found.history[0, :, 0], best, rtol=1e-12)
     np.testing.assert_allclose(found.point.values[:, 0], 2.0, rtol=1e-12)
     # 20 designs are drawn; 8 take 25 steps of descent and 8 steps of polishing with 6 designs each.
     np.testing.assert_allclose(told[1][1], 0.9 * 220.0 / 604.0, rtol=1e-12)
@@ -146,7 +148,7 @@ def test_costly_objectives_start_from_nominal_optima():
     assert found.drawn == found.existing == 4 and len(found.point.z) == 16  # the best one, and random ones beside it
     random = np.random.default_rng(0).uniform(size=(16, 2))
     begun = evaluate(problem, np.concatenate([[[0.625, 0.5]], random])[:16], ())
-    np.testing.assert_allclose(found.history[0], begun.values[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(found.history[0, :, 0], begun.values[:, 0], rtol=1e-6)
     np.testing.assert_allclose(found.point.z[found.best], [0.625, 0.5], atol=0.01)
 
 
