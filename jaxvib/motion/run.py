@@ -44,6 +44,7 @@ from jaxvib.motion.analysis.points import (
     peak_time_text,
     require_turns,
     require_vibration,
+    samples_of,
     vibration_of,
 )
 from jaxvib.motion.analysis.regime import STILL_SHARE, Regime, balancing_time_text, regime
@@ -59,7 +60,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.measures import VibrationMeasures
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.steady.points import Harmonic, PathsOfPoints
-from jaxvib.steady.vibration import Vibration
+from jaxvib.steady.vibration import Samples, Vibration
 from jaxvib.units import Number
 from jaxvib.units.known import when_known
 
@@ -462,6 +463,11 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         when_known(require_turns, self.window.time, self.omega)
         amplitude, rest = fit_harmonic(self.window.time, self.window.state.displacement, self.omega)
         return Harmonic(self.scene.machine, self.omega, amplitude, rest)
+
+    def samples(self) -> Samples:
+        """Return samples of the motion in the window. **Raises** `InputError` for a batch of runs."""
+        self.require_single()
+        return samples_of(self.scene, self.window)
 
     @property
     def no_vibration(self) -> str:

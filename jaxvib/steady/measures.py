@@ -25,7 +25,6 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.plane_body import PlaneBody, PlaneNetwork
 from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.machine.validation import validate_scene
-from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit, names_along
@@ -34,7 +33,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import Jam
 from jaxvib.steady.jams.phases import PhaseJam
 from jaxvib.steady.orbits.describe import Orbit
-from jaxvib.steady.points import at_positive_speed, ellipse_at, read_slope, require_amplitudes, rows_in_plane
+from jaxvib.steady.points import at_positive_speed, path_at, read_slope, require_amplitudes, rows_in_plane
 from jaxvib.steady.vibration import Samples, Vibration, half_range, peak_acceleration, peak_forces, rms_velocity
 from jaxvib.steady.zone import vibration_zone
 from jaxvib.units import Number, number
@@ -85,16 +84,15 @@ class VibrationMeasures(Readable):
     - `static_load` (ns,), N: weight that each support carries, negative if the support pulls the foundation up
     - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on a support
     - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive, see `Vibration`
-    - `point` (2,), m, of a body in a plane, and the motion of this point: `point_stroke`, m peak to peak along the long axis of
+    - `point` (2,), m, of a body in a plane, and the motion of this point: `point_stroke`, m peak to peak, the largest extent of
       its path; `point_acceleration`, g, `throw_angle`, rad, and `throw_number`, see `Ellipse`; `conveying_speed`, m/s, the
       estimate of `jaxvib.conveying_speed`. If several points were requested, these have a leading axis. For other machines they
       are None
     - `throughput`, kg/s, at the `point`; None if no `layer` was given
     - `coordinates` (nt,): names of the coordinates, and `directions` of the force on the foundation
 
-    For a run these are those of the whole motion in its window, with all its frequencies, except for `throw_angle` and
-    `conveying_speed`, which are those of the harmonic at `speed`. The throw number of a run is its largest acceleration toward
-    the deck's lower side, divided by the component of g in this direction.
+    For a run these are those of the whole motion in its window, with all its frequencies, except for
+    `conveying_speed`, which is that of the harmonic at `speed`.
 
     `static_deflection` and `static_load` are NaN if the supports cannot carry the weight, if the directions of the coordinates
     are unknown, and for a rotor without the effect `Gravity`, whose axis may be vertical. `dynamic_load`, `side_load`, and
@@ -405,24 +403,15 @@ def _measures_at(scene: Scene, motion: Vibration, place: Place, slope: Array) ->
     """Return the measures of a point of a body in a plane by the names of their fields."""
     displacement, w = at_positive_speed(motion.displacement, motion.speed)
     rows = rows_in_plane(scene.machine, place)
-    amplitude = rows @ displacement
-    path = ellipse_at(amplitude, w, slope, jnp.zeros_like(w))
-    stroke, acceleration, throw = 2.0 * path.semi_major, path.acceleration, path.throw_number
-    if motion.samples is not None:
-        long_axis = jnp.stack([jnp.cos(path.direction), jnp.sin(path.direction)])
-        stroke = 2.0 * half_range(motion.samples.displacement @ (long_axis @ rows))
-        across, up = (motion.samples.acceleration @ rows.T / STANDARD_GRAVITY).T
-        acceleration = sampled_maximum(magnitude(across + 1j * up), axis=0)
-        away = jnp.sin(slope) * across - jnp.cos(slope) * up  # a deck that accelerates downward throws its material
-        throw = sampled_maximum(jnp.maximum(away, 0.0), axis=0) / jnp.cos(slope)
+    path = path_at(rows, displacement, w, slope, motion.samples, jnp.zeros_like(w))
     at = place.at if isinstance(place, BodyPoint) else place
     return {
         "point": jnp.zeros(2, motion.amplitude.dtype) if at is None else jnp.asarray(at, motion.amplitude.dtype),
-        "point_stroke": stroke,
-        "point_acceleration": acceleration,
+        "point_stroke": path.stroke,
+        "point_acceleration": path.acceleration,
         "throw_angle": path.direction,
-        "throw_number": throw,
-        "conveying_speed": conveying_speed_at(amplitude, w, slope),
+        "throw_number": path.throw_number,
+        "conveying_speed": conveying_speed_at(rows @ displacement, w, slope),
     }
 
 

@@ -7,6 +7,7 @@ q = Re(Y e^{i w t}), the point moves on the ellipse with the complex amplitudes 
 from __future__ import annotations
 
 import abc
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -20,12 +21,14 @@ from jaxvib.boundary import validated
 from jaxvib.display import GRAVITIES, Axes, Drawn, quantity_text
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Machine, Place, on_body, read_place
+from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.readable import Readable
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.vibration import Samples, largest_extent
 from jaxvib.units import Number, known_number, number, numbers
 from jaxvib.units.known import require_finite, require_if_known, when_known
 from jaxvib.units.reading import STANDARD_GRAVITY
@@ -39,20 +42,28 @@ def _rounding(semi_axis: Array) -> float:
     return max(1e-12, 8.0 * float(jnp.finfo(semi_axis.dtype).eps))
 
 
+_SHOWN_DIFFERENCE = 1e-3
+"""Relative difference between the stroke and the long axis of an ellipse above which texts state the stroke, too."""
+
+
 class Ellipse(Readable):
-    """Path of a point that vibrates at one speed.
+    """Path of a point that vibrates at one speed w, with measures of the whole path of runs and exact motions.
 
     **Attributes**
 
-    - `semi_major` a, m; typical: 1 to 10 mm for screens and feeders
+    - `semi_major` a, m, of the ellipse on which the point moves at the speed w; typical: 1 to 10 mm for screens and feeders
     - `semi_minor` b, m, positive if the point turns anticlockwise, negative if it turns clockwise, 0 on a straight line
-    - `direction` of the long axis, rad from x anticlockwise, above -pi/2 and at most pi/2; the throw angle of a point that
-      moves on a straight line. The direction is 0 for a circle, which has no long axis
-    - `acceleration`, in g: w^2 a / g, with g = 9.80665 m/s^2; typical: 3 to 6
-    - `throw_number`: the amplitude of the acceleration perpendicular to the deck, divided by the component of g in this
-      direction; typical: 2 to 5
+    - `stroke`, m peak to peak: largest extent of the path in any direction; 2 a for averaged motions
+    - `direction` of the stroke, rad from x anticlockwise, above -pi/2 and at most pi/2; the throw angle of a point that moves
+      on a straight line. The direction is 0 for a circle, which has no long axis
+    - `acceleration`, in g: the largest one, with g = 9.80665 m/s^2; w^2 a / g for averaged motions; typical: 3 to 6
+    - `throw_number`: the largest acceleration perpendicular to the deck, toward its lower side, divided by the component of g
+      in this direction; typical: 2 to 5
     - `remainder`: root-mean-square displacement that is not on the ellipse, relative to the root-mean-square displacement on
       it; 0 for averaged motions
+
+    `stroke`, `direction`, `acceleration` and `throw_number` of an exact motion, and of a run in its window, are those of the
+    whole motion with all its frequencies.
 
     >>> import jax.numpy as jnp
     >>> path = ellipse_of(jnp.array([0.003 + 0.0j, 0.003 + 0.0j]), 100.0)        # 3 mm in x and in y, in phase
@@ -62,6 +73,7 @@ class Ellipse(Readable):
 
     semi_major: Array = eqx.field(metadata=in_unit("m"))
     semi_minor: Array = eqx.field(metadata=in_unit("m"))
+    stroke: Array = eqx.field(metadata=in_unit("m"))
     direction: Array = eqx.field(metadata=in_unit("rad"))
     acceleration: Array = eqx.field(metadata=in_unit(GRAVITIES))
     throw_number: Array = eqx.field(metadata=in_unit(""))
@@ -87,6 +99,8 @@ class Ellipse(Readable):
         along = "a circle" if bool(self.is_circle) else f"long axis at {angle:.4g} deg"
         numbers = f"{float(self.acceleration):.4g} g, throw number {throw:.4g}"
         rest = f", remainder {float(self.remainder):.2g}" if float(self.remainder) > 0.0 else ""
+        if abs(float(self.stroke) / (2.0 * float(self.semi_major)) - 1.0) > _SHOWN_DIFFERENCE:
+            axes += f", stroke {quantity_text(self.stroke, 'm', 4)} peak to peak"
         return f"{axes}, {along}, {numbers}{rest}"
 
 
@@ -146,10 +160,29 @@ def ellipse_at(amplitude: Array, speed: Array, slope: Array, remainder: Array) -
     return Ellipse(
         semi_major=long,
         semi_minor=short,
+        stroke=2.0 * long,
         direction=0.5 * jnp.arctan2(product.imag, product.real),
         acceleration=factor * long,
         throw_number=factor * normal / jnp.cos(slope),
         remainder=jnp.asarray(remainder, long.dtype),
+    )
+
+
+def path_at(rows: Array, amplitude: Array, speed: Array, slope: Array, samples: Samples | None, remainder: Array) -> Ellipse:
+    """Return the path of the point with the `rows` (2, nd): the ellipse of the complex amplitudes (nd,) at the `speed`, with the
+    measures of the whole motion if there are `samples` of it."""
+    path = ellipse_at(rows @ amplitude, speed, slope, remainder)
+    if samples is None:
+        return path
+    extent = largest_extent(samples.displacement @ rows.T)
+    across, up = (samples.acceleration @ rows.T / STANDARD_GRAVITY).T
+    away = jnp.sin(slope) * across - jnp.cos(slope) * up  # a deck that accelerates downward throws its material
+    return dataclasses.replace(
+        path,
+        stroke=extent.stroke,
+        direction=extent.direction,
+        acceleration=sampled_maximum(magnitude(across + 1j * up), axis=0),
+        throw_number=sampled_maximum(jnp.maximum(away, 0.0), axis=0) / jnp.cos(slope),
     )
 
 
@@ -230,6 +263,10 @@ class PathsOfPoints(eqx.Module):
     def harmonic(self) -> Harmonic:
         """Return the vibration of the coordinates at the speed of the exciters."""
 
+    def samples(self) -> Samples | None:
+        """Return samples of the whole motion with all its frequencies; None for a motion that is known at one speed only."""
+        return None
+
     @validated
     def ellipse(self, at: int | Number | Sequence[Number] | None = None, body: int = 0, *, slope: Number = 0.0) -> Ellipse:
         """Return the path of a point, see `Ellipse`.
@@ -246,7 +283,7 @@ class PathsOfPoints(eqx.Module):
         """
         motion = self.harmonic()
         place = on_body(read_place(at), motion.machine.require_body(body))
-        return _ellipse(motion, place, read_slope(slope))
+        return _ellipse(motion, self.samples(), place, read_slope(slope))
 
     @validated
     def deck(self, points: Sequence[Sequence[Number]], body: int = 0, *, slope: Number = 0.0) -> Deck:
@@ -262,7 +299,7 @@ class PathsOfPoints(eqx.Module):
             raise InputError("points", f"is {quoted(points)}; it must be a list of points, [(x, y), ...]")
         places = jnp.stack([numbers(point, "m", f"points[{k}]", 2) for k, point in enumerate(points)])
         motion = self.harmonic()
-        return _deck(motion, places, read_slope(slope), motion.machine.require_body(body))
+        return _deck(motion, self.samples(), places, read_slope(slope), motion.machine.require_body(body))
 
     @validated
     def foundation_moment(self, about: Sequence[Number] = (0.0, 0.0)) -> Array:
@@ -291,8 +328,8 @@ def rows_in_plane(machine: Machine, place: Place, name: str = "at") -> Array:
 
 
 @cached
-def _ellipse(motion: Harmonic, place: Place, slope: Array) -> Ellipse:
-    return _at_rows(motion, rows_in_plane(motion.machine, place), slope)[1]
+def _ellipse(motion: Harmonic, samples: Samples | None, place: Place, slope: Array) -> Ellipse:
+    return _at_rows(motion, samples, rows_in_plane(motion.machine, place), slope)[1]
 
 
 @cached
@@ -302,9 +339,9 @@ def _moment(motion: Harmonic, about: Array) -> Array:
 
 
 @cached
-def _deck(motion: Harmonic, points: Array, slope: Array, body: int) -> Deck:
+def _deck(motion: Harmonic, samples: Samples | None, points: Array, slope: Array, body: int) -> Deck:
     rows = jnp.stack([rows_in_plane(motion.machine, on_body(point, body), "points") for point in points])
-    amplitude, ellipses = jax.vmap(lambda each: _at_rows(motion, each, slope))(rows)
+    amplitude, ellipses = jax.vmap(lambda each: _at_rows(motion, samples, each, slope))(rows)
     mean = jnp.mean(amplitude, axis=0, keepdims=True)
     variance = jnp.mean(jnp.sum(jnp.abs(amplitude - mean) ** 2, axis=1))
     return Deck(points, amplitude, ellipses, _root_of_ratio(variance, jnp.sum(jnp.abs(mean) ** 2)))
@@ -316,9 +353,10 @@ def _root_of_ratio(part: Array, whole: Array) -> Array:
     return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, part) / jnp.where(is_zero, 1.0, whole)))
 
 
-def _at_rows(motion: Harmonic, rows: Array, slope: Array) -> tuple[Array, Ellipse]:
+def _at_rows(motion: Harmonic, samples: Samples | None, rows: Array, slope: Array) -> tuple[Array, Ellipse]:
     """Return the complex amplitudes (2,) and the ellipse of the point with these rows."""
     amplitude = rows @ motion.amplitude
     on_ellipse = 0.5 * jnp.sum(jnp.abs(amplitude) ** 2)
     off_ellipse = jnp.zeros_like(on_ellipse) if motion.rest is None else jnp.sum((rows @ motion.rest) * rows)
-    return amplitude, ellipse_at(amplitude, motion.speed, slope, _root_of_ratio(off_ellipse, on_ellipse))
+    remainder = _root_of_ratio(off_ellipse, on_ellipse)
+    return amplitude, path_at(rows, motion.amplitude, motion.speed, slope, samples, remainder)

@@ -94,6 +94,50 @@ def half_range(values: Array) -> Array:
     return sampled_maximum(sampled_maximum(above, axis=0)[None] - above, axis=0) / 2.0
 
 
+class Extent(NamedTuple):
+    """Largest extent of a path: `stroke`, m peak to peak, and its `direction`, rad from the first coordinate, above -pi/2 and at
+    most pi/2; 0 for a circle, whose extent is the same in all directions."""
+
+    stroke: Array
+    direction: Array
+
+
+_DIRECTIONS = 64
+"""Number of directions in which the largest extent is searched for first."""
+
+_SPACING = np.pi / _DIRECTIONS
+"""Angle between neighbouring directions, rad."""
+
+_DIRECTION_STEPS = 4
+"""Steps of Newton's method from the best of these directions."""
+
+
+def largest_extent(path: Array) -> Extent:
+    """Return the largest extent, in any direction, of an evenly sampled path (nt, 2).
+
+    The width of the path has a maximum in the direction of the extent. A change of the direction therefore has no influence on
+    the derivatives of the stroke; those of the direction follow from the implicit function theorem. If the extents in several
+    directions are equal, one of them is used.
+    """
+
+    def width(direction: Array) -> Array:
+        return 2.0 * half_range(path @ jnp.stack([jnp.cos(direction), jnp.sin(direction)]))
+
+    def improved(direction: Array) -> Array:
+        bend, size = jax.lax.stop_gradient((jax.grad(jax.grad(width))(direction), width(direction)))
+        is_maximum = -bend > max(1e-9, 64.0 * float(jnp.finfo(path.dtype).eps)) * size
+        change = jax.grad(width)(direction) / jnp.where(is_maximum, -bend, 1.0)
+        return jnp.where(is_maximum, direction + jnp.clip(change, -_SPACING, _SPACING), 0.0)
+
+    angles = jnp.asarray(_SPACING * np.arange(1, _DIRECTIONS + 1) - 0.5 * np.pi, path.dtype)
+    widths = jnp.ptp(jax.lax.stop_gradient(path) @ jnp.stack([jnp.cos(angles), jnp.sin(angles)]), axis=0)
+    direction = angles[jnp.argmax(widths)]
+    for _ in range(_DIRECTION_STEPS):
+        direction = improved(jax.lax.stop_gradient(direction))
+    stroke = width(jax.lax.stop_gradient(direction))
+    return Extent(stroke, 0.5 * jnp.arctan2(jnp.sin(2.0 * direction), jnp.cos(2.0 * direction)))
+
+
 def _turn_weights(time: Array, speed: Array) -> Array:
     """Return weights (nt,) with the sum 1 for a mean value. They increase linearly over the first turn and decrease over the
     last one, so that the mean of a sine with the period of a turn does not depend on the end of the time interval."""

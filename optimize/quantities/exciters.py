@@ -80,7 +80,7 @@ def _field_of_ellipse(evaluation: Evaluation, tier: Tier, at: Point, body: int, 
 
 @quantity_function
 def throw_stroke(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
-    """Return the stroke of a point, m peak to peak: the length of the long axis of its path, "double amplitude" in data sheets.
+    """Return the stroke of a point, m peak to peak: the largest extent of its path, "double amplitude" in data sheets.
 
     **Arguments**
 
@@ -99,12 +99,12 @@ def throw_stroke(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier
 
 
 def _throw_stroke(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:
-    return 2.0 * _ellipse(evaluation, tier, at, body).semi_major
+    return _ellipse(evaluation, tier, at, body).stroke
 
 
 @quantity_function
 def throw_angle(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
-    """Return the throw angle: direction of the long axis of a point's path, rad from x anticlockwise, -pi/2 to pi/2.
+    """Return the throw angle: direction of the largest extent of a point's path, rad from x anticlockwise, -pi/2 to pi/2.
 
     **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; typical: the middle of the deck.
 
@@ -185,7 +185,7 @@ def _roundness(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Arra
 
 @quantity_function
 def force_per_throw(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
-    """Return the foundation force, N zero to peak, divided by the semi-major axis of the path of a point, N/m.
+    """Return the foundation force, N zero to peak, divided by half of the stroke of a point, N/m.
 
     **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; typical: the middle of the deck.
 
@@ -202,7 +202,7 @@ def force_per_throw(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: T
 
 
 def _force_per_throw(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:
-    return working_force(evaluation, tier) / _ellipse(evaluation, tier, at, body).semi_major
+    return working_force(evaluation, tier) / (0.5 * _ellipse(evaluation, tier, at, body).stroke)
 
 
 @quantity_function

@@ -8,6 +8,7 @@ import pytest
 import jaxvib as jv
 from jaxvib.motion.analysis.points import fit_harmonic
 from jaxvib.steady.points import Harmonic, PathsOfPoints
+from jaxvib.steady.vibration import largest_extent
 
 SPEED, G = 90.0, 9.80665
 
@@ -236,3 +237,47 @@ def test_run_without_a_trajectory_refuses_its_whole_motion():
 def test_wrong_numbers_of_ellipses_are_refused(amplitude, speed, says):
     with pytest.raises(jv.InputError, match=says):
         jv.ellipse_of(amplitude, speed)
+
+
+def widths(path, count=20001):
+    """Widths of a path (nt, 2) in evenly spaced directions, by sampling."""
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, count)
+    return angle, np.ptp(path @ np.stack([np.cos(angle), np.sin(angle)]), axis=0)
+
+
+def sampled_path(harmonics, count=1024, further=2):
+    """Path (nt, 2) with the complex amplitudes (K, 2) of the orders 1, 2, ..."""
+    theta = 2.0 * np.pi * np.arange(count + further) / count
+    return jnp.real(jnp.exp(1j * jnp.outer(theta, 1 + np.arange(len(harmonics)))) @ harmonics)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_largest_extent_is_that_of_a_dense_sampling(seed):
+    rng = np.random.default_rng(seed)
+    parts = rng.normal(size=(2, 4, 2)) / np.array([1.0, 2.0, 5.0, 10.0])[:, None]
+    found = largest_extent(sampled_path(parts[0] + 1j * parts[1]))
+    angle, width = widths(np.asarray(sampled_path(parts[0] + 1j * parts[1], 4000)))
+    np.testing.assert_allclose(found.stroke, np.max(width), rtol=2e-6)
+    np.testing.assert_allclose(found.direction, angle[np.argmax(width)], atol=2e-3)
+
+    extent = jax.jit(lambda x: jnp.stack(largest_extent(sampled_path(x[0] + 1j * x[1]))))
+    change, step = rng.normal(size=parts.shape), 1e-6
+    slope = jax.jvp(extent, (jnp.asarray(parts),), (jnp.asarray(change),))[1]
+    ends = [extent(jnp.asarray(parts + sign * step * change)) for sign in (-1.0, 1.0)]
+    np.testing.assert_allclose(slope, (ends[1] - ends[0]) / (2.0 * step), rtol=1e-6)
+    gradient = jax.grad(lambda x: extent(x)[0])(jnp.asarray(parts))
+    np.testing.assert_allclose(np.sum(gradient * change), slope[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("amplitude", [(1.0, 1j), (1.0, 1.0), (0.0, 1.0), (1.0, 0.0), (0.0, 0.0)])
+def test_extent_of_a_plain_path_has_finite_derivatives(amplitude):
+    """A circle, whose extents in all directions are equal, straight lines, and a point at rest."""
+    amplitude = jnp.asarray(amplitude) + 0j
+
+    def extent(scale):
+        return jnp.stack(largest_extent(sampled_path(scale * amplitude[None])))
+
+    value, slope = jax.jvp(extent, (jnp.asarray(2.0),), (jnp.asarray(1.0),))
+    ellipse = jv.ellipse_of(2.0 * amplitude, SPEED)
+    np.testing.assert_allclose(value, [2.0 * ellipse.semi_major, ellipse.direction], atol=1e-8)
+    np.testing.assert_allclose(slope, [ellipse.semi_major, 0.0], atol=1e-8)

@@ -125,9 +125,7 @@ def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -
     """
     time, states, model = window.time, window.state, assemble(scene)
     harmonic, _ = fit_harmonic(time, states.displacement, measured.omega)
-    field = dynamics_of(model)
-    torques = jax.vmap(partial(drive_torques, model, field))(time, states)
-    acceleration = jax.vmap(field)(time, states).velocity
+    torques = jax.vmap(partial(drive_torques, model, dynamics_of(model)))(time, states)
     hann = _hann(time.shape[0])
     weight = jnp.asarray(hann / np.sum(hann), time.dtype)
     torque, power = (weight @ torque_or_power for torque_or_power in torques)
@@ -144,8 +142,16 @@ def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -
         exciter_force=jnp.where(is_unknown, jnp.nan, force),
         torque=jnp.where(has_spin, jnp.nan, torque),
         power=jnp.where(has_spin, jnp.nan, power),
-        samples=Samples(time, states.displacement, states.velocity, acceleration, window.foundation_force),
+        samples=samples_of(scene, window),
     )
+
+
+@cached
+def samples_of(scene: Scene, window: Trajectory) -> Samples:
+    """Return samples of the whole motion in a window."""
+    time, states = window.time, window.state
+    acceleration = jax.vmap(dynamics_of(assemble(scene)))(time, states).velocity
+    return Samples(time, states.displacement, states.velocity, acceleration, window.foundation_force)
 
 
 def require_turns(time: np.ndarray, speed: float) -> None:
@@ -222,7 +228,7 @@ def measures_text(
     if motion.samples is None:
         note += "; g and mm/s are computed from the whole amplitude and this speed, forces on supports from this part only"
     elif measures.point is not None:
-        note += "; throw angle and conveying speed are computed from this part only"
+        note += "; the conveying speed is computed from this part only"
     return [note, *lines]
 
 

@@ -445,3 +445,21 @@ def test_limit_needs_a_number_and_a_free_motion(general, orbit):
     with pytest.raises(jv.InputError, match="has no exciter whose speed or phase is free"):
         ideal = symmetric([(0.0, 0.0)] * 2, directions=(1, -1), drive=jv.ConstantSpeed(100.0))
         jv.synchronization_limit(ideal, jv.synchronous_orbit(ideal, points=17), over="exciters[1].unbalance")
+
+
+def test_stroke_and_throw_number_are_those_of_the_whole_path(orbit):
+    theta = 2.0 * np.pi * np.arange(4096) / 4096.0
+    k = np.arange(orbit.displacement_harmonics.shape[1])
+    rows = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, 1.5]])
+    harmonics = rows @ np.asarray(orbit.displacement_harmonics)
+    path, w = np.real(harmonics @ np.exp(1j * np.outer(k, theta))), float(orbit.speed)
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 4001)
+    widths = [np.ptp(np.cos(a) * path[0] + np.sin(a) * path[1]) for a in angle]
+    found = orbit.ellipse(at=(1.5, 0.5), slope=-0.1)
+    assert float(found.stroke) == pytest.approx(np.max(widths), rel=1e-6)
+    assert abs(float(found.stroke) / (2.0 * float(found.semi_major)) - 1.0) > 1e-5  # the fundamental alone
+    assert float(found.direction) == pytest.approx(angle[np.argmax(widths)], abs=2e-3)
+    x, y = np.real(-((k * w) ** 2) * harmonics @ np.exp(1j * np.outer(k, theta))) / 9.80665
+    assert float(found.acceleration) == pytest.approx(np.max(np.hypot(x, y)), rel=1e-6)
+    throw = np.max(np.sin(-0.1) * x - np.cos(-0.1) * y) / np.cos(-0.1)
+    assert float(found.throw_number) == pytest.approx(throw, rel=1e-6)
