@@ -281,6 +281,7 @@ def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, o
         "coordinates": structure.coordinates,
         "units": structure.units,
         **fields_of(run, "amplitude", "foundation_force", "drift", "settled", "steps", "rejected"),
+        **({"caught_at": run.caught_at} if isinstance(run, jv.Run) else {}),
         **stays_document(run),
     }
 

@@ -18,18 +18,21 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, Onto, SpeedUnit, quantity_text
 from jaxvib.equations.forces import normal_force
+from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import on_body, read_place
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import start_notes
 from jaxvib.motion.analysis.beat import beat_period
+from jaxvib.motion.analysis.caught import held_lines, held_rotors
 from jaxvib.motion.analysis.creep import creep_text
 from jaxvib.motion.analysis.measure import (
     AbstractMeasured,
     Measured,
     Trajectory,
     duration_text,
+    last_mean_speeds,
     turning_angles,
     turning_masses,
 )
@@ -265,7 +268,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 f"  {self._error_text(reason)}; {self._cost}",
                 *([] if self.window.time.dtype.itemsize >= 8 else [_SINGLE_PRECISION]),
                 *([] if self.settled else [self._window_text()]),
-                f"  {self.speeds_text(self.scene, self.window.rotor_speeds)}",
+                f"  {self.speeds_text(self.scene, self.window.rotor_speeds, self._last_speeds)}",
+                *(f"  {line}" for line in held_lines(self.caught_at, np.asarray(estimated_frequencies(self.scene)))),
                 *([] if reason == ZERO_VIBRATION else [f"  {self.amplitude_text(self.scene)}"]),
                 *(f"  {line}" for line in measures_text(self.scene, reason, self.vibration, measures)),
                 *(f"  {part._on_the_way(when)}" for when, part in self.parts().items()),
@@ -278,6 +282,12 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 *self._detachment(),
             ]
         )
+
+    @property
+    def _last_speeds(self) -> Array:
+        """Mean speeds of the turning masses at the end of the window, rad/s."""
+        time = self.window.time
+        return last_mean_speeds(time, *turning_angles(self.scene, lambda: time, self.window.state))
 
     def _error_text(self, no_vibration: str) -> str:
         if np.isnan(self.error):
@@ -301,6 +311,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         _, speeds = turning_angles(self.scene, lambda: time, self.window.state)
         if coasting := coasting_text(self.scene, np.asarray(time), np.asarray(speeds)):
             return f"not settled: {coasting}"
+        if np.any(self.caught_at):
+            return "not settled: a resonance catches exciters, run longer to see whether they pass"
         period = beat_period(self.scene, self._stored)
         if period is None:
             return "not settled: run longer"
@@ -372,6 +384,15 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """Kind of motion at the end of the run, see `Regime`."""
         self.require_single()
         return regime(self.scene, self.window)
+
+    @property
+    def caught_at(self) -> np.ndarray:
+        """Number, from 1, of the resonance that catches each exciter without loads (exciter,) at the end of the run: the rotor
+        stays near this resonance, slower than its motor. It is 0 for other exciters, and for a run that failed."""
+        self.require_single()
+        if not self._has_end:
+            return np.zeros(len(self.scene.exciters), int)
+        return held_rotors(self.scene, self.window.rotor_speeds, np.asarray(estimated_frequencies(self.scene)))
 
     @property
     def stays(self) -> list[Stay]:

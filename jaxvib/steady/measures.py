@@ -34,7 +34,15 @@ from jaxvib.steady.jams.jam import Jam
 from jaxvib.steady.jams.phases import PhaseJam
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.points import at_positive_speed, path_at, read_slope, require_amplitudes, rows_in_plane
-from jaxvib.steady.vibration import Samples, Vibration, half_range, peak_acceleration, peak_forces, rms_velocity
+from jaxvib.steady.vibration import (
+    Samples,
+    Vibration,
+    half_range,
+    peak_acceleration,
+    peak_forces,
+    periodic_samples,
+    rms_velocity,
+)
 from jaxvib.steady.zone import vibration_zone
 from jaxvib.units import Number, number
 from jaxvib.units.known import when_known
@@ -91,7 +99,7 @@ class VibrationMeasures(Readable):
     - `throughput`, kg/s, at the `point`; None if no `layer` was given
     - `coordinates` (nt,): names of the coordinates, and `directions` of the force on the foundation
 
-    For a run these are those of the whole motion in its window, with all its frequencies, except for
+    For a run in its window, and for an exact jam, these are those of the whole motion with all its frequencies, except for
     `conveying_speed`, which is that of the harmonic at `speed`.
 
     `static_deflection` and `static_load` are NaN if the supports cannot carry the weight, if the directions of the coordinates
@@ -259,7 +267,7 @@ def vibration_measures(
 
     Omega is the speed, and Y the complex amplitude of a coordinate. k and c are the stiffness and the damping of a support, u
     and s its displacements by the vibration and by the weight. M and K are the mass and stiffness matrices of the machine.
-    For a run, strokes, accelerations, velocities and forces are those of the whole motion in its window, see
+    For a run and an exact jam, strokes, accelerations, velocities and forces are those of the whole motion, see
     `VibrationMeasures`.
 
     **Arguments**
@@ -267,7 +275,7 @@ def vibration_measures(
     - `scene`
     - `motion` of the scene: a jam of light loads such as `jam_modes(scene).select(3)` or `phase_jams(scene).select(0)`, an
       exact jam such as `jam_orbit(scene, mode=3)`, or the `vibration()` of a run, of an envelope, of a synchronous regime or
-      of a response. For an exact jam, forces on supports and motions of points are those of the first harmonic
+      of a response
     - `at`: point of a deck, (x, y) of the body with the number `body`, m, or a list of points; default: the body's centre of
       mass; typical: both ends of the deck
     - `slope` of the deck, rad or text from x anticlockwise; typical: "-15 deg" to 0 (the default)
@@ -308,7 +316,9 @@ def vibration_measures(
         first = motion.displacement_harmonics[:, motion.orders.index(1)]
         vibration = (first, motion.amplitude, motion.foundation_force)
         phase = motion.offsets + motion.deviation_harmonics[:, 0].real  # of loads that differ
-        motion = _vibration_at_phases(scene, motion.rotor_speed, motion.omega, phase, *vibration, motion.power)
+        samples = periodic_samples(motion.orders, motion.omega, motion.displacement_harmonics, motion.force_harmonics)
+        vibration_at_phases = _vibration_at_phases(scene, motion.rotor_speed, motion.omega, phase, *vibration, motion.power)
+        motion = vibration_at_phases._replace(samples=samples)
     measures = _measures(scene, motion, places if has_list else places[0], along)
     if layer is None or measures.conveying_speed is None:
         return measures

@@ -169,8 +169,8 @@ def ellipse_at(amplitude: Array, speed: Array, slope: Array, remainder: Array) -
 
 
 def path_at(rows: Array, amplitude: Array, speed: Array, slope: Array, samples: Samples | None, remainder: Array) -> Ellipse:
-    """Return the path of the point with the `rows` (2, nd): the ellipse of the complex amplitudes (nd,) at the `speed`, with the
-    measures of the whole motion if there are `samples` of it."""
+    """Return the path of the point with the `rows` (2, nd): the ellipse of the complex amplitudes (nd,) at the `speed`, with
+    the measures of the whole motion if there are `samples` of it."""
     path = ellipse_at(rows @ amplitude, speed, slope, remainder)
     if samples is None:
         return path

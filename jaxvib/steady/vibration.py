@@ -11,6 +11,7 @@ from jax import Array
 
 from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.numerics.linalg import magnitude
+from jaxvib.runtime.programs import cached
 from jaxvib.units.reading import STANDARD_GRAVITY
 
 
@@ -28,6 +29,20 @@ class Samples(NamedTuple):
     foundation_force: Array
 
 
+_PERIOD_SAMPLES = 1024
+"""Number of samples of a period of an exact motion."""
+
+
+@cached
+def periodic_samples(orders: tuple[int, ...], speed: Array, displacement: Array, force: Array) -> Samples:
+    """Return samples of two periods of a motion Re sum_k c_k exp(i k w t) of the `orders` k, with the `speed` w, rad/s, and the
+    harmonics (nd, K) and (nb, K) of displacement and foundation force. Each peak of a period is then between other samples."""
+    k, theta = np.asarray(orders), 2.0 * np.pi * np.arange(2 * _PERIOD_SAMPLES + 1) / _PERIOD_SAMPLES
+    wave = jnp.asarray(np.exp(1j * np.outer(k, theta)), displacement.dtype)
+    q, v, a = ((displacement * ((1j * k * speed) ** order)[None] @ wave).real.T for order in range(3))
+    return Samples(theta / speed, q, v, a, (force @ wave).real.T)
+
+
 class Vibration(NamedTuple):
     """Vibration of a machine at one speed of its exciters, q = Re(displacement exp(i w t)).
 
@@ -40,7 +55,7 @@ class Vibration(NamedTuple):
     - `foundation_force` and `exciter_force`, N zero to peak: force on the foundation, and resultant of the centrifugal forces
     - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive; `power` is the mean of torque times
       speed, which differs from the product of the means if both vary within a turn
-    - `samples` of the whole motion of a run, which may have further frequencies; None for other motions
+    - `samples` of the whole motion of a run or an exact jam, which has further frequencies; None for other motions
     """
 
     speed: Array
@@ -95,8 +110,8 @@ def half_range(values: Array) -> Array:
 
 
 class Extent(NamedTuple):
-    """Largest extent of a path: `stroke`, m peak to peak, and its `direction`, rad from the first coordinate, above -pi/2 and at
-    most pi/2; 0 for a circle, whose extent is the same in all directions."""
+    """Largest extent of a path: `stroke`, m peak to peak, and its `direction`, rad from the first coordinate, above -pi/2 and
+    at most pi/2; 0 for a circle, whose extent is the same in all directions."""
 
     stroke: Array
     direction: Array
@@ -111,6 +126,10 @@ _SPACING = np.pi / _DIRECTIONS
 _DIRECTION_STEPS = 4
 """Steps of Newton's method from the best of these directions."""
 
+_MIN_BEND = 1e-2
+"""Smallest second derivative of the width with respect to the direction, relative to the width, of a path that has a direction:
+an ellipse whose semi-axes differ by 0.5 %. Samples of a circle have smaller ones, because their extrema are interpolated."""
+
 
 def largest_extent(path: Array) -> Extent:
     """Return the largest extent, in any direction, of an evenly sampled path (nt, 2).
@@ -123,19 +142,21 @@ def largest_extent(path: Array) -> Extent:
     def width(direction: Array) -> Array:
         return 2.0 * half_range(path @ jnp.stack([jnp.cos(direction), jnp.sin(direction)]))
 
-    def improved(direction: Array) -> Array:
+    def improved(direction: Array) -> tuple[Array, Array]:
+        """The direction after a step of Newton's method, and False for an extent that is the same in all directions."""
         bend, size = jax.lax.stop_gradient((jax.grad(jax.grad(width))(direction), width(direction)))
-        is_maximum = -bend > max(1e-9, 64.0 * float(jnp.finfo(path.dtype).eps)) * size
-        change = jax.grad(width)(direction) / jnp.where(is_maximum, -bend, 1.0)
-        return jnp.where(is_maximum, direction + jnp.clip(change, -_SPACING, _SPACING), 0.0)
+        has_axis = -bend > _MIN_BEND * size
+        change = jnp.where(has_axis, jax.grad(width)(direction), 0.0) / jnp.where(has_axis, -bend, 1.0)
+        return direction + jnp.clip(change, -_SPACING, _SPACING), has_axis
 
     angles = jnp.asarray(_SPACING * np.arange(1, _DIRECTIONS + 1) - 0.5 * np.pi, path.dtype)
     widths = jnp.ptp(jax.lax.stop_gradient(path) @ jnp.stack([jnp.cos(angles), jnp.sin(angles)]), axis=0)
-    direction = angles[jnp.argmax(widths)]
+    direction, has_axis = angles[jnp.argmax(widths)], jnp.asarray(True)
     for _ in range(_DIRECTION_STEPS):
-        direction = improved(jax.lax.stop_gradient(direction))
+        direction, has_axis = improved(jax.lax.stop_gradient(direction))
     stroke = width(jax.lax.stop_gradient(direction))
-    return Extent(stroke, 0.5 * jnp.arctan2(jnp.sin(2.0 * direction), jnp.cos(2.0 * direction)))
+    turned = jnp.where(has_axis, direction, 0.0)
+    return Extent(stroke, 0.5 * jnp.arctan2(jnp.sin(2.0 * turned), jnp.cos(2.0 * turned)))
 
 
 def _turn_weights(time: Array, speed: Array) -> Array:

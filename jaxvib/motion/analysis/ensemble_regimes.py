@@ -9,16 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.state import State
 from jaxvib.equations.torque_balance import mass_owners
-from jaxvib.machine.drives.controlled import SwitchedOff
-from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import mass_names
+from jaxvib.motion.analysis.caught import catching_resonance, has_no_resonance
 from jaxvib.motion.analysis.measure import turning_angles, turning_directions
 from jaxvib.results.estimate import wilson
 from jaxvib.results.fields import in_unit, names_along
@@ -35,20 +34,6 @@ lies between that of a small swing about constant phases and that of a slow drif
 _PHASE_GAP = np.pi / 4.0
 """Smallest gap, rad, between the phases of two regimes. It lies between the scatter of the phases of one regime and the
 distance of two regimes, which is typically half a turn."""
-
-_BELOW_RESONANCE = 1.05
-"""Speed, relative to a natural frequency, up to which a mass counts as not having passed the resonance. Masses are caught
-slightly below the natural frequency."""
-
-_WORKING_SHARE = 0.95
-"""Largest natural frequency, relative to the working speed of a drive, that counts as a resonance below this speed."""
-
-
-def catching_resonance(speed: ArrayLike, working_speed: ArrayLike, resonances: Array | np.ndarray) -> Array:
-    """Return the number, from 1, of the lowest of the `resonances` (nd,), ascending, below 0.95 of the `working_speed` of the
-    drive that a mass at `speed` has not passed; 0 if all of them are passed."""
-    missed = (resonances < _WORKING_SHARE * jnp.asarray(working_speed)) & ~(jnp.asarray(speed) > _BELOW_RESONANCE * resonances)
-    return jnp.where(jnp.any(missed), jnp.argmax(missed) + 1, 0)
 
 
 class RotatingMasses(Readable):
@@ -82,8 +67,8 @@ def rotating_masses(scenes: Scene, states: State, mean_speed: Array, end: Array,
         resonances = jax.lax.stop_gradient(estimated_frequencies(scene))
         exciters = [scene.exciters[owner] for owner in owners]
         numbers = [
-            0 if _has_no_resonance(exciter) else catching_resonance(own, exciter.drive.speed, resonances)
-            for exciter, own in zip(exciters, jnp.unstack(jax.lax.stop_gradient(turned)), strict=True)
+            0 if each.loads is None and has_no_resonance(each) else catching_resonance(own, each.drive.speed, resonances)
+            for each, own in zip(exciters, jnp.unstack(jax.lax.stop_gradient(turned)), strict=True)
         ]
         has_equal_loads = [e.loads is not None and all(np.ndim(x) == 0 for x in jax.tree.leaves(e.loads)) for e in exciters]
         equal = [owners.index(owner) if has_equal_loads[k] else k for k, owner in enumerate(owners)]
@@ -91,11 +76,6 @@ def rotating_masses(scenes: Scene, states: State, mean_speed: Array, end: Array,
         return RotatingMasses(turned * length, phase, jnp.stack(numbers), mass_names(scene), tuple(equal))
 
     return jax.vmap(of_run)(scenes, states, mean_speed)
-
-
-def _has_no_resonance(exciter: Exciter) -> bool:
-    """Return True if no resonance can catch the rotor: its drive prescribes its speed, or its motor is switched off."""
-    return exciter.loads is None and (exciter.drive.ideal or isinstance(exciter.drive, SwitchedOff))
 
 
 class EnsembleRegimesStatus(eqx.Enumeration):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -40,6 +41,13 @@ _MAX_SPREAD_OF_MEAN = 0.2
 
 _MIN_SHOWN_RIPPLE = 0.01
 """Smallest variation of the rotor speeds about their means, relative to the largest speed, that the text of a run states."""
+
+_MAX_SHOWN_AS_MEAN = 0.01
+"""Largest difference between the mean speeds at the end of a window and in the whole window, relative to the largest speed, of
+a text that states the means of the window only."""
+
+_LAST_PARTS = 10
+"""Number of equal parts of a window; the speeds at its end are means over whole turns in the last part."""
 
 _MAX_CONSTANT_SPREAD = 0.01
 """Largest difference of the speeds of a rotor, relative to the largest one, with which its speed counts as constant."""
@@ -135,13 +143,20 @@ class AbstractMeasured(Readable):
         kind = f" ({ROOT_SUM_SQUARE})" if scene.machine.has_foundation and len(structure.foundation_directions) > 1 else ""
         return f"amplitude, zero to peak: {amplitude}; foundation force {force}{kind}"
 
-    def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array]) -> str:
+    def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array], last_speed: Array | None = None) -> str:
         """Return a line of text with the speeds of the turning masses, the last of the `rotor_speeds` (nt,), rad/s, of each
         exciter with loads, and in a settled motion the variation of the speeds of the other rotors.
 
         The mean speed is left out if the speeds differ much, for example because a motor stands still. If a rotor speed is not
-        constant, the text states that it is the last one.
+        constant, the text states that it is the last one. If the mean speeds of the turning masses at the end, `last_speed`
+        (loads,), differ from those of the window, because a mass passed a resonance in it, the text begins with them.
         """
+        mean, end = np.asarray(self.load_speed), np.asarray(self.load_speed if last_speed is None else last_speed)
+        if np.max(np.abs(end - mean)) > _MAX_SHOWN_AS_MEAN * np.max(np.abs(end)):
+            recent = [np.asarray(speeds)[last_samples(len(speeds))] for speeds in rotor_speeds]
+            at_end = dataclasses.replace(self, load_speed=end, omega=np.mean(turning_directions(scene) * end))
+            means = f"means of the window, in which the speeds change: {speed_text(mean, 6)}"
+            return f"at the end, {at_end.speeds_text(scene, recent)}; {means}"
         exciters = [*zip(scene.exciters, map(np.asarray, rotor_speeds), strict=True)]
         histories = [speeds for exciter, speeds in exciters if exciter.loads is not None]
         changes = any(np.ptp(speeds) > _MAX_CONSTANT_SPREAD * np.max(np.abs(speeds)) for speeds in histories)
@@ -159,6 +174,16 @@ class AbstractMeasured(Readable):
         if bool(self.settled) and not swing and ripple > _MIN_SHOWN_RIPPLE * float(np.max(magnitudes)):
             swing = f"; rotor speeds vary by ±{speed_text(ripple, 3)}"
         return f"{turning_masses(scene)} turn at {each}{rotor}{swing}"
+
+
+def last_samples(count: int) -> slice:
+    """Return the samples at the end of a window of `count` samples, over which the final speeds are means."""
+    return slice(count - max(2, count // _LAST_PARTS), None)
+
+
+def last_mean_speeds(times: Array, angle: Array, rate: Array) -> Array:
+    """Return the mean speeds (m,), rad/s, over the whole turns at the end of a window, for arguments as in `mean_speeds`."""
+    return mean_speeds(times, angle, rate, (last_samples(len(times)).start,))[0]
 
 
 def duration_text(scene: Scene, end: Array) -> str:

@@ -28,8 +28,9 @@ no-load speed, passes each band more slowly than the last one."""
 _MAX_SPEED_RATIO = 0.95
 """Largest speed during a stay, relative to that of the rotor, or to the no-load speed of a motor."""
 
-_MIN_SHARE_IN_BAND = 0.8
-"""Smallest share of a stay during which the speed is within twice the band."""
+_MIN_SHARE_NEARBY, _NEARBY = 0.8, 0.12
+"""Smallest share of a stay during which the speed is near that of the stay, and the largest relative distance that is near. The
+speeds of motors that a resonance holds together swing by about 10 %."""
 
 _NEAR_RESONANCE = (0.85, 1.1)
 """Speeds of a rotor, relative to a natural frequency, at which a resonance can hold it. Other stays follow from the supply."""
@@ -67,6 +68,7 @@ def find_stays(scene: Scene, time: np.ndarray, speeds: np.ndarray, rotor_speeds:
 
     A mass stays near a speed if it turns at least 10 times within 3 % of it, at least three times as long as at its mean
     acceleration and as in the next band of speeds, and slower than 0.95 of its rotor or of the no-load speed of its motor.
+    Swings by up to 12 % from this speed, and larger ones for a fifth of the time, do not end a stay.
 
     **Arguments**: `time` (nt,), s, evenly spaced; `speeds` (nt, n), rad/s, of the turning masses as in `turning_angles`;
     `rotor_speeds` (nt,) of each exciter.
@@ -128,13 +130,15 @@ def _parts(time: np.ndarray, speed: np.ndarray, target: np.ndarray, period: floa
     at_mean_rate = 2.0 * _BAND * levels * np.maximum(climb - duration, 0.0) / (0.9 * mean[-1])
     longer = _MIN_SLOWNESS * np.maximum(at_mean_rate, time[next_end] - time[end])
     duration = np.where((duration >= longer) & (duration * levels >= 2.0 * np.pi * _MIN_TURNS), duration, 0.0)
+    for j in np.flatnonzero(duration):
+        is_near = np.abs(mean[begin[j] : end[j] + 1] - levels[j]) < _NEARBY * levels[j]
+        if np.mean(is_near) < _MIN_SHARE_NEARBY:
+            duration[j] = 0.0
     while np.max(duration) > 0.0:
         j = int(np.argmax(duration))
-        samples = slice(begin[j], end[j] + 1)
         n = end[j] + 1 - begin[j]
         speed_and_target = [(each[end[j] + 1] - each[begin[j]]) / n for each in (total, total_target)]
-        share = np.mean(np.abs(mean[samples] - levels[j]) < 2.0 * _BAND * levels[j])
-        if share > _MIN_SHARE_IN_BAND and speed_and_target[0] < _MAX_SPEED_RATIO * speed_and_target[1]:
+        if speed_and_target[0] < _MAX_SPEED_RATIO * speed_and_target[1]:
             parts.append(_Part(float(time[begin[j]]), float(time[end[j]]), *map(float, speed_and_target)))
         duration = np.where((begin <= end[j]) & (end >= begin[j]), 0.0, duration)
     return parts

@@ -21,7 +21,7 @@ from jaxvib.machine.effects.terms import ContactFriction, RotorImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory, duration_text, only_exciter_value
+from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory, duration_text, last_samples, only_exciter_value
 from jaxvib.motion.analysis.points import absent_vibration, measures_text, require_vibration
 from jaxvib.motion.analysis.regime import regime
 from jaxvib.motion.analysis.stays import Stay, find_stays
@@ -195,6 +195,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         self.require_single()
         moves = bool(np.all(np.isfinite(self.amplitude)))
         measured = measures_text(self.scene, self.no_vibration, self.vibration, measures) if moves else []
+        last_speed = jnp.mean(self.window.load_speed[last_samples(len(self.window.time))], axis=0)
         named, first = status_name(self.status), []
         end, state = self.message, "settled" if bool(self.settled) else self._unsettled_text()
         if named in ("would_separate", "unstable"):
@@ -205,7 +206,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
                 *first,
                 f"{end}: {duration_text(self.scene, self.window.time[-1])}, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
-                f"  {self.speeds_text(self.scene, self.window.rotor_speeds)}",
+                f"  {self.speeds_text(self.scene, self.window.rotor_speeds, last_speed)}",
                 f"  {self.amplitude_text(self.scene)}",
                 *([f"  {_OFFSET}"] if moves and _moves_without_spring(self.scene) else []),
                 *(f"  {line}" for line in measured),

@@ -19,7 +19,7 @@ from jaxvib.machine.drives.drive import Motor, MotorWrapper
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import lifting_torques, start_notes, validate_scene, weight_accelerations
-from jaxvib.motion.analysis.ensemble_regimes import catching_resonance
+from jaxvib.motion.analysis.caught import caught_rotors, caught_text
 from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.motion.envelope.result import Envelope, plot_histories
 from jaxvib.motion.start import initial_state
@@ -105,7 +105,7 @@ class MotorRunUp(Result):
         if self.status_name == "not_turning":
             lines.append("without gravity (exciters that are turning already):")
         for k, (speed, caught) in enumerate(zip(np.asarray(self.speed), np.asarray(self.caught_at).tolist(), strict=True), 1):
-            at = f", caught by resonance {caught} at {speed_text(self.resonances[caught - 1])}" if caught else ""
+            at = f", {caught_text(caught, np.asarray(self.resonances))}" if caught else ""
             lines.append(f"  exciter {k}: {speed_text(speed)}{at}")
         lines += [f"  {stay.summary()}" for stay in self.run.stays]
         structure = self.scene.machine.structure()
@@ -277,9 +277,7 @@ def _judgement(scene: Scene, run: Envelope, resonances: np.ndarray) -> tuple[np.
     """Return the speed of each exciter, the number of the resonance that catches it, and the name of the status."""
     directions = np.array([exciter.direction for exciter in scene.exciters])
     speed = directions * np.array([float(np.mean(np.asarray(n))) for n in run.window.rotor_speeds])
-    drives = [exciter.drive for exciter in scene.exciters]
-    numbers = [catching_resonance(*each, resonances) for each in zip(speed, [drive.speed for drive in drives], strict=True)]
-    caught = np.where([drive.ideal for drive in drives], 0, np.asarray(numbers))
+    caught = caught_rotors(scene, speed, resonances)
     name = status_name(run.status)
     if name == "not_turning":
         return speed, caught, "not_turning"

@@ -45,7 +45,7 @@ from jaxvib.steady.orbits.whole import (
 )
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.points import Harmonic, PathsOfPoints
-from jaxvib.steady.vibration import Samples
+from jaxvib.steady.vibration import Samples, periodic_samples
 from jaxvib.units import Number, Numbers, count, known_number, number, numbers, validate_tolerance
 from jaxvib.units.known import is_known, when_known
 
@@ -55,9 +55,6 @@ _MAX_UNKNOWN_STEPS = 128
 _ONE_ANGLE = 1e-3
 """Largest difference between the phases of loads at one angle, rad."""
 
-
-_SAMPLES = 1024
-"""Number of samples of a period from which its extent and its largest accelerations are computed."""
 
 _SYNCHRONOUS_POINTS = (17, 33, 65, 129)
 """Collocation points on a period, tried one after the other until the accuracy is reached."""
@@ -166,8 +163,9 @@ class SynchronousOrbit(PathsOfPoints, Result):
         )
 
     def samples(self) -> Samples:
-        """Return samples of a period, and the first two of the next one."""
-        return _samples(self.speed, self.displacement_harmonics, self.force_harmonics)
+        """Return samples of the motion, see `periodic_samples`."""
+        orders = tuple(range(self.displacement_harmonics.shape[-1]))
+        return periodic_samples(orders, self.speed, self.displacement_harmonics, self.force_harmonics)
 
     def summary(self) -> str:
         """Return the result as a few lines of text; amplitudes zero to peak."""
@@ -201,15 +199,6 @@ def _at(scene: Scene, omega: Array, displacement: Array, deviation: Array, theta
     wave = jnp.exp(1j * k * theta)
     q, v = (displacement @ wave).real, omega * (displacement @ (1j * k * wave)).real
     return state_of(scene, theta, q, v, (deviation @ wave).real, (deviation @ (1j * k * wave)).real, omega)
-
-
-@cached
-def _samples(omega: Array, displacement: Array, force: Array) -> Samples:
-    k = np.arange(displacement.shape[-1])
-    theta = 2.0 * np.pi * np.arange(_SAMPLES + 2) / _SAMPLES
-    wave = jnp.asarray(np.exp(1j * np.outer(k, theta)), displacement.dtype)
-    q, v, a = (((1j * k * omega) ** order * displacement @ wave).real.T for order in range(3))
-    return Samples(theta / omega, q, v, a, (force @ wave).real.T)
 
 
 @validated

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.motion.analysis.ensemble_regimes import RotatingMasses, catching_resonance, regimes_of_runs
+from jaxvib.motion.analysis.caught import catching_resonance
+from jaxvib.motion.analysis.ensemble_regimes import RotatingMasses, regimes_of_runs
 
 TURN = 2.0 * np.pi
 

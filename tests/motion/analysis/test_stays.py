@@ -107,3 +107,11 @@ def test_the_command_prints_stays(tmp_path, capsys):
     assert stay["masses"] == "the loads" and stay["mode"] == 1 and 4.0 < stay["end"] - stay["start"] < 6.0
     assert run_command([*words, "--window", "--json"]) == 0
     assert "stays" not in json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("swing", [0.05, 0.10])
+def test_a_stay_whose_speed_swings_is_found(swing):
+    """Motors that a resonance holds together: their speeds swing at a rate below the lowest resonance."""
+    is_held = (TIME > 3.0) & (TIME < 9.0)
+    (stay,) = found(held(3.0, 9.0) + 27.0 * swing * np.sin(5.0 * (TIME - 3.0)) * is_held)
+    np.testing.assert_allclose([stay.start, stay.end, stay.speed], [3.0, 9.0, 27.0], rtol=0.05, atol=0.8)

@@ -1,6 +1,7 @@
 """Runs of several exciters against equations written by hand and integrated by SciPy."""
 
 import dataclasses
+import re
 
 import equinox as eqx
 import jax
@@ -58,7 +59,11 @@ def test_a_run_of_two_motors_obeys_the_equations_by_hand():
     turned = [np.ptp(angle) / (run.window.time[-1] - run.window.time[0]) for angle in run.window.rotor_angles]
     np.testing.assert_allclose(np.abs(run.load_speed), turned, rtol=0.05)
     speeds = ", ".join(f"{float(speed) * 30.0 / np.pi:.6g}" for speed in run.load_speed)
-    assert f"(each: {speeds} rpm; negative: clockwise)\n" in run.summary() and "rotor" not in run.summary()
+    means = f"; means of the window, in which the speeds change: {speeds} rpm\n"
+    assert means in run.summary() and "  at the end, exciters turn at " in run.summary() and "rotor" not in run.summary()
+    at_end = re.search(r"each: (.*), (.*) rpm; negative", run.summary()).groups()
+    last = [float(np.mean(speed[-205:])) * 30.0 / np.pi for speed in run.window.rotor_speeds]
+    np.testing.assert_allclose([float(each) for each in at_end], last, rtol=0.02)
     assert run.load_speed[0] > 0.0 > run.load_speed[1]
     stopped = dataclasses.replace(run, load_speed=jnp.asarray([100.0, -0.01]))  # the mean speed has no meaning
     assert stopped.speeds_text(SCENE, run.window.rotor_speeds) == "exciters turn at 954.93, -0.095493 rpm; negative: clockwise"
