@@ -13,7 +13,19 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, MARKERS, STROKES, Look, cell_edges, color_of, legend_above, log_ticks, panels
+from jaxvib.draw.style import (
+    COLORS,
+    HATCHED,
+    MARKERS,
+    NO_RESULT,
+    STROKES,
+    Look,
+    cell_edges,
+    color_of,
+    legend_above,
+    log_ticks,
+    panels,
+)
 
 
 def tiers_chart(
@@ -138,7 +150,7 @@ def stability_chart(
     ax: Axes | None = None,
 ) -> Drawn:
     """Draw a band for each `value` (n,) of the varied parameter, between the first and the last one. A band is shaded at the
-    load speeds `omega` (n, P) of `stable` (n, P) jams.
+    load speeds `omega` (n, P) of `stable` (n, P) jams, white at those of unstable ones, and hatched where `omega` is NaN.
 
     Points on the axis show the values, because a band reaches midway to the next one. `marks` contains points (k, 2), each with
     a load speed and a value, by their kind. Speeds are in rad/s and drawn in `unit`.
@@ -149,26 +161,54 @@ def stability_chart(
     edges = cell_edges(value, logarithmic)
     if value.size > 1:
         edges = np.clip(edges, value[0], value[-1])  # nothing is known beyond the first and the last value
-    for speeds, is_stable, low, high in zip(omega, stable, edges[:-1], edges[1:], strict=True):
+    ends = float(np.nanmin(omega)), float(np.nanmax(omega))
+    missing = [_gaps(speeds, *ends) for speeds in omega]
+    for speeds, is_stable, gaps, low, high in zip(omega, stable, missing, edges[:-1], edges[1:], strict=True):
         axes.fill_between(scale * speeds, low, high, where=is_stable, color="#cfe3d6", lw=0.0)
+        if gaps:
+            spans = [(scale * start, scale * (end - start)) for start, end in gaps]
+            axes.broken_barh(spans, (low, high - low), **HATCHED[NO_RESULT])
     if logarithmic:
         axes.set_yscale("log")
     axes.margins(y=0.05)  # room for the marks of the first and the last value
-    low, high = scale * np.nanmin(omega), scale * np.nanmax(omega)
-    if low < high:
-        axes.set_xlim(low, high)
+    if ends[0] < ends[1]:
+        axes.set_xlim(scale * ends[0], scale * ends[1])
     for k, (kind, points) in enumerate(marks.items()):
         # Points of different kinds can lie on each other: hollow marks of different sizes remain visible.
         look: Look = {"mec": color_of(k), "mfc": "none", "mew": 1.4, "ms": max(9.0 - 2.0 * k, 3.0), "ls": ""}
         axes.plot(scale * points[:, 0], points[:, 1], "os^D"[k % 4], label=kind, **look)
     if logarithmic:
         log_ticks(axes)
-    axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
+    areas: dict[str, Look] = {
+        "stable": {"facecolor": "#cfe3d6", "lw": 0.0},
+        "unstable": {"facecolor": "white", "edgecolor": "#b3b3b3", "lw": 0.8},
+        "no jam found": HATCHED[NO_RESULT],
+    }
+    entries = [Patch(label=name, **look) for name, look in areas.items() if name != "no jam found" or any(missing)]
     on_axis: Look = {"transform": axes.get_yaxis_transform(), "clip_on": False}
     axes.plot(np.zeros(value.size), value, "o", ms=3.0, mfc="white", mec="black", label="computed values", **on_axis)
     axes.set(xlabel=f"load speed, {unit}", ylabel=label)
-    legend_above(axes, 1)
+    # Long names of the marks are in the first column, otherwise the legend would be wider than the figure.
+    legend_above(axes, 2, handles=[*axes.get_legend_handles_labels()[0], *entries])
     return figure if ax is None else ax
+
+
+def _gaps(speeds: np.ndarray, low: float, high: float) -> list[tuple[float, float]]:
+    """Return the parts of the range from `low` to `high` in which ascending `speeds` (P,) are NaN.
+
+    >>> nan = float("nan")
+    >>> _gaps(np.array([1.0, nan, 3.0, 4.0, nan]), 1.0, 5.0)
+    [(1.0, 3.0), (4.0, 5.0)]
+    """
+    known = np.flatnonzero(np.isfinite(speeds))
+    if known.size == 0:
+        return [(low, high)]
+    found = speeds[known]
+    pairs = zip(found[:-1], found[1:], np.diff(known) > 1, strict=True)
+    inside = [(float(start), float(end)) for start, end, is_gap in pairs if is_gap]
+    outside = [(low, float(found[0])), (float(found[-1]), high)]
+    rounding = 1e-9 * (high - low)
+    return sorted(gap for gap in [*inside, *outside] if gap[1] - gap[0] > rounding)
 
 
 def audit_chart(

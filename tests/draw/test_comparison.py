@@ -14,6 +14,7 @@ from jaxvib.draw.comparison import (
     steps_chart,
     tiers_chart,
 )
+from jaxvib.draw.style import HATCHED, NO_RESULT
 
 EPS = np.finfo(float).eps
 
@@ -87,6 +88,20 @@ def test_bands_of_stable_jams_meet_midway(value, scale, edges):
     assert axis.get_xlabel() == "load speed, Hz"
     (computed,) = (line for line in axis.lines if line.get_label() == "computed values")
     np.testing.assert_array_equal(computed.get_xydata(), [[0.0, each] for each in value])
+    names = [text.get_text() for text in axis.get_legend().get_texts()]
+    assert names == ["fold", "computed values", "stable", "unstable"]
+
+
+def test_load_speeds_without_a_jam_are_hatched_and_named():
+    nan = np.nan
+    omega = np.array([[1.0, 2.0, 3.0, 4.0, 5.0], [nan, 2.0, 3.0, nan, 5.0], [nan] * 5])
+    stable = np.array([[True, True, False, False, False], [False, True, True, False, False], [False] * 5])
+    axis = stability_chart(np.array([1.0, 2.0, 3.0]), omega, stable, {}, label="x", unit="rad/s").axes[0]
+    hatched = [area for area in axis.collections if area.get_hatch() == HATCHED[NO_RESULT]["hatch"]]
+    spans = [[(path.get_extents().x0, path.get_extents().x1) for path in area.get_paths()] for area in hatched]
+    assert spans == [[(1.0, 2.0), (3.0, 5.0)], [(1.0, 5.0)]]
+    names = [text.get_text() for text in axis.get_legend().get_texts()]
+    assert names == ["computed values", "stable", "unstable", "no jam found"]
 
 
 def test_an_audit_shows_changes_in_percent_from_the_least():

@@ -30,7 +30,7 @@ class StabilityMap(Result):
     **Attributes** (n values, P load speeds)
 
     - `value` (n,) of x
-    - `omega` (n, P): load speeds, rad/s
+    - `omega` (n, P): load speeds, rad/s, NaN where no jam was found
     - `stable` (n, P): True if the jam is stable, including against separation of the loads
     - `special` (n,): the special points of each diagram
     """
@@ -47,7 +47,7 @@ class StabilityMap(Result):
         """Share of the range of load speeds in which the jams are stable, (n,)."""
         widths = np.diff(self.omega, axis=1)
         stable = (self.stable[:, 1:].astype(float) + self.stable[:, :-1]) / 2.0
-        return np.sum(stable * widths, axis=1) / np.sum(widths, axis=1)
+        return np.nansum(stable * widths, axis=1) / (np.nanmax(self.omega) - np.nanmin(self.omega))
 
     def summary(self) -> str:
         """Return a line of text for each value: the stable share of the range, and the special points."""
@@ -58,8 +58,8 @@ class StabilityMap(Result):
         return "\n".join(lines)
 
     def plot(self, *, label: str = "x", unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot stable jams as shaded areas over the load speed in `unit` and x, with special points as marks; `label`: name of
-        x.
+        """Plot stable jams as shaded areas over the load speed in `unit` and x, hatched areas without a jam, and special points
+        as marks; `label`: name of x.
         """
         marks: dict[str, list[tuple[float, float]]] = {}
         for x, points in zip(self.value, self.special, strict=True):

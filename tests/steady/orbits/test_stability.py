@@ -144,6 +144,14 @@ def test_bands_of_the_stability_map_are_its_rows():
     assert whole.x0 <= legend.x0 and legend.x1 <= whole.x1 and axes.get_window_extent().width > 0.7 * whole.width
 
 
+def test_the_stable_share_counts_speeds_without_a_jam():
+    nan = np.nan
+    omega = np.array([[1.0, 2.0, 3.0, 4.0, 5.0], [nan, 2.0, 3.0, 4.0, nan]])
+    found = StabilityMap(np.array([1.0, 2.0]), omega, np.isfinite(omega), ((), ()))
+    np.testing.assert_allclose(found.stable_share, [1.0, 0.5])
+    assert "50.0 % of the load speeds stable" in found.summary()
+
+
 @pytest.mark.parametrize(("between", "says"), [((0.06, 0.08), "0.06 the diagram has a torus"), ((0.01, 0.02), "has no torus")])
 def test_an_onset_says_which_end_is_wrong(between, says):
     with pytest.raises(jv.InputError, match=says):
