@@ -256,6 +256,23 @@ def test_run_up_shows_the_resonances_that_it_passes():
     assert sorted(float(line.get_ydata()[0]) for line in dotted) == [-30.0, -20.0, 20.0, 30.0]
 
 
+def test_axes_of_averaged_amplitudes_and_forces_say_zero_to_peak():
+    time = np.linspace(0.0, 1.0, 50)
+    one, two, no_loads = np.ones((50, 1)), np.ones((50, 2)), np.zeros((50, 0))
+    figure = amplitude_histories(time, two, no_loads, one, one, names=["x", "psi"], units=["m", "rad"], unit="rad/s")
+    labels = [axis.get_ylabel().split("\n") for axis in figure.axes]
+    assert [label[1:] for label in labels] == [["zero to peak"], ["zero to peak"], [], ["zero to peak"]]
+    assert labels[-1][0] == "foundation force, N" and not any(axis.texts for axis in figure.axes)
+
+
+def test_the_band_of_an_averaged_run_names_short_intervals():
+    time = np.linspace(0.0, 1.0, 4000)
+    amplitude, one = 1.0 + 0.2 * np.sin(400.0 * time)[:, None], np.ones((4000, 1))
+    figure = amplitude_histories(time, amplitude, one[:, :0], one, one, names=["x"], units=["m"], unit="rad/s")
+    names = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert names == ["x", "band: lowest to highest value within short intervals"]
+
+
 def test_a_legend_ends_before_the_header_of_the_values():
     figure = before_after([("foundation force divided by the amplitude of a point at (0, 0.1) m, N/mm", 2.0, 1.0)])
     FigureCanvasAgg(figure).draw()

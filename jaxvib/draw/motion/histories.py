@@ -29,8 +29,8 @@ _MAX_BEATS, _SAMPLES_PER_INTERVAL, _MIN_SAMPLES = 20, 10, 1000
 """Maximum number of beats of an averaged history that is drawn as a curve. A history with more beats and at least
 `_MIN_SAMPLES` samples is drawn as a band between the minima and maxima of intervals of `_SAMPLES_PER_INTERVAL` samples."""
 
-_BEATING_BAND = "band: lowest to highest amplitude while it beats"
-"""Entry of a legend for the band of an averaged history."""
+_SHORT_INTERVALS = "band: lowest to highest value within short intervals"
+"""Entry of a legend for the band of an averaged history, which has a width where the amplitude beats or changes fast."""
 
 _ZERO_SHARE = 1e-9
 """Ratio of the last periods and the largest value of a run below which the last periods are rounding errors."""
@@ -341,8 +341,8 @@ def amplitude_histories(
     for axis, (kind, label, factor) in zip(axes, kinds, strict=False):
         of_kind = [k for k in range(len(names)) if units[k] == kind]
         lines(axis, factor * amplitude, of_kind, [names[k] for k in of_kind])
-        axis.set_ylabel(label)
-        _draw_legend(axis, band=_BEATING_BAND)
+        axis.set_ylabel(f"{label}\nzero to peak")
+        _draw_legend(axis, band=_SHORT_INTERVALS)
     for k, name in _equal_loads(load_speed, load_speed[-(load_speed.shape[0] // 4) :]):
         lines(axes[-2], scale * load_speed, [k], [name])
     _draw_rotor_speeds(axes[-2], time, scale * rotor_speed)
@@ -352,8 +352,7 @@ def amplitude_histories(
     axes[-2].set_ylabel(f"speed, {unit}")
     _draw_legend(axes[-2])
     lines(axes[-1], force, range(len(directions)), directions)
-    axes[-1].set_ylabel("foundation force, N")
-    _draw_legend(axes[-1], 2, _BEATING_BAND)
+    axes[-1].set_ylabel("foundation force, N\nzero to peak")
+    _draw_legend(axes[-1], 2, _SHORT_INTERVALS)
     axes[-1].set_xlabel("time, s")
-    axes[0].text(1.0, 1.02, "zero to peak", transform=axes[0].transAxes, ha="right", va="bottom", fontsize="small")
     return figure if ax is None else ax
