@@ -131,7 +131,8 @@ def _explain_names(function: Callable[..., Any], given: Mapping[str, Any], name:
 
 
 def with_known_names(function: F) -> F:
-    """Explain unknown keywords of a function that reads its other arguments itself, see `_explain_names`.
+    """Explain unknown keywords of a function, or of the constructor of a class, that reads its other arguments itself, see
+    `_explain_names`. A class is changed in place.
 
     >>> @with_known_names
     ... def disc(*, mass: float, radius: float) -> float:
@@ -141,16 +142,22 @@ def with_known_names(function: F) -> F:
         ...
     TypeError: disc() got an unexpected keyword argument 'raduis'; did you mean 'radius'? allowed: mass, radius
     """
+    # A named tuple has no constructor of its own but `__new__`.
+    constructor = "__new__" if isinstance(function, type) and issubclass(function, tuple) else "__init__"
+    inner = getattr(function, constructor) if isinstance(function, type) else function
 
-    @functools.wraps(function)
+    @functools.wraps(inner)
     def called(*args: Any, **kwargs: Any) -> Any:
         try:
-            return function(*args, **kwargs)
+            return inner(*args, **kwargs)
         except TypeError:
             _explain_names(function, kwargs, function.__name__)
             raise
 
-    return typing.cast(F, called)
+    if not isinstance(function, type):
+        return typing.cast(F, called)
+    setattr(function, constructor, staticmethod(called) if constructor == "__new__" else called)
+    return typing.cast(F, function)
 
 
 if typing.TYPE_CHECKING:

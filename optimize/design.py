@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxvib.boundary import with_known_names
 from jaxvib.machine.files import Tables
 from jaxvib.machine.numbers.named import find_number
 from jaxvib.machine.scene import Scene
@@ -36,6 +37,7 @@ class Catalogue(NamedTuple):
         return f"chosen {self.name}: {'; '.join(dict.fromkeys(self.rows[k] for k in nearest))}"
 
 
+@with_known_names
 @dataclass(frozen=True)
 class Design:
     """Design task.

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
+from jaxvib.boundary import with_known_names
 from jaxvib.display import Axes, Drawn, shown_unit
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -46,6 +47,7 @@ class SynthesisStatus(eqx.Enumeration):
     interrupted = "the search was interrupted: this is its best design"
 
 
+@with_known_names
 @dataclass(frozen=True)
 class Outcome:
     """Quantities of a machine in one jam mode, or in the working regime of its exciters; NaN if there is no such motion.

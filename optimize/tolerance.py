@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import validated, with_known_names
 from jaxvib.errors import ComputationError, InputError, quoted, suggest_name
 from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, present_numbers, put_numbers, put_present
 from jaxvib.machine.scene import Scene
@@ -37,6 +37,7 @@ _STATISTIC = re.compile(r"\b(worst|expected|\d+% quantile of) ")
 _DEFAULT_SAMPLES = 128
 
 
+@with_known_names
 class ToleranceRange(NamedTuple):
     """Range of a quantity over machines within tolerances.
 

@@ -1,7 +1,10 @@
 """Arguments of public functions against their annotations."""
 
+import copy
 import decimal
+import inspect
 import pathlib
+import pickle
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, Union
 
@@ -16,6 +19,7 @@ from numpy.typing import ArrayLike
 from scenes import scene
 
 import jaxvib as jv
+import optimize
 from jaxvib.boundary import Axes, Figure, _alternatives, call_user, is_real, is_whole, validated
 from jaxvib.errors import require_path
 from jaxvib.units import Number
@@ -217,6 +221,29 @@ def test_an_unknown_name_remains_a_type_error():
 def test_unknown_names_of_arguments_are_explained(make, name, says):
     with pytest.raises(TypeError, match=says):
         make(**{name: 1.0})
+
+
+PUBLIC = {name: getattr(package, name) for package in (jv, optimize) for name in package.__all__}
+
+
+def is_made_by_call(public):
+    """Return False for values, and for exceptions and enumerations, which users do not make."""
+    return (
+        callable(public) and not (isinstance(public, type) and issubclass(public, Exception)) and not hasattr(public, "promote")
+    )
+
+
+@pytest.mark.parametrize("name", sorted(name for name, public in PUBLIC.items() if is_made_by_call(public)))
+def test_every_public_callable_explains_unknown_names(name):
+    with pytest.raises(TypeError, match=rf"^{name}\(\) .* 'no_such'; (did you mean .*allowed|allowed|it has no arguments)"):
+        PUBLIC[name](no_such=1.0)
+
+
+@pytest.mark.parametrize("named", [jv.Tolerance(1e-6), jv.Vibration(*jv.Vibration._fields)])
+def test_classes_with_explained_names_remain_classes(named):
+    kind = type(named)
+    assert isinstance(kind, type) and pickle.loads(pickle.dumps(named)) == named and copy.copy(named) == named
+    assert "args" not in inspect.signature(kind).parameters
 
 
 def test_numbers_and_paths_are_known_by_their_kind():

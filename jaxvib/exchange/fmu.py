@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import validated, with_known_names
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, require_one_of, require_writable, with_ending, written
 from jaxvib.exchange.c_code import CProgram, number_text, write_program
@@ -51,6 +51,7 @@ _PLATFORMS = {
 """Folders of binaries in FMI 2.0 and in FMI 3.0, and the file name extension."""
 
 
+@with_known_names
 class Fmu(NamedTuple):
     """Exported functional mock-up unit.
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import validated, with_known_names
 from jaxvib.equations.averaged import Amplitudes, averaged_field
 from jaxvib.equations.linear import linear_model, mean_speed
 from jaxvib.errors import InputError, optional_module, quoted, require_writable, with_ending, written
@@ -47,6 +47,7 @@ _IN_JAM = (
 )
 
 
+@with_known_names
 class StateSpace(NamedTuple):
     """Linear model x' = A x + B u, y = C x + D u with named signals.
 

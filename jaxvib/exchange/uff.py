@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import validated, with_known_names
 from jaxvib.equations.linear import estimated_frequencies, linear_model
 from jaxvib.errors import InputError, open_regular, optional_module, quoted, require_one_of, require_writable, written
 from jaxvib.exchange.state_space import state_space
@@ -64,6 +64,7 @@ class _Node(NamedTuple):
     rows: np.ndarray
 
 
+@with_known_names
 class UffFunction(NamedTuple):
     """Function of a universal file.
 
@@ -88,6 +89,7 @@ class UffFunction(NamedTuple):
     about: str
 
 
+@with_known_names
 class UffFile(NamedTuple):
     """Contents of a universal file: `functions`; `nodes`, the position (x, y, z) in m of each node by its number.
 

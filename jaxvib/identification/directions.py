@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxvib.boundary import with_known_names
 from jaxvib.identification.fit import Fitted, polar_unbalances
 from jaxvib.identification.problem import Problem
 
@@ -40,6 +41,7 @@ _ADDED_MASS = ", or record a run with a known mass added"
 _ADVICE = f"give one of these parameters as known{_ADDED_MASS}"
 
 
+@with_known_names
 class Direction(NamedTuple):
     """Combination of parameters that the records do not determine. Returned by `identify` in a `MachineFit`.
 

@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from jaxvib.boundary import call_user
+from jaxvib.boundary import call_user, with_known_names
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import terms_of
@@ -67,6 +67,7 @@ _SEGMENT_TURNS = 2.0e4
 segments."""
 
 
+@with_known_names
 @dataclass(frozen=True)
 class Tolerance:
     """Steps whose error is at most `tolerance`, both relative and absolute in natural units.
@@ -90,6 +91,7 @@ class Tolerance:
         require_real(self.tolerance, "", "tolerance")
 
 
+@with_known_names
 @dataclass(frozen=True)
 class Accuracy:
     """Steps with which the estimated error of the whole result is at most `error`. The run is repeated to find these steps.
@@ -110,6 +112,7 @@ class Accuracy:
         require_real(self.error, "", "error")
 
 
+@with_known_names
 @dataclass(frozen=True)
 class EqualSteps:
     """A number of steps of equal length.

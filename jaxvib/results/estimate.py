@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import validated, with_known_names
 from jaxvib.errors import InputError, quoted
 
 
@@ -23,6 +23,7 @@ class Estimate(NamedTuple):
     high: float
 
 
+@with_known_names
 class Share(NamedTuple):
     """Share of the cases in which a statement is true.
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import with_known_names
 from jaxvib.numerics.extrema import sampled_maximum
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.runtime.programs import cached
@@ -43,6 +44,7 @@ def periodic_samples(orders: tuple[int, ...], speed: Array, displacement: Array,
     return Samples(theta / speed, q, v, a, (force @ wave).real.T)
 
 
+@with_known_names
 class Vibration(NamedTuple):
     """Vibration of a machine at one speed of its exciters, q = Re(displacement exp(i w t)).
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias, TypeVar, cast
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.boundary import call_user, validated
+from jaxvib.boundary import call_user, validated, with_known_names
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns
@@ -42,6 +42,7 @@ _UNIT = re.compile(r"[+-]?[\d.]+(?:[eE][+-]?\d+)?\s*(\S.*)")
 """Pattern of a limit that is written with a unit, such as "2 mm"."""
 
 
+@with_known_names
 @dataclass(frozen=True, repr=False)
 class Quantity:
     """Function of a scene with a scalar value, a name and a unit. Quantities can be added, multiplied and compared.
@@ -318,6 +319,7 @@ class Combined(Quantity):
         return super().pieces(evaluation, sign)
 
 
+@with_known_names
 @dataclass(frozen=True, repr=False)
 class Demand:
     """Condition that a quantity is at most, or at least, a value or another quantity.

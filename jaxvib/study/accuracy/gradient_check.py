@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from jaxvib.boundary import call_user, is_real, validated
+from jaxvib.boundary import call_user, is_real, validated, with_known_names
 from jaxvib.display import Axes, Drawn
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, put_numbers
@@ -51,6 +51,7 @@ class GradientStatus(eqx.Enumeration):
     )
 
 
+@with_known_names
 class ImplicitRoute(NamedTuple):
     """Quantity that is computed from the solution of an equation.
 
