@@ -42,7 +42,7 @@ _MAX_SPREAD_OF_MEAN = 0.2
 _MIN_SHOWN_RIPPLE = 0.01
 """Smallest variation of the rotor speeds about their means, relative to the largest speed, that the text of a run states."""
 
-_MAX_SHOWN_AS_MEAN = 0.01
+_MAX_SHOWN_AS_MEAN = 0.03
 """Largest difference between the mean speeds at the end of a window and in the whole window, relative to the largest speed, of
 a text that states the means of the window only."""
 
@@ -152,7 +152,7 @@ class AbstractMeasured(Readable):
         (loads,), differ from those of the window, because a mass passed a resonance in it, the text begins with them.
         """
         mean, end = np.asarray(self.load_speed), np.asarray(self.load_speed if last_speed is None else last_speed)
-        if np.max(np.abs(end - mean)) > _MAX_SHOWN_AS_MEAN * np.max(np.abs(end)):
+        if not bool(self.settled) and np.max(np.abs(end - mean)) > _MAX_SHOWN_AS_MEAN * np.max(np.abs(end)):
             recent = [np.asarray(speeds)[last_samples(len(speeds))] for speeds in rotor_speeds]
             at_end = dataclasses.replace(self, load_speed=end, omega=np.mean(turning_directions(scene) * end))
             means = f"means of the window, in which the speeds change: {speed_text(mean, 6)}"

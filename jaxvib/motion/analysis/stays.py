@@ -138,7 +138,8 @@ def _parts(time: np.ndarray, speed: np.ndarray, target: np.ndarray, period: floa
         j = int(np.argmax(duration))
         n = end[j] + 1 - begin[j]
         speed_and_target = [(each[end[j] + 1] - each[begin[j]]) / n for each in (total, total_target)]
-        if speed_and_target[0] < _MAX_SPEED_RATIO * speed_and_target[1]:
+        has_passed = speed_and_target[0] < mean[-1] / (1.0 + _NEARBY)
+        if has_passed and speed_and_target[0] < _MAX_SPEED_RATIO * speed_and_target[1]:
             parts.append(_Part(float(time[begin[j]]), float(time[end[j]]), *map(float, speed_and_target)))
         duration = np.where((begin <= end[j]) & (end >= begin[j]), 0.0, duration)
     return parts

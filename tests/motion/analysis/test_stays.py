@@ -52,6 +52,7 @@ def test_a_stay_is_found_at_its_times_and_speed():
         pytest.param(60.0 * -np.expm1(-TIME / 3.0), id="exponential"),
         pytest.param(60.0 * -np.expm1(-TIME / 15.0), id="slow"),
         pytest.param(np.minimum(9.0 * TIME, 27.0), id="still jammed"),
+        pytest.param(np.minimum(9.0 * TIME, 27.0) + 3.0 * np.sin(4.8 * TIME) * (TIME > 3.0), id="still jammed, swings"),
         pytest.param(60.0 * np.exp(-TIME / 5.0), id="coasting"),
         pytest.param(held(3.0, 4.5), id="short"),
     ],
