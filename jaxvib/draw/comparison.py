@@ -221,11 +221,12 @@ def audit_chart(
 ) -> Drawn:
     """Draw the relative changes (n,) that n effects with these `labels` cause, a marker for each quantity.
 
-    A line marks the requested `accuracy`; changes below their `uncertainty` (n,) lie in a grey range.
+    A line marks the requested `accuracy`; changes below their `uncertainty` (n,) lie in a grey range. The axis shows the sizes
+    of the changes, without signs.
 
     >>> figure = audit_chart(["gravity"], {"amplitude": np.array([1e-4])}, np.array([1e-6]), 0.01)
     >>> figure.axes[0].get_xlabel()
-    'change, %'
+    'size of the change, %'
     """
     n = len(labels)
     figure, (left,) = panels(1, size=(8.0, 1.6 + 0.34 * max(n, 3)), ax=ax)
@@ -246,7 +247,9 @@ def audit_chart(
     log_ticks(left, "x")
     left.axvline(100.0 * accuracy, color="black", ls=":", lw=1.2, label="requested accuracy")
     left.set_yticks(place, labels)
-    left.set(ylim=(n - 0.4, -0.6), xlabel="change, %")
+    beyond = any(np.any(values < low / 100.0) for values in changes.values())
+    note = " (on the left edge: smaller)" if beyond else ""
+    left.set(ylim=(n - 0.4, -0.6), xlabel=f"size of the change, %{note}")
     legend_above(left, 3)
     return figure if ax is None else ax
 

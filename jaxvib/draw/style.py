@@ -11,8 +11,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
+from matplotlib.transforms import Bbox
 
 from jaxvib.display import Onto, shown_unit
 from jaxvib.errors import InputError, quoted
@@ -252,13 +254,15 @@ def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str
     low, high = axis.get_ylim()
     inside = sorted((k for k, y in enumerate(heights) if np.isfinite(y) and low <= y <= high), key=lambda k: heights[k])
     to_share = axis.transScale + axis.transLimits
+    taken = [line.get_transform().transform_path(line.get_path()) for line in axis.lines]
     for k in inside:
         axis.plot([x], [heights[k]], "o", ms=4.5, mfc="black" if filled[k] else "white", mec="black", zorder=4)
     for share, text in join_names([(float(to_share.transform((x, heights[k]))[1]), names[k]) for k in inside if names[k]]):
+        place = (x, to_share.inverted().transform((0.0, share))[1])
         axis.annotate(
             text,
-            (x, to_share.inverted().transform((0.0, share))[1]),
-            xytext=(6, 0),
+            place,
+            xytext=_free_place(axis, place, text, taken),
             textcoords="offset points",
             va="center",
             fontsize="small",
@@ -266,6 +270,30 @@ def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str
             zorder=5,
             path_effects=WHITE_OUTLINE,
         )
+
+
+_PLACES_BESIDE = tuple((right, up) for right in (6.0, 12.0) for up in (0.0, 7.0, -7.0, 10.0, -10.0, 13.0, -13.0))
+"""Places of the left end of a text beside its point, in points, the best one first."""
+
+
+def _free_place(axis: Axes, place: tuple[float, float], text: str, taken: list[Path]) -> tuple[float, float]:
+    """Return the first place beside a point at which a small text crosses as few of the `taken` paths, in pixels, as possible,
+    and add the outline of the text to them."""
+    pixels = axis.figure.dpi / 72.0
+    x, y = axis.transData.transform(place)
+
+    def box_at(beside: tuple[float, float]) -> Bbox:
+        left, middle = x + pixels * (beside[0] - 1.0), y + pixels * beside[1]
+        return Bbox.from_bounds(left, middle - 4.5 * pixels, (5.5 * len(text) + 2.0) * pixels, 9.0 * pixels)
+
+    def crossed(beside: tuple[float, float]) -> int:
+        box = box_at(beside)
+        outside = not axis.bbox.y0 <= box.y0 < box.y1 <= axis.bbox.y1
+        return sum(path.intersects_bbox(box, filled=False) for path in taken) + outside
+
+    best = min(_PLACES_BESIDE, key=crossed)
+    taken.append(Path(box_at(best).corners()[[0, 1, 3, 2, 0]]))
+    return best
 
 
 def join_names(named: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:

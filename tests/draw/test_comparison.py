@@ -121,6 +121,9 @@ def test_an_audit_shows_changes_in_percent_from_the_least():
 def test_an_audit_of_large_changes_begins_below_the_accuracy():
     axis = audit_chart(["gravity"], {"force": np.array([0.2])}, np.array([1e-7]), 0.03).axes[0]
     assert axis.get_xlim()[0] == pytest.approx(1.0)  # a third of 3 %
+    assert axis.get_xlabel() == "size of the change, %"
+    without = audit_chart(["gravity"], {"force": np.array([0.0])}, np.array([1e-7]), 0.03).axes[0]
+    assert without.get_xlabel() == "size of the change, % (on the left edge: smaller)"
 
 
 def test_differences_of_a_derivative_are_ringed_at_the_best_step():

@@ -62,6 +62,20 @@ def test_labels_that_nearly_touch_are_merged():
     assert [line.get_markerfacecolor() for line in axis.lines] == ["black", "white", "black"]
 
 
+def test_numbers_of_points_cross_no_curve_and_no_other_number():
+    figure, (axis,) = panels(1)
+    x, levels = np.linspace(0.0, 1.0, 11), [0.3, 0.46, 0.62]
+    for y in levels:
+        axis.plot(x, np.full(11, y))
+    axis.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
+    numbered(axis, 0.5, levels, ["1", "2", "3"], [True, True, False])
+    figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in axis.texts]
+    curves = [line.get_transform().transform_path(line.get_path()) for line in axis.lines[:3]]
+    assert len(boxes) == 3 and not any(curve.intersects_bbox(box, filled=False) for curve in curves for box in boxes)
+    assert not any(box.overlaps(other) for box, other in itertools.combinations(boxes, 2))
+
+
 def diagram(**options):
     omega = np.linspace(1.0, 5.0, 81)
     speed = omega + 4.0 / (1.0 + 9.0 * (omega - 3.0) ** 2)
