@@ -128,9 +128,8 @@ _SPACING = np.pi / _DIRECTIONS
 _DIRECTION_STEPS = 4
 """Steps of Newton's method from the best of these directions."""
 
-_MIN_BEND = 1e-2
-"""Smallest second derivative of the width with respect to the direction, relative to the width, of a path that has a direction:
-an ellipse whose semi-axes differ by 0.5 %. Samples of a circle have smaller ones, because their extrema are interpolated."""
+_MIN_DIFFERENCE = 1e-3
+"""Smallest relative difference between the widths in two directions of a path that is not a circle."""
 
 
 def largest_extent(path: Array) -> Extent:
@@ -144,18 +143,19 @@ def largest_extent(path: Array) -> Extent:
     def width(direction: Array) -> Array:
         return 2.0 * half_range(path @ jnp.stack([jnp.cos(direction), jnp.sin(direction)]))
 
-    def improved(direction: Array) -> tuple[Array, Array]:
-        """The direction after a step of Newton's method, and False for an extent that is the same in all directions."""
-        bend, size = jax.lax.stop_gradient((jax.grad(jax.grad(width))(direction), width(direction)))
-        has_axis = -bend > _MIN_BEND * size
-        change = jnp.where(has_axis, jax.grad(width)(direction), 0.0) / jnp.where(has_axis, -bend, 1.0)
-        return direction + jnp.clip(change, -_SPACING, _SPACING), has_axis
+    def improved(direction: Array) -> Array:
+        """The direction after a step of Newton's method."""
+        bend = jax.lax.stop_gradient(jax.grad(jax.grad(width))(direction))
+        moves = has_axis & (bend < 0.0)
+        change = jnp.where(moves, jax.grad(width)(direction), 0.0) / jnp.where(moves, -bend, 1.0)
+        return direction + jnp.clip(change, -_SPACING, _SPACING)
 
     angles = jnp.asarray(_SPACING * np.arange(1, _DIRECTIONS + 1) - 0.5 * np.pi, path.dtype)
     widths = jnp.ptp(jax.lax.stop_gradient(path) @ jnp.stack([jnp.cos(angles), jnp.sin(angles)]), axis=0)
-    direction, has_axis = angles[jnp.argmax(widths)], jnp.asarray(True)
+    has_axis = jnp.min(widths) < (1.0 - _MIN_DIFFERENCE) * jnp.max(widths)
+    direction = angles[jnp.argmax(widths)]
     for _ in range(_DIRECTION_STEPS):
-        direction, has_axis = improved(jax.lax.stop_gradient(direction))
+        direction = improved(jax.lax.stop_gradient(direction))
     stroke = width(jax.lax.stop_gradient(direction))
     turned = jnp.where(has_axis, direction, 0.0)
     return Extent(stroke, 0.5 * jnp.arctan2(jnp.sin(2.0 * turned), jnp.cos(2.0 * turned)))
