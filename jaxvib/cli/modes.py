@@ -115,7 +115,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
 
     def text() -> str:
         from jaxvib.display import speed_text  # slow imports, which --help does not need
-        from jaxvib.steady.jams.jam import modes_table
+        from jaxvib.steady.jams.jam import modes_table, side_by_side_lines
 
         head, *rows = modes_table(modes_found, growth)
         lines = [
@@ -123,7 +123,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
             table("jam modes (light loads)", head, rows) if rows else "no jam mode was found at this speed",
         ]
         if rows:
-            lines.append("amplitudes and foundation force are zero to peak")
+            lines += ["amplitudes and foundation force are zero to peak", *side_by_side_lines(scene)]
         if any(row[2].startswith("no") for row in rows):
             lines.append("not stable: after a small disturbance the loads (balls, rollers, pendulums) leave this jam")
         lines += [text] if (text := modes_found.missing_text()) else []

@@ -142,6 +142,15 @@ def test_modes_limit_the_drag_of_touching_balls(typed, tmp_path):
     assert "greatest drag of touching balls; in the jams they count as points" in " ".join(printed.split())
 
 
+def test_modes_say_that_touching_balls_lie_side_by_side(typed, tmp_path):
+    balls = jv.balls(count=2, mass=0.8, ball_radius=0.03, radius=0.12, drag=0.5)
+    table = jv.Scene(jv.one_mass(mass=120.0, stiffness=5e4, damping=100.0), balls, jv.ConstantSpeed(60.0))
+    said = "balls lie side by side; their stability is that of points at one angle (phase_jams: points at any phases)"
+    for machine, is_said in ((table, True), (equal_points(table), False)):
+        jv.save_scene(machine, tmp_path / "table.toml")
+        assert (said in typed("modes", "table.toml")[1]) == is_said
+
+
 def test_modes_name_a_resonance_without_a_peak(typed, tmp_path):
     plain = scene("two_mass", speed=150.0)
     damped = eqx.tree_at(lambda s: s.machine.damping, plain, 30.0 * plain.machine.damping)

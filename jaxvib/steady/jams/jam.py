@@ -52,6 +52,14 @@ STABILITY_OF_FREE_LOADS = "for light loads, each of which is free to move separa
 _UNRESOLVED = "no peak of its own on the branch (strong damping, a close resonance, or an exciter that does not move)"
 
 
+def side_by_side_lines(scene: Scene) -> list[str]:
+    """Return a line about balls that lie side by side in jam modes; an empty list for loads at one point."""
+    loads = jammed_loads(scene)
+    if loads.ball_radius is None or loads.count == 1 or not loads.alike:
+        return []
+    return ["balls lie side by side; their stability is that of points at one angle (phase_jams: points at any phases)"]
+
+
 class JamStatus(eqx.Enumeration):
     """Outcomes of a jam mode. The value of each member is the message shown to the user."""
 
@@ -224,6 +232,7 @@ class JamModes(AbstractJam):
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         rows = ("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in lines)
         notes = [text] if (text := self.missing_text()) else []
+        notes += [] if scene is None else side_by_side_lines(scene)
         is_known = any(map(math.isfinite, growth.values()))
         notes += [f"stable: {STABILITY_OF_FREE_LOADS if is_known else STABILITY_CRITERION}"]
         notes += ["(summary(scene) computes whether they stay together)"] if scene is None else []

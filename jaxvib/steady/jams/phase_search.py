@@ -123,7 +123,10 @@ class PhaseJams(AbstractPhaseJam):
     def summary(self) -> str:
         """Return a line for each jam, see `distinct`; phases in degrees."""
         jams = [self.select(each[0]).summary() + images_text(each) for each in self.distinct] or ["no jam"]
-        as_points = "loads count as points: jams at free phases do not include their ball_radius"
+        as_points = (
+            "loads count as points: jams at free phases do not include their ball_radius\n"
+            "(jam_modes places equal loads side by side)"
+        )
         return "\n".join([*jams, *([] if getattr(self.scene.loads, "ball_radius", None) is None else [as_points])])
 
     @validated

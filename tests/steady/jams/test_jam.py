@@ -239,7 +239,10 @@ def test_summary_with_a_scene_states_whether_loads_stay_together():
     text = jv.jam_modes(s).summary(s)
     stable = {line.split()[0]: " ".join(line.split()[2:]) for line in text.splitlines()[2:-1]}
     assert stable["3"].startswith("yes ") and stable["4"].startswith("no ") and stable["5"].startswith("no: the loads spread ")
-    assert text.endswith("stable: for light loads, each of which is free to move separately")
+    assert text.endswith("stable: for light loads, each of which is free to move separately") and "side by side" not in text
+    sized = s.replace(loads=jv.balls(count=3, mass=0.8, radius=0.12, ball_radius=0.03, drag=1.5))
+    said = "balls lie side by side; their stability is that of points at one angle (phase_jams: points at any phases)\n"
+    assert said in jv.jam_modes(sized).summary(sized) and said[:-1] not in jv.jam_modes(sized).summary()
 
 
 def test_vmap_over_rotor_speeds_is_a_loop():
