@@ -165,6 +165,10 @@ def _largest_lever(machine: Machine) -> float:
     return float(max(places, default=0.0))
 
 
+_MIN_USUAL_RPM = 10.0
+"""Lowest usual speed of an exciter, rpm. A lower one of few digits probably has a point between its thousands."""
+
+
 def implausible_numbers(scene: Scene) -> list[str]:
     """Return a sentence for each parameter of a scene that was probably intended in another unit.
 
@@ -186,6 +190,9 @@ def implausible_numbers(scene: Scene) -> list[str]:
         speed = float(exciter.drive.speed)
         if speed > MAX_USUAL_SPEED and _is_short(speed):
             note(f"{place}drive.speed", speed_text(speed), "rad/s", f"{speed:g} rpm")
+        if 0.0 < (rpm := speed * 30.0 / np.pi) < _MIN_USUAL_RPM and _is_short(rpm):
+            thousands = f"{1e3 * rpm:g} rpm"
+            notes.append(f"{place}drive.speed is {rpm:g} rpm; a point separates decimals: did you mean '{thousands}'?")
         name, frequency = _supply_frequency(exciter.drive)
         if _is_short(frequency) and any(math.isclose(frequency, hertz, rel_tol=_SUPPLY_TOLERANCE) for hertz in _SUPPLIES):
             note(f"{place}{name}", f"{frequency / (2.0 * np.pi):.4g} Hz", "rad/s", f"{frequency:g} Hz")
@@ -212,7 +219,7 @@ def implausible_numbers(scene: Scene) -> list[str]:
             note("machine.mass", value, "kg", f"{mass:g} t")
         if amplitude < _MIN_AMPLITUDE:
             value = f"so small that it moves the machine by {1e6 * amplitude:.3g} µm"
-            note("exciters.unbalance", value, "kg m, a plain force in N", "kN")
+            note("exciters.unbalance", value, "kg m, a plain force in N", "kg m' or 'kN")
     if mass > _MAX_MASS:
         note("machine.mass", f"{mass / 1e3:g} t", "kg", f"{mass / 1e3:g} kg")
     supports = [each.stiffness for each in getattr(scene.machine, "supports", ())]

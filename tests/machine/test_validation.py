@@ -197,6 +197,16 @@ def test_only_plain_speeds_are_noted(speed, count):
     assert len(implausible_numbers(scene)) == count
 
 
+@pytest.mark.parametrize(
+    ("speed", "shown", "meant"), [("1.450 1/min", "1.45", "1450"), ("0.975 rpm", "0.975", "975"), ("0.16 rad/s", "", "")]
+)
+def test_speeds_with_a_point_between_thousands_are_noted(speed, shown, meant):
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    notes = implausible_numbers(jv.Scene(machine, exciters=[jv.Exciter(unbalance=0.05, drive=jv.ConstantSpeed(speed))]))
+    says = f"drive.speed is {shown} rpm; a point separates decimals: did you mean '{meant} rpm'?"
+    assert notes == [says] * bool(meant)
+
+
 def test_a_stiffness_far_below_the_others_is_noted():
     says = "but another one is {} N/m; a plain number is in N/m: did you mean '{} N/mm'?"
     feeder = SCREENS["feeder"].replace('["80 N/mm", "126 N/mm"]', '["80 N/mm", 126]', 1)
@@ -221,7 +231,7 @@ def test_implausible_bodies_in_a_plane_are_noted():
     heavy = SCREENS["feeder"].replace("mass = 400.0", "mass = 400e3")
     assert implausible_numbers(jv.scene_from_toml(heavy)) == [
         "exciters.unbalance is so small that it moves the machine by 2.03 µm; a plain number is in kg m, a plain force in N: "
-        "did you mean 'kN'?",
+        "did you mean 'kg m' or 'kN'?",
         "machine.mass is 400 t; a plain number is in kg: did you mean '400 kg'?",
     ]
     motor = 'kind = "name_plate_motor"\npower = 1.1\nrated_speed = "930 rpm"\nbreakdown_ratio = 2.6\ninertia = 0.6\n'
