@@ -76,6 +76,21 @@ from jaxvib.units.reading import _FACTORS, in_own_unit, to_float, unit_ratio
         ("1500 u/min", "rad/s", 50 * np.pi),
         ("1500 CPM", "rad/s", 50 * np.pi),
         ("25 Hertz", "rad/s", 50 * np.pi),
+        ("1500/min", "rad/s", 50 * np.pi),
+        ("1500 / min", "rad/s", 50 * np.pi),
+        ("\u22125 kg", "kg", -5.0),
+        ("\u22125", "kg", -5.0),
+        ("5e\u22123 m", "m", 5e-3),
+        ("1 234 kg", "kg", 1234.0),
+        ("1\u00a0234\u00a0567.5\u00a0kg", "kg", 1234567.5),
+        ("12\u2009345", "N", 12345.0),
+        ("4 x 1 250 N/mm", "N/m", 5e6),
+        ("1\u202f500 rpm", "rad/s", 50 * np.pi),
+        ("2 g", "m/s^2", 2 * 9.80665),
+        ("2 g", "kg", 0.002),
+        ("5 Newton", "N", 5.0),
+        ("5 Newton meter", "N m", 5.0),
+        ("10 ftlbf", "N m", 10.0 * 4.4482216152605 * 0.3048),
         ("5.5 KW", "W", 5500.0),
         ("4.4e4", "N/m", 4.4e4),
         (44, "N/m", 44.0),
@@ -180,7 +195,9 @@ def test_pint_quantities_come_in():
         number(units.Quantity(3.0, "kg"), "N/m", "field")
 
 
-@pytest.mark.parametrize("text", ["1 500 N/m", "1500 N/m 2", "N/m", "(1500 N/m", "1500 (N/m", "1500/0 N/m", "1.5 N/m,", ""])
+@pytest.mark.parametrize(
+    "text", ["1 50 N/m", "15 00 N/m", "1500 N/m 2", "N/m", "(1500 N/m", "1500 (N/m", "1500/0 N/m", "1.5 N/m,", ""]
+)
 def test_text_that_only_looks_like_a_number_is_refused(text):
     with pytest.raises(jv.InputError, match=r"which is not in N/m; write for example '1.5 N/m'"):
         to_float(text, "N/m", "machine.stiffness")
@@ -217,6 +234,8 @@ def test_masses_with_several_meanings_are_refused(text, meanings):
     [
         ("150 lb/in", "N/m", "a pound is a mass; for the force write '150 lbf/in', or N"),
         ("10 ft-lb", "N m", "a pound is a mass; for the force write '10 ft-lbf', or N"),
+        ("10 ftlb", "N m", "a pound is a mass; for the force write '10 ft lbf', or N"),
+        ("10 kgcm", "N m", "a kilogram is a mass; for the force write '10 kgf cm', or N"),
         ("10 oz in", "N m", "an ounce is a mass; for the force write '10 ozf in', or N"),
         ("3 kg/mm", "N/m", "a kilogram is a mass; for the force write '3 kgf/mm', or N"),
         ("10 lbs", "N", "a pound is a mass; for the force write '10 lbf', or N"),
@@ -247,6 +266,39 @@ def test_a_speed_must_say_what_it_counts(text):
 def test_a_decimal_comma_has_its_own_message(text, advice):
     with pytest.raises(jv.InputError, match=f"'{text}', with a comma; {re.escape(advice)}$"):
         to_float(text, "N/m", "machine.stiffness")
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "advice"),
+    [
+        ("1.234,5 kg", "kg", "1234.5 kg"),
+        ("1,234.5 kg", "kg", "1234.5 kg"),
+        ("1.234.567 kg", "kg", "1234567 kg"),
+        ("1'450 rpm", "rad/s", "1450 rpm"),
+        ('1.234"', "m", "1.234 in"),
+        ("1.234,567'", "m", "1234.567 ft"),
+        ("1/2 in", "m", "0.5 in"),
+        ("1 1/2 in", "m", "1.5 in"),
+        ('3/4"', "m", "0.75 in"),
+        ("10″", "m", "10 in"),
+        ("5'", "m", "5 ft"),
+    ],
+)
+def test_shorthand_is_refused_with_the_right_text(text, unit, advice):
+    with pytest.raises(jv.InputError, match=f"field is [\"']{re.escape(text)}[\"']; write '{re.escape(advice)}'$"):
+        number(text, unit, "field")
+    assert float(number(advice, unit, "field")) > 0.0
+
+
+def test_long_texts_are_refused_at_once():
+    for text in ("1" * 10**6 + " kg", "1 " * 10**6, "1 234" * 10**6, "1'234" * 10**6):
+        with pytest.raises(jv.InputError, match="which is not in kg"):
+            to_float(text, "kg", "mass")
+
+
+def test_gravities_are_read_beside_an_acceleration():
+    assert in_own_unit("2 g", "limit", "m/s^2") == (2 * 9.80665, "m/s^2")
+    assert in_own_unit("2 g", "limit") == (0.002, "kilogram")
 
 
 @pytest.mark.parametrize("text", ["4 x 55 N/mm", "4*55 N/mm", "4 × 55 N/mm"])

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from jaxvib.machine.files import Tables, in_one_line, scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
-from jaxvib.units.reading import SEVERAL
+from jaxvib.units.reading import SEVERAL, without_typesetting
 
 _BLANK = re.compile(r"(?:\s|#[^\n]*)*")
 _NAME = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
@@ -263,7 +263,7 @@ def _with_unit(read: object, old: object, new: object) -> str:
         return f"[{', '.join(map(_with_unit, reads, olds, new))}]"
     if isinstance(new, dict):  # an effect that the file switches on by `true`
         return f"{{ {', '.join(f'{name} = {written}' for name, written, _ in _added(_Values({}, old, old, new)))} }}"
-    written = _NUMBER_AND_UNIT.fullmatch(read) if isinstance(read, str) else None
+    written = _NUMBER_AND_UNIT.fullmatch(without_typesetting(read)) if isinstance(read, str) else None
     if isinstance(new, str):
         return f'"{new}"'
     if not isinstance(new, float):

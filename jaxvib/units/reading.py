@@ -54,10 +54,27 @@ _UNDER = re.compile(r"(.+?)\s+under\s+(.+)")
 _MASS_TIMES_RADIUS = re.compile(r"(.+?)\s*[x×*]\s*([+-]?\.?\d.*)")
 """Pattern of an unbalance that is given as a mass times a radius, such as "0.3 kg x 0.24 m"."""
 
+_THOUSANDS_APART = re.compile(r"(?<![\d.,])([1-9]\d{0,2}(?:[ \u00a0\u2009\u202f]\d{3})+)(?!\d|\s\d|/)")
+"""Number with spaces, also thin or non-breaking ones, between its thousands, such as "1 234"."""
+
+_PER_TIME = re.compile(r"(?!1\s*/)(\d+\.?\d*)\s*/\s*(min|Min|s)")
+"""Frequency without the 1 of its unit, such as "1450/min"."""
+
 _COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*(?:[^\W\d_%°][^,;()]*)?")
 
 _THOUSANDS = re.compile(r"[+-]?\d{1,3},\d{3}(?!\d)")
 """Pattern of a number whose comma can separate thousands."""
+
+_GROUPS = (r"(?:['’]\d{3})+", r"(?:\.\d{3}){2,}", r"(?:,\d{3}){2,}", r"(?:\.\d{3})+(?=,\d)", r"(?:,\d{3})+(?=\.\d)")
+_DIGIT_GROUPS = re.compile(rf"([+-]?\d{{1,3}}(?:{'|'.join(_GROUPS)}))(?!\d)(?:[.,](?=\d))?")
+"""Number with marks that can only separate thousands, and the point or comma before its decimals."""
+
+_INCHES = re.compile(r"(?<=\d)\s*(?:[\"″”]|'')$")
+
+_FEET = re.compile(r"(?<=\d)\s*['′’]$")
+
+_FRACTION = re.compile(r"(?<![\d.,])(?:(\d{1,3})[\s-]+)?(\d{1,4})\s*/\s*([1-9]\d{0,3})(?=\s*[^\W\d_])")
+"""Fraction, also after a whole number, such as "1 1/2"."""
 
 _SPELLINGS = {
     **dict.fromkeys(("RPM", "Rpm", "upm", "Upm", "UPM", "r/min", "U/min", "rev/min"), "rpm"),
@@ -69,6 +86,8 @@ _SPELLINGS = {
     **dict.fromkeys(("Hertz", "HERTZ"), "Hz"),
     **dict.fromkeys(("ips", "IPS"), "in/s"),
     **dict.fromkeys(("ppi", "pli"), "lbf/in"),
+    **dict.fromkeys(("Newton", "Newtons"), "N"),
+    **dict.fromkeys(("Newtonmeter", "Newton meter"), "N m"),
     "KN": "kN",
     "Ohm": "ohm",
     "Prozent": "%",
@@ -81,6 +100,9 @@ _SPELLINGS = {
 
 _PER_MINUTE = ("1/min", "min^-1", "min**-1", "min⁻¹", "min-1")
 """Spellings of revolutions per minute, if the argument is a speed."""
+
+_GRAVITIES = ("g", "G")
+"""Spellings of the standard gravity, if the argument is an acceleration."""
 
 _JOINED = {
     "Ns": "N s",
@@ -101,6 +123,8 @@ _JOINED = {
     "kpm": "kgf m",
     "kp": "kgf",
     "lbm": "lb",
+    "ftlbf": "ft lbf",
+    "inlbf": "in lbf",
     "mil": "thou",
     "mils": "thou",
     "Pas": "Pa s",
@@ -117,7 +141,8 @@ _PLAIN_POWER = re.compile(r"(?<=[^\W\d_])([23])(?!\w)")
 _HYPHEN = re.compile(r"(?<=[^\W\d_])-(?=[^\W\d_])")
 """Hyphen between the factors of a product, as in "lb-in"."""
 
-_MASS_UNIT = re.compile(r"(?<![^\W\d])(kg|lb|oz)s?(?!\w)")
+_MASS_UNIT = re.compile(r"(?<![^\W\d])(?!lbm)(ft|in)?(kg|lb|oz)s?(ft|in|[cm]?m)?(?!\w)")
+"""Unit of mass, alone or joined to a length, as in "ftlb" and "kgcm"."""
 
 _AMBIGUOUS = (
     (re.compile(r"(?<![^\W\d_])grad(?![^\W\d_])", re.IGNORECASE), "degrees or gon; write deg or gon"),
@@ -160,6 +185,20 @@ def _example(unit: str) -> str:
     return "'1500 rpm', '157.1 rad/s' or '25 Hz'" if unit == "rad/s" else f"'1.5 {unit}'" if unit else "1.5"
 
 
+def without_typesetting(text: str) -> str:
+    """Return a text with the minus of a keyboard, without spaces between thousands, and with "1/min" for "/min".
+
+    >>> without_typesetting("\u22125 kg"), without_typesetting("1 234 kg"), without_typesetting("1450/min")
+    ('-5 kg', '1234 kg', '1450 1/min')
+    """
+    text = text.strip().replace("\u2212", "-")
+    if len(text) > _MAX_UNIT_CHARACTERS:  # the patterns take minutes for long texts
+        return text
+    if (per := _PER_TIME.fullmatch(text)) is not None:
+        return f"{per[1]} 1/{per[2]}"
+    return _THOUSANDS_APART.sub(lambda apart: re.sub(r"\s", "", apart[1]), text)
+
+
 def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray | np.number:
     """Return the magnitude of `value` in the SI unit `unit`; a number without a unit is already in `unit`.
 
@@ -186,10 +225,10 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
     if isinstance(value, str):
         try:
             if "_" not in value:  # Python would read "1_000"
-                return float(value)
+                return float(without_typesetting(value))
         except ValueError:
             pass
-        text = value.strip()
+        text = without_typesetting(value)
         under = _UNDER.fullmatch(text) if unit == "N/m" and len(text) < 100 else None
         if under is not None:
             return _stiffness_under(under[1], under[2], value, field)
@@ -208,6 +247,8 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
             raise _wrong_unit(value, unit, field)
         magnitude, written = float(parts[1]), (parts[2] + parts[3]).strip()
         factor = _FACTORS.get(unit, {}).get("rpm" if written in _PER_MINUTE else _SPELLINGS.get(written, written))
+        if factor is None and unit == "m/s^2" and written in _GRAVITIES:
+            factor = STANDARD_GRAVITY
         if factor is not None:
             return magnitude * factor
         return _magnitude(_quantity(magnitude, written, value, unit, field), unit, field, value)
@@ -280,6 +321,24 @@ def require_real(value: object, unit: str, field: str) -> None:
         raise InputError(field, f"is {quoted(value)}, which is not a number; write a {number_words(unit)}")
 
 
+def _without_shorthand(text: str) -> str:
+    """Return a text without marks between thousands, signs of inches and feet, and fractions.
+
+    >>> _without_shorthand("1.234,5 kg"), _without_shorthand('1 1/2"')
+    ('1234.5 kg', '1.5 in')
+    """
+
+    def in_decimals(found: re.Match[str]) -> str:
+        return f"{int(found[1] or 0) + int(found[2]) / int(found[3]):.6g}"
+
+    text = _FEET.sub(" ft", _INCHES.sub(" in", text.strip()))
+    grouped = _DIGIT_GROUPS.match(text)
+    if grouped is not None:
+        point = "" if grouped[0] == grouped[1] else "."
+        text = re.sub("[.,'’]", "", grouped[1]) + point + text[grouped.end() :]
+    return _FRACTION.sub(in_decimals, text, count=1)
+
+
 def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
     """Return the error for a string that is not in `unit`, or for a string without a readable unit if `unit` is None."""
     for pattern, meanings in _AMBIGUOUS:
@@ -290,7 +349,10 @@ def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
         return InputError(
             field, f"is {quoted(value)}, a deflection; write {under} with the mass (or force) that this spring carries"
         )
-    as_force = _MASS_UNIT.sub(r"\1f", value)
+    meant = _without_shorthand(value)
+    if unit and meant != value and len(value) < 100 and _in_unit(meant, unit) is not None:
+        return InputError(field, f"is {quoted(value)}; write {quoted(meant)}")
+    as_force = _MASS_UNIT.sub(lambda found: " ".join(filter(None, (found[1], f"{found[2]}f", found[3]))), value)
     if unit and as_force != value:
         try:
             to_float(as_force, unit, field)
@@ -406,9 +468,11 @@ def in_own_unit(value: str | Quantity, field: str, beside: str = "") -> tuple[fl
 
     given: Any = value
     if isinstance(value, str):
-        parts = _NUMBER_WITH_UNIT.fullmatch(value.strip()) if len(value) < 100 else None
+        parts = _NUMBER_WITH_UNIT.fullmatch(without_typesetting(value)) if len(value) < 100 else None
         if parts is None:
             return _finite(to_float(value, "", field), field), ""
+        if beside == "m/s^2" and (parts[2] + parts[3]).strip() in _GRAVITIES:
+            return _finite(to_float(value, beside, field), field), beside
         given = _quantity(float(parts[1]), (parts[2] + parts[3]).strip(), value, None, field)
     require_real(given.m, "", field)
     try:

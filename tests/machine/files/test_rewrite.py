@@ -50,6 +50,13 @@ drive = { kind = "dc_motor", speed = "1500 rpm", stall_torque = 12.0, inertia = 
     assert 'unbalance = "0.3 kg m"  # was "0.2 kg m"' in text and 'stiffness = "800 N/mm"' in text
 
 
+def test_a_number_with_spaces_between_thousands_is_rewritten():
+    source = TEMPLATES["one_mass"].replace('"50 N/mm"', '"5 x 10 000 N/m"')
+    scene = jv.scene_from_toml(source)
+    stiffer = eqx.tree_at(lambda scene: scene.machine.stiffness, scene, 1.25 * scene.machine.stiffness)
+    assert 'stiffness = "5 x 12500 N/m"' in rewrite_scene(source, stiffer)
+
+
 def test_a_static_deflection_stays_a_deflection():
     source = TEMPLATES["one_mass"].replace('"50 N/mm"', '"25 mm under 128 kg"')
     scene = jv.scene_from_toml(source)
