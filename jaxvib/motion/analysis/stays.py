@@ -70,6 +70,10 @@ def find_stays(scene: Scene, time: np.ndarray, speeds: np.ndarray, rotor_speeds:
     acceleration and as in the next band of speeds, and slower than 0.95 of its rotor or of the no-load speed of its motor.
     Swings by up to 12 % from this speed, and larger ones for a fifth of the time, do not end a stay.
 
+    Falling speeds have no stay before they pass. Above a resonance the torque of the vibration grows as the speed falls, so
+    that a rotor falls faster than the reference of its motor, up to the speed at which no equilibrium above it is left.
+    Only below the resonance, after it has passed, can it fall more slowly than the reference for a time.
+
     **Arguments**: `time` (nt,), s, evenly spaced; `speeds` (nt, n), rad/s, of the turning masses as in `turning_angles`;
     `rotor_speeds` (nt,) of each exciter.
     """
