@@ -155,6 +155,25 @@ def test_band_contains_the_signal():
     np.testing.assert_allclose(right.lines[1].get_ydata(), -shown)
 
 
+@pytest.mark.parametrize("amplitude", [0.0, 0.5])
+def test_the_band_of_a_ramp_is_its_oscillation(amplitude):
+    """The end of a ramp has no influence beyond the five intervals beside it."""
+    t = np.linspace(0.0, 20.0, 20_001)
+    for rate in (10.0, 7.3, 31.0):  # periods per s, in intervals of 0.2 s
+        middle, low, high = band(t, 30.0 * np.minimum(t, 10.0) + amplitude * np.sin(2.0 * np.pi * rate * t), 100)
+        straight = np.abs(middle - 10.0) > 1.0
+        trend = 30.0 * np.minimum(middle, 10.0)
+        np.testing.assert_allclose((high - trend)[straight], amplitude, rtol=0.06, atol=1e-9)
+        np.testing.assert_allclose((low - trend)[straight], -amplitude, rtol=0.06, atol=1e-9)
+        assert np.max(np.abs(high - trend)) < amplitude + 2.0 and np.max(high) <= 300.0 + amplitude + 1e-9
+
+
+def test_the_band_of_a_jump_stays_within_the_signal():
+    t = np.linspace(0.0, 20.0, 20_001)
+    _, low, high = band(t, np.where(t < 10.0, 0.0, np.exp(10.0 - t)), 100)
+    assert np.min(low) >= 0.0 and np.max(high) <= 1.0 and np.all(high >= low)
+
+
 def test_before_and_after_shows_what_falls_a_thousandfold():
     figure = before_after([("force, N", 1424.0, 2.1), ("speed, rpm", 570.0, 570.0), ("more", 1.0, 3.0)])
     axis = figure.axes[0]

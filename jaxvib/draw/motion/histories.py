@@ -20,7 +20,7 @@ from jaxvib.draw.style import (
 )
 
 _BINS = 600
-"""Maximum number of intervals of a run. The run is drawn as a band between the minimum and the maximum of each interval."""
+"""Maximum number of intervals of a run. The run is drawn as a band of its oscillation about the trend, see `band`."""
 
 _MAX_PLAIN_PERIODS = 40
 """Maximum number of periods of a run that is drawn without bands."""
@@ -43,20 +43,60 @@ _SHOWN_PERIODS = 3
 
 
 def band(time: np.ndarray, values: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the middle times, minima and maxima (bins,) of a signal (nt,) in `bins` intervals of equal length.
+    """Return the middle times and the lower and upper limits (bins,) of a signal (nt,) in `bins` intervals of equal length.
 
-    If the signal has fewer than 2 samples per interval, return all times and the signal itself as minimum and maximum.
+    The limits are those of the deviations from the trend of the signal, added to the trend at the middle of each interval: the
+    band of a ramp has no width. If the signal has fewer than 2 samples per interval, return all times and the signal itself as
+    both limits.
 
     >>> import numpy as np
-    >>> t, low, high = band(np.arange(4.0), np.array([0.0, 2.0, -1.0, 1.0]), 2)
-    >>> low.tolist(), high.tolist()
-    ([0.0, -1.0], [2.0, 1.0])
+    >>> t = np.arange(100.0)
+    >>> middle, low, high = band(t, 2.0 * t + (-1.0) ** t, 10)
+    >>> (low - 2.0 * middle).round(9).tolist() == [-1.0] * 10, (high - 2.0 * middle).round(9).tolist() == [1.0] * 10
+    (True, True)
     """
     if time.size < 2 * bins:
         return time, values, values
     edges = np.linspace(0, time.size, bins + 1).astype(int)
-    low, high = np.minimum.reduceat(values, edges[:-1]), np.maximum.reduceat(values, edges[:-1])
-    return (time[edges[:-1]] + time[edges[1:] - 1]) / 2.0, low, high
+    middle, trend = (time[edges[:-1]] + time[edges[1:] - 1]) / 2.0, _trend(time, values, edges)
+    at_middle = np.interp(middle, time, trend)
+
+    def limit(sign: float) -> np.ndarray:
+        # Both are limits of the signal. The second one is the tighter one on a slope, and the first one beside a kink.
+        plain, about_trend = (
+            _smoothed_peaks(np.maximum.reduceat(sign * each, edges[:-1])) for each in (values, values - trend)
+        )
+        return sign * np.minimum(plain, about_trend + sign * at_middle)
+
+    return middle, limit(-1.0), limit(1.0)
+
+
+_TREND_WEIGHTS = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
+"""Weights of the means of successive intervals in the trend. They reduce the oscillation in these means: an interval does not
+contain a whole number of periods."""
+
+
+def _trend(time: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return the trend (nt,) of a signal: straight lines between the weighted means of the intervals between `edges`."""
+    if edges.size <= _TREND_WEIGHTS.size + 1:
+        return np.full(time.size, np.mean(values))
+    size = np.diff(edges)
+    # The times have the same weights, so that a straight line is its own trend.
+    t, mean = (np.convolve(np.add.reduceat(x, edges[:-1]) / size, _TREND_WEIGHTS, "valid") for x in (time, values))
+    slope = np.diff(mean) / np.diff(t)
+    trend = np.interp(time, t, mean)
+    return trend + slope[0] * np.minimum(time - t[0], 0.0) + slope[-1] * np.maximum(time - t[-1], 0.0)
+
+
+def _smoothed_peaks(values: np.ndarray) -> np.ndarray:
+    """Return a smooth curve that is not below the maxima of intervals.
+
+    An interval does not contain a whole number of periods; the maxima of successive intervals therefore form a saw-tooth. The
+    result is the mean of three running maxima, each over three neighbouring intervals that include the interval itself.
+    """
+    padded = np.pad(values, 2, mode="edge")
+    largest = np.maximum(np.maximum(padded[:-2], padded[2:]), padded[1:-1])
+    return (largest[:-2] + largest[1:-1] + largest[2:]) / 3.0
 
 
 def period_of(time: np.ndarray, values: np.ndarray) -> float:
@@ -260,8 +300,6 @@ def _draw_band(
     of the first signal would hide the dashes of an equal one.
     """
     middle, low, high = band(time, values, bins)
-    if low is not high:
-        low, high = -_smoothed_peaks(-low), _smoothed_peaks(high)
     look = {**series_look(k), "lw": 1.1, "zorder": 2.0 + 0.001 * k}
     axis.plot(middle, high, label=name, **look)
     if low is not high:
@@ -276,17 +314,6 @@ def _draw_legend(axis: Axes, least: int = 1, band: str = "band: lowest to highes
         handles.append(Patch(color="#555555", alpha=_BAND_ALPHA, lw=0.0, label=band))
     if len(handles) >= least:
         legend_above(axis, 4, handles=handles)  # a legend wider than its panel would move the columns apart
-
-
-def _smoothed_peaks(values: np.ndarray) -> np.ndarray:
-    """Return a smooth curve that is not below the maxima of intervals.
-
-    An interval does not contain a whole number of periods; the maxima of successive intervals therefore form a saw-tooth. The
-    result is the mean of three running maxima, each over three neighbouring intervals that include the interval itself.
-    """
-    padded = np.pad(values, 2, mode="edge")
-    largest = np.maximum(np.maximum(padded[:-2], padded[2:]), padded[1:-1])
-    return (largest[:-2] + largest[1:-1] + largest[2:]) / 3.0
 
 
 def _draw_rotor_speeds(axis: Axes, time: np.ndarray, speeds: np.ndarray, bins: int | None = None) -> None:
