@@ -372,7 +372,7 @@ def run(arguments: list[str]) -> int:
         return app.main(args=arguments, prog_name="jaxvib", standalone_mode=False, obj=tuple(arguments)) or 0
     except InputError as error:
         error = _with_option_names(arguments, error)
-        message = f"{error}{_remedy_hint(arguments, error)}"
+        message = f"{error}{remedy_hint(arguments, error)}"
         return _report_error(wants_json, 2, {"kind": "input", "field": error.field, "message": message})
     except ComputationError as error:
         return _report_error(wants_json, 1, {"kind": "computation", "status": error.status, "message": str(error)})
@@ -412,7 +412,7 @@ def _repeat_hint(arguments: list[str], error: click.UsageError) -> str:
     return f"; repeat the option for each value: {used[0]} ... {used[0]} ..." if used else ""
 
 
-def _parameters(arguments: list[str]) -> list[click.Parameter]:
+def _parameters(arguments: Sequence[str]) -> list[click.Parameter]:
     """Return the arguments and options of the command in a command line."""
     called = app.commands.get(arguments[0]) if arguments else None
     return [] if called is None else called.params
@@ -429,7 +429,7 @@ def _with_option_names(arguments: list[str], error: InputError) -> InputError:
     return InputError(field, problem)
 
 
-def _remedy_hint(arguments: list[str], error: InputError) -> str:
+def remedy_hint(arguments: Sequence[str], error: InputError) -> str:
     """Return a hint to the option that removes an unsupported effect or replaces an unsupported drive; "" for other errors."""
     table, _, name = error.field.partition(".")
     options = [each.name for each in _parameters(arguments)]

@@ -18,6 +18,7 @@ from jaxvib.cli.app import (
     command,
     loaded_scene,
     ranges_within,
+    remedy_hint,
     require_tolerances,
     table,
     tolerance_table,
@@ -99,13 +100,13 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
     limits = None if has_friction else jax.device_get(jv.drag_limits(scene))
     note_loads(scene, [float(jam.omega) for jam in remaining], output.scene)
     ranges = ranges_within(scene, [int(jam.mode) for jam in remaining], tolerances)
-    balanced = _is_balance_stable(scene)
+    balance = _balance_document(scene)
     document = {
         "rotor_speed": scene.drive.speed,
         "resonances": modes_found.resonances,
         "judged": STABILITY_OF_FREE_LOADS if any(map(math.isfinite, growth.values())) else STABILITY_CRITERION,
         "modes": [_mode_document(jam, growth[int(jam.mode)]) for jam in jams],
-        "balanced_motion_stable": balanced,
+        **balance,
         "unresolved": modes_found.unresolved,
         "measures": [{"mode": mode, **entry.document()} for mode, entry in measures.items()],
         "folds": [{"omega": modes_found.folds.omega[k], "rotor_speed": modes_found.folds.rotor_speed[k]} for k in folds],
@@ -129,7 +130,7 @@ def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, 
         lines += [text] if (text := modes_found.missing_text()) else []
         if tolerances:
             lines.append(tolerance_table(ranges, tolerances))
-        lines += _reached_lines(scene, output, [f"mode {k}{_condition(growth[k])}" for k in measures], balanced)
+        lines += _reached_lines(scene, output, [f"mode {k}{_condition(growth[k])}" for k in measures], balance)
         lines += [indented(f"mode {mode}:", entry) for mode, entry in measures.items()]
         lines += _fold_lines(float(scene.drive.speed), modes_found.folds, folds)
         return "\n".join([*lines, *_drag_lines(scene, limits), *_imbalance_lines(scene)])
@@ -154,27 +155,33 @@ def _fold_lines(rotor_speed: float, folds: Any, existing: list[int]) -> list[str
     return lines + ([f"folds above {_MAX_FOLD_SPEEDS:g} times the rotor speed, not shown: {far}"] if far else [])
 
 
-def _is_balance_stable(scene: jv.Scene) -> bool | None:
-    """Return True if the loads can balance the rotor and this motion is stable; None if its stability cannot be computed."""
+def _balance_document(scene: jv.Scene) -> dict[str, bool | str | None]:
+    """Return, for a document, whether the loads can balance the rotor in a stable motion, or why this cannot be computed."""
     try:
         states = jv.balanced_states(scene)
-        return any(states.stability(k).stable for k in range(len(states.angles)))
-    except InputError:
-        return None
+        return {"balanced_motion_stable": any(states.stability(k).stable for k in range(len(states.angles)))}
+    except InputError as error:
+        reason = f"{error}{remedy_hint(click.get_current_context().obj, error)}"
+        return {"balanced_motion_stable": None, "balanced_motion_not_judged": reason}
 
 
-def _reached_lines(scene: jv.Scene, output: Output, jams: list[str], balanced: bool | None) -> list[str]:
-    """Return lines about the stable motions at the speed of the scene, if there are several, or only balanced loads.
+def _reached_lines(scene: jv.Scene, output: Output, jams: list[str], balance: Mapping[str, bool | str | None]) -> list[str]:
+    """Return lines about the stable motions at the speed of the scene, if there are several, or only balanced loads, and about
+    balanced loads that are not judged.
 
-    **Arguments**: `jams`: names of the stable jams; `balanced`: see `_is_balance_stable`.
+    **Arguments**: `jams`: names of the stable jams; `balance`: see `_balance_document`.
     """
+    balanced = balance["balanced_motion_stable"]
     motions = jams + (["balanced loads"] if balanced else [])
     if not jams and balanced:
         return [f"balanced loads are stable: the loads spread and balance the rotor (jaxvib balance {output.scene})"]
+    not_judged = balance.get("balanced_motion_not_judged")
+    lines = [] if not_judged is None else ["balanced loads are not judged, and may be stable as well:", f"  {not_judged}"]
     if len(motions) < 2:
-        return []
+        return lines
     start = "spin_up" if scene.drive.constant else "rest"
     return [
+        *lines,
         f"several motions are stable: {', '.join(motions)}",
         "which one the machine reaches depends on its start:",
         f"  jaxvib simulate {output.scene} --until 100s --start {start}",
@@ -247,11 +254,11 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     jams = [result.select(k) for k in range(result.omega.shape[0])]
     measures = [measures_of(scene, jam) if jam.stable else None for jam in jams]
     note_loads(scene, [float(jam.omega) for jam in jams if jam.stable], output.scene)
-    balanced = _is_balance_stable(scene)
+    balance = _balance_document(scene)
     document = {
         "rotor_speed": scene.drive.speed,
         "judged": "by the growth rate of small disturbances, for light loads that move independently",
-        "balanced_motion_stable": balanced,
+        **balance,
         "phase_jams": [
             {
                 **fields_of(jam, "omega", "stable", "growth"),
@@ -276,7 +283,7 @@ def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
         head = [unit, "", "pattern of the loads", "phases, degrees", "foundation force, N"]
         title = f"light-load jams with unequal phases; rotor {rotor}"
         stable_jams = [f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam, _ in shown if jam.stable]
-        reached = _reached_lines(scene, output, [f"the jam at {each}" for each in stable_jams], balanced)
+        reached = _reached_lines(scene, output, [f"the jam at {each}" for each in stable_jams], balance)
         if not rows:
             return "\n".join([f"no jam at {rotor}", *reached, *_drag_lines(scene, limits, points=not is_gathered)])
         conclusion = (
@@ -343,7 +350,7 @@ def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None
     existing = {k: jam for k, jam in jams.items() if math.isfinite(jam.rotor_speed)}
     measures = {k: measures_of(scene, jam) for k, jam in existing.items() if jam.stable}
     note_loads(scene, [float(existing[k].omega) for k in measures], output.scene, averaged=False)
-    balanced = _is_balance_stable(scene)
+    balance = _balance_document(scene)
     diagram = jv.branches(scene, exact=True)
     output.figure("branches.png", lambda: diagram.plot())
     output.csv(csv, diagram, "point")
@@ -351,7 +358,7 @@ def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None
         "rotor_speed": scene.drive.speed,
         "resonances": light.resonances,
         "judged": "by Floquet multipliers of the full equations",
-        "balanced_motion_stable": balanced,
+        **balance,
         "modes": [
             {
                 "mode": k,
@@ -375,7 +382,7 @@ def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None
             f"rotor {speed_text(scene.drive.speed)}",
             table("exact jams; amplitudes and force are zero to peak", head, rows),
             *(f"mode {k}: {jam.message}" for k, jam in jams.items() if k not in existing),
-            *_reached_lines(scene, output, [f"mode {k}" for k in measures], balanced),
+            *_reached_lines(scene, output, [f"mode {k}" for k in measures], balance),
             *(indented(f"mode {k}:", each) for k, each in measures.items()),
         ]
         if points:

@@ -53,6 +53,17 @@ def test_modes_writes_table_and_figure(typed, tmp_path):
     assert json.loads((tmp_path / "figures" / "modes.json").read_text())["rotor_speed"] == 150.0
 
 
+def test_modes_say_why_balanced_loads_are_not_judged(typed, tmp_path):
+    plain = scene("two_mass", speed=150.0)
+    jv.save_scene(plain.replace(effects=(jv.Gravity(),)), tmp_path / "heavy.toml")
+    why = "effects.gravity disturbs the balanced motion; leave it out, or simulate (--without gravity)"
+    out = typed("modes", "heavy.toml")[1]
+    assert f"balanced loads are not judged, and may be stable as well:\n  {why}\n" in out
+    document = json.loads(typed("modes", "heavy.toml", "--json")[1])
+    assert document["balanced_motion_stable"] is None and document["balanced_motion_not_judged"] == why
+    assert "not judged" not in typed("modes", "heavy.toml", "--without", "gravity")[1]
+
+
 def test_drag_limits_of_balls_at_any_phases_are_those_of_points():
     """Touching balls have the unbalance of a chain."""
     balls = jv.balls(count=3, mass=0.8, ball_radius=0.03, radius=0.12, drag=1.5)
@@ -119,7 +130,7 @@ def test_exact_jams_have_notes_on_loads_but_not_on_averaging(typed, tmp_path, mo
     def end(scene):
         raise jv.InputError("scene", "has notes")
 
-    monkeypatch.setattr("jaxvib.cli.modes._is_balance_stable", end)
+    monkeypatch.setattr("jaxvib.cli.modes._balance_document", end)
     code, _, err = typed("modes", "weak.toml", "--exact")
     notes = err.splitlines()
     assert code == 2 and len(notes) == 3 and notes[0].startswith("note: loads at rest swing and do not turn over:")
@@ -207,7 +218,7 @@ def test_modes_of_a_rotor_that_has_no_jams_say_so(typed, tmp_path):
 def test_exact_modes_json_has_the_promised_keys(typed):
     code, out, err = typed("modes", "machine.toml", "--exact", "--json")
     document = json.loads(out)
-    assert code == 0 and err.startswith("note: the acceleration is 10.1 g")
+    assert code == 0 and err.startswith("note: the acceleration is 10 g")
     assert set(document) == {"rotor_speed", "resonances", "judged", "balanced_motion_stable", "modes", "special", "missing"}
     assert set(document["special"][0]) == {"omega", "rotor_speed", "kind"}
     assert {"fold"} <= {point["kind"] for point in document["special"]}
