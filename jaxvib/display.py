@@ -115,6 +115,8 @@ def shown_unit(unit: str, size: float) -> tuple[str, float]:
         return "deg", 180.0 / np.pi
     if unit == "kg" and 0.0 < size < 1.0:
         return "g", 1e3
+    if unit == "kg m" and 0.0 < size < 1e-2:
+        return "g m", 1e3
     if unit == "N" and size >= 1e4:
         return "kN", 1e-3
     return unit, 1.0

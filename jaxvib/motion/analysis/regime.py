@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import Axes, Drawn, speed_text
+from jaxvib.display import Axes, Drawn, quantity_text, speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.machine.carrier import scaled
 from jaxvib.machine.effects.base import terms_of
@@ -84,7 +84,8 @@ class Regime(Result):
       first load
     - `unbalance`: residual unbalance of loads and rotor in the frame of the rotor, relative to that of all loads at one angle;
       balanced below 0.02
-    - `load_unbalance` (count,): unbalance of each load relative to the sum of all
+    - `total_load_unbalance`: sum of the unbalances of all loads, kg m
+    - `load_unbalance` (count,): unbalance of each load relative to this sum
     - `imbalance`: static imbalance of the rotor relative to this sum, complex, in the frame of the rotor
     - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed`, rad/s
     - `mode`: estimated number of the jam mode; 0 if the loads are not jammed. Let natural frequency k be the last one below the
@@ -103,6 +104,7 @@ class Regime(Result):
     ripple: Array = eqx.field(metadata=in_unit("rad/s"))
     phase: Array = eqx.field(metadata=in_unit("rad", "load"))
     unbalance: Array = eqx.field(metadata=in_unit(""))
+    total_load_unbalance: Array = eqx.field(metadata=in_unit("kg m"))
     load_unbalance: Array = eqx.field(metadata=in_unit("", "load"))
     imbalance: Array = eqx.field(metadata=in_unit(""))
     resonance: Array = eqx.field(metadata=in_unit(""))
@@ -154,11 +156,23 @@ class Regime(Result):
 
     def _remainder_text(self) -> str:
         share = float(self.unbalance)
-        if share < 1.005:
-            return f"{100.0 * share:.3g} % of the loads' unbalance is left"
         # Loads at one angle add at most their own unbalance to that of the rotor.
         cause = ": the imbalance of the rotor exceeds what the loads can balance" if share > 2.005 else ""
-        return f"{share:.2g} times the loads' unbalance is left{cause}"
+        return f"the remaining unbalance is {self.unbalance_text(share)}{cause}"
+
+    @property
+    def _with_moments(self) -> bool:
+        """True if `unbalance` of a rotor that tilts is a moment, larger than the static share."""
+        static = abs(np.sum(np.asarray(self.load_unbalance) * np.exp(1j * np.asarray(self.phase))) + complex(self.imbalance))
+        return float(self.unbalance) > static + _BALANCED_UNBALANCE_SHARE
+
+    def unbalance_text(self, share: float) -> str:
+        """Return an unbalance with a `share` of that of all loads as text, with the unbalance of the rotor beside it."""
+        total, own = float(self.total_load_unbalance), abs(complex(self.imbalance))
+        relative = f"{100.0 * share:.3g} % of" if share < 1.005 else f"{share:.2g} times"
+        size = "with moments, " if self._with_moments else f"{quantity_text(share * total, 'kg m', 3)}, "
+        rotor = f" (the rotor alone has {quantity_text(own * total, 'kg m', 3)})" if own > 0.0 else ""
+        return f"{size}{relative} that of all loads{rotor}"
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
@@ -172,9 +186,7 @@ class Regime(Result):
         title, weight, imbalance = self.label, np.asarray(self.load_unbalance), 0.0
         if title in ("balanced", "unbalanced"):
             imbalance, share = complex(self.imbalance), float(self.unbalance)
-            static = abs(np.sum(weight * np.exp(1j * np.asarray(self.phase))) + imbalance)
-            with_moments = ", with moments" if share > static + _BALANCED_UNBALANCE_SHARE else ""
-            title += f"\n{100.0 * share:.2g} % of the loads' unbalance left{with_moments}"
+            title += f"\n{100.0 * share:.2g} % of the loads' unbalance left{', with moments' if self._with_moments else ''}"
         return phase_circles([(title, np.asarray(self.phase))], weights=weight, imbalance=imbalance, ax=ax)
 
 
@@ -216,11 +228,10 @@ def regime(scene: Scene, segment: Trajectory) -> Regime:
 def _regime(scene: Scene, segment: Trajectory) -> Regime:
     times, state = segment.time, segment.state
     phi, rate = state.azimuth, state.azimuth_rate
-    half = times.shape[0] // 2
+    half, end = times.shape[0] // 2, times.shape[0] - 1
     turn = segment.rotor_angle
 
     angles, rates = jnp.column_stack([phi, turn]), jnp.column_stack([rate, segment.rotor_speed])
-    end = times.shape[0] - 1
     whole, early, late = mean_speeds(times, angles, rates, first=(0, 0, half), last=(end, half - 1, end))
     speed, rotor = whole[:-1], whole[-1]
     mean, reference = jnp.mean(speed), jnp.maximum(jnp.abs(rotor), jnp.finfo(rotor.dtype).tiny)
@@ -265,6 +276,7 @@ def _regime(scene: Scene, segment: Trajectory) -> Regime:
         ripple=jnp.where(jnp.all(is_known), jnp.max(jnp.max(rate, axis=0) - jnp.min(rate, axis=0)) / 2.0, jnp.nan),
         phase=jnp.where(all_with_rotor, to_rotor, to_first),
         unbalance=unbalance,
+        total_load_unbalance=size,
         load_unbalance=unbalances / size,
         imbalance=imbalance / size,
         resonance=nearest + 1,
@@ -309,9 +321,8 @@ def balancing_time_text(scene: Scene, motion: Regime, trajectory: Trajectory | N
     time = np.asarray(trajectory.time)
     if not away.size or away[-1] + 1 == time.size:
         return ""
-    return (
-        f"balanced within {100.0 * _BALANCED_UNBALANCE_SHARE:.3g} % of the loads' unbalance from {time[away[-1] + 1]:.4g} s on"
-    )
+    left = motion.unbalance_text(_BALANCED_UNBALANCE_SHARE)
+    return f"balanced from {time[away[-1] + 1]:.4g} s on: the remaining unbalance is below {left}"
 
 
 @cached

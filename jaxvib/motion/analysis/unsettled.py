@@ -68,4 +68,5 @@ def balanced_text(regime: Regime, window: Trajectory) -> str:
     early, late = (np.linalg.norm(np.ptp(part, axis=0)) for part in np.split(displacement, [len(displacement) // 2]))
     if not bool(regime.name == RegimeName.balanced) or late > early:
         return ""
-    return f"balanced within {100.0 * float(regime.unbalance):.2g} % of the loads' unbalance; the remaining vibration decays"
+    left = regime.unbalance_text(float(regime.unbalance))
+    return f"balanced: the remaining unbalance is {left}; the remaining vibration decays"

@@ -96,7 +96,8 @@ def test_a_balanced_rotor_has_its_time_and_no_amplitude():
     assert "estimated error of the angles in the window" in text
     moments = 0.01 * np.sum(np.exp(1j * (path.state.azimuth - path.rotor_angle[:, None])), axis=1) + 0.01
     after = path.time[np.flatnonzero(np.abs(moments) >= 0.02 * 0.02)[-1] + 1]
-    assert f"  balanced within 2 % of the loads' unbalance from {float(after):.4g} s on" in text and 0.1 < after < 15.0
+    left = "0.4 g m, 2 % of that of all loads (the rotor alone has 0.01 kg m)"  # loads: 0.02 kg m
+    assert f"  balanced from {float(after):.4g} s on: the remaining unbalance is below {left}" in text and 0.1 < after < 15.0
 
 
 def test_a_balanced_motion_that_decays_needs_no_longer_run():
@@ -105,8 +106,8 @@ def test_a_balanced_motion_that_decays_needs_no_longer_run():
     first = run.summary().splitlines()[0]
     unbalance = abs(np.mean(np.exp(1j * np.asarray(run.window.state.azimuth)), axis=1))
     assert not run.settled and "not settled" not in first and "run longer" not in first
-    left = f"{100.0 * float(run.regime.unbalance):.2g} %"
-    assert f"balanced within {left} of the loads' unbalance; the remaining vibration decays (drift" in first
+    left = f"{100.0 * float(run.regime.unbalance):.3g} % of that of all loads"
+    assert "balanced: the remaining unbalance is " in first and f" m, {left}; the remaining vibration decays (drift" in first
     assert np.max(unbalance) < 1e-3
     assert "run longer" in jv.simulate(scene, 2.0, estimate=False).summary()
 
@@ -118,7 +119,7 @@ def test_an_averaged_balanced_motion_needs_no_longer_run():
     first, loads = run.summary().splitlines()[0], np.exp(1j * np.asarray(run.window.phase))
     share = np.max(np.abs(np.mean(loads, axis=1)))
     assert not run.settled and "not settled" not in first and share < 1e-3
-    left = re.search(r"balanced within (\S+) % of the loads' unbalance; the remaining vibration decays \(drift", first)
+    left = re.search(r"balanced: .* m, (\S+) % of that of all loads; the remaining vibration decays \(drift", first)
     assert float(left.group(1)) <= 100.0 * share
     assert "not settled: run longer (drift" in jv.envelope(scene, 2.0).summary()
     jammed = jv.Scene(scene.machine, jv.balls(count=1, mass=0.8, radius=0.12, drag=0.5), scene.drive)

@@ -204,14 +204,17 @@ def test_summary_names_an_imbalance_beyond_the_loads():
     """Four pendulums of 0.05 kg at 0.08 m: 0.016 kg m of unbalance, opposite each other or all at one angle."""
     opposite, together = [0.0, np.pi, np.pi, 0.0], [0.0] * 4
     found = jv.regime(*made(opposite, 460.0, effects=(jv.StaticImbalance(4.8e3),))).summary()
-    assert "3e+05 times the loads' unbalance is left: the imbalance of the rotor exceeds what the loads can balance" in found
+    more = "3e+05 times that of all loads (the rotor alone has 4800 kg m)"
+    cause = "the imbalance of the rotor exceeds what the loads can balance"
+    assert f"the remaining unbalance is 4800 kg m, {more}: {cause}" in found
     added = jv.regime(*made(together, 460.0, effects=(jv.StaticImbalance(8e-3),))).summary()
-    assert "1.5 times the loads' unbalance is left" in added and "exceeds" not in added
-    assert (
-        "50 % of the loads' unbalance is left"
-        in jv.regime(*made(opposite, 460.0, effects=(jv.StaticImbalance(8e-3),))).summary()
-    )
-    assert "; 100 % of the loads' unbalance is left" in jv.regime(*made(together, 460.0)).summary()
+    own = "that of all loads (the rotor alone has 8 g m);"
+    assert f"; the remaining unbalance is 0.024 kg m, 1.5 times {own}" in added and "exceeds" not in added
+    partly = jv.regime(*made(opposite, 460.0, effects=(jv.StaticImbalance(8e-3),))).summary()
+    assert f"; the remaining unbalance is 8 g m, 50 % of {own}" in partly
+    plain = jv.regime(*made(together, 460.0))
+    assert "; the remaining unbalance is 0.016 kg m, 100 % of that of all loads;" in plain.summary()
+    np.testing.assert_allclose(plain.total_load_unbalance, 0.016)
 
 
 def test_a_jam_close_to_the_rotors_speed_is_a_jam():
