@@ -21,6 +21,7 @@ from jaxvib.machine.files import (
 )
 from jaxvib.machine.numbers.named import find_number
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.damping import relative_dampings
 from jaxvib.runtime.startup import start
 from jaxvib.units import count, number
 from jaxvib.units.tables import csv_column, row_names
@@ -53,7 +54,8 @@ def load_design(path: str | Path) -> Design:
     - `[recipe]`: the `name` of a function of `optimize.recipes` (except `retune`), and its arguments, in place of the next
       four tables and of the objective
     - `[free]`: bounds for each parameter that may change
-    - `[ties]`: parameters that follow others
+    - `[ties]`: parameters that follow others. A damping that the scene file gives as a ratio or a loss factor follows the
+      stiffness and the mass, unless it is free, chosen or tied
     - `[choices]`: parameters whose values are chosen from a list, or from a catalogue: `file`, a CSV file relative to the
       design file, and the name of its `column`. If whole rows are chosen, such as motors, the key is any name. Its value is
       then a table of `file` and `columns`; `columns` maps parameters to names of columns
@@ -93,11 +95,13 @@ def load_design(path: str | Path) -> Design:
     for name in ("hold", "demand"):
         if not isinstance(tables.get(name, []), list):
             raise InputError(name, f"is not a list of tables; write [[{name}]] for each quantity")
-    scene = load_scene(Path(path).parent / tables["scene"])
+    scene_file = Path(path).parent / tables["scene"]
+    scene = load_scene(scene_file)
     design = _design_from_recipe(scene, tables) if has_recipe else _design_from_tables(scene, tables, Path(path).parent)
+    space = design.space.with_relative_dampings(relative_dampings(read_toml(scene_file)["machine"], "machine"))
     demands = tuple(d for k, table in enumerate(tables.get("demand", [])) for d in _demands(table, f"demand[{k}]"))
     search = {**design.search, **_search_options(tables.get("search", {}))}
-    return dataclasses.replace(design, search=search, subject_to=(*design.subject_to, *demands))
+    return dataclasses.replace(design, space=space, search=search, subject_to=(*design.subject_to, *demands))
 
 
 def _design_from_recipe(scene: Scene, tables: Tables) -> Design:

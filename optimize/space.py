@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from types import ModuleType
@@ -13,9 +14,11 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import is_real, validated
-from jaxvib.errors import InputError, quoted
-from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
+from jaxvib.errors import InputError, quoted, within
+from jaxvib.machine.files import rebuild_part
+from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, present_numbers, put_numbers
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.damping import is_relative
 from jaxvib.results.readable import Readable
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_known
@@ -28,8 +31,8 @@ Bounds = tuple[Number, Number] | tuple[Number, Number, str]
 """(low, high), or (low, high, "log" or "even")."""
 
 Source = str | tuple[str, float | Literal["keep"]]
-"""Source of a tied parameter: the name of another parameter (equal values), (name, factor), or (name, "keep") for their
-present ratio."""
+"""Source of a tied parameter: the name of another parameter (equal values), (name, factor), (name, "keep") for their present
+ratio, or for a damping of the machine its ratio or loss factor, such as "3 %"."""
 
 
 class HeldQuantity(Readable):
@@ -76,6 +79,44 @@ class Tie(NamedTuple):
     source: NamedNumber
     factor: tuple[float, ...]
 
+    @property
+    def mark(self) -> str:
+        """Text behind the name of the target in tables."""
+        return "tied"
+
+    def sources(self, scene: Scene) -> set:
+        """Return the entries of the parameters of a `scene` on which the value depends."""
+        return self.source.entries
+
+    def value(self, scene: Scene) -> Array:
+        """Return the value of the target in a `scene`."""
+        return jnp.asarray(self.factor) * self.source.read(scene)
+
+
+class RelativeDamping(NamedTuple):
+    """Damping `target` that the scene file, or a tie, gives as `text`: "3 %" or "loss factor 0.1 at 16 Hz".
+
+    Its value follows from the stiffness and the mass as in the constructor of the machine.
+    """
+
+    target: NamedNumber
+    text: str
+
+    @property
+    def mark(self) -> str:
+        """Text behind the name of the target in tables."""
+        return self.text
+
+    def sources(self, scene: Scene) -> set:
+        """Return the entries of the parameters of a `scene` on which the value depends."""
+        of_machine = [each for each in numbers_of(scene).values() if each.path[0] == "machine" and not each.is_damping]
+        return set().union(*(each.entries for each in of_machine))
+
+    def value(self, scene: Scene) -> Array:
+        """Return the value of the target in a `scene`. **Raises** `InputError` for a text that the constructor refuses."""
+        given = {(*path[1:], k): self.text for path, k in self.target.entries}
+        return self.target.read(eqx.tree_at(lambda s: s.machine, scene, rebuild_part(scene.machine, "machine", given)))
+
 
 class Column(NamedTuple):
     """Column of a catalogue of rows, other than the first column.
@@ -116,8 +157,9 @@ class DesignSpace(Readable):
     - `hold`: quantities that keep their value, each in `optimize.hold(...)`, for example a sum (`total`) or a product
       (`product`) of parameters
     - `ties`: a mapping from the name of a parameter to its source. The source is the name of another parameter (equal values),
-      (name, factor), or (name, "keep") to keep the present ratio of both. The factor -1 mirrors a position. Entries of an array
-      that are 0 stay 0, as in `free`
+      (name, factor), or (name, "keep") to keep the present ratio of both. The factor -1 mirrors a position. The source of a
+      damping of the machine may also be a ratio, "3 %", or a loss factor, see `jaxvib.one_mass`: the damping then follows the
+      stiffness and the mass. Entries of an array that are 0 stay 0, as in `free`
     - `choices`: a mapping from the name of a parameter to its allowed values, such as the springs of a catalogue, or from
       "loads.count" to allowed numbers of loads; typical: 2 to 20 values. If several values belong together, as those of a
       motor, the key is any name. Its value is then a mapping from parameters to the columns of a catalogue, for example
@@ -161,7 +203,7 @@ class DesignSpace(Readable):
     high: Array | np.ndarray
     free: tuple[NamedNumber, ...] = eqx.field(static=True)
     logs: tuple[bool, ...] = eqx.field(static=True)
-    ties: tuple[Tie, ...] = eqx.field(static=True)
+    ties: tuple[Tie | RelativeDamping, ...] = eqx.field(static=True)
     columns: tuple[Column, ...] = eqx.field(static=True)
     held: tuple[HeldQuantity, ...]
     choices: tuple[Choice, ...] = eqx.field(static=True)
@@ -256,7 +298,7 @@ class DesignSpace(Readable):
         for each in self.columns:
             scene = put_numbers(scene, (each.target,), each.value(each.source.read(scene)))
         for tie in self.ties:
-            scene = put_numbers(scene, (tie.target,), jnp.asarray(tie.factor) * tie.source.read(scene))
+            scene = put_numbers(scene, (tie.target,), tie.value(scene))
         return scene
 
     @validated
@@ -296,6 +338,31 @@ class DesignSpace(Readable):
         for bounds, name in ((low, "low"), (high, "high")):
             self._require_size(bounds, name, single=True)
         return eqx.tree_at(lambda s: (s.low, s.high), self, (np.asarray(low, float), np.asarray(high, float)))
+
+    def with_relative_dampings(self, texts: Mapping[str, str]) -> DesignSpace:
+        """Return the same space, in which dampings follow the stiffness and the mass of each design.
+
+        **Arguments**: `texts`: ratios and loss factors by the names of the dampings, as the scene file gives them. Dampings
+        that are free, chosen or tied are left out, and those that are equal in all designs.
+        """
+        changed = (*self.free, *(each.target for each in (*self.columns, *self.ties)))
+        used = set().union(*(each.entries for each in changed))
+        ties = {
+            each.name: text
+            for number in numbers_of(self.scene).values()
+            for each in number.single(self.scene)
+            if (text := texts.get(each.name) or texts.get(each.name.removesuffix(f"[{each.entry}]")))
+            and not each.entries & used
+        }
+        lowest, highest = (self.scene_of(jnp.asarray(bounds)) for bounds in (self.low, self.high))
+        follow = [
+            tie
+            for tie in _read_ties(self.scene, ties, used)  # a damping increases with the stiffness and with the mass
+            if not np.allclose(tie.value(lowest), tie.value(highest), rtol=1e-9, atol=0.0)
+        ]
+        space = copy.copy(self)
+        object.__setattr__(space, "ties", _in_order(self.scene, [*self.ties, *follow]))
+        return space
 
     def residuals(self, evaluation: Evaluation) -> Array:
         """Return the relative deviation (m,) of each held quantity from its held value, from an `evaluation` of a scene."""
@@ -389,12 +456,16 @@ def _read_choices(
     return allowed, counts
 
 
-def _read_ties(scene: Scene, ties: Mapping[str, Source], used: set) -> tuple[Tie, ...]:
-    read = []
+def _read_ties(scene: Scene, ties: Mapping[str, Source], used: set) -> tuple[Tie | RelativeDamping, ...]:
+    read: list[Tie | RelativeDamping] = []
     for name, source_given in ties.items():
         target = find_number(scene, name, "ties")
         if target.entries & used:
             raise InputError(f"ties.{name}", "is free, chosen or tied already; a number has one source")
+        if is_relative(source_given):
+            read += _read_relative_damping(scene, target, source_given)
+            used = used | target.entries
+            continue
         pair = isinstance(source_given, (list, tuple)) and len(source_given) == 2
         source_name, factor = source_given if pair else (source_given, 1.0)
         if not isinstance(source_name, str):
@@ -424,12 +495,25 @@ def _read_ties(scene: Scene, ties: Mapping[str, Source], used: set) -> tuple[Tie
             raise InputError(f"ties.{name}", f"has no ratio to {source_name}, which is 0 in the scene; give a factor")
         used = used | target.entries
         read.append(Tie(target, source, tuple(map(float, ratio))))
-    return _in_order(read)
+    return _in_order(scene, read)
 
 
-def _in_order(ties: Sequence[Tie]) -> tuple[Tie, ...]:
+def _read_relative_damping(scene: Scene, target: NamedNumber, text: str) -> list[RelativeDamping]:
+    """Return the ties of the entries of a `target`, other than 0, to the stiffness and the mass by a ratio or a loss factor."""
+    if target.path[0] != "machine" or not target.is_damping:
+        problem = f"is {quoted(text)}, which only a damping of the machine can be"
+        raise InputError(f"ties.{target.name}", f"{problem}; give another number's name, or (name, factor)")
+    ties = [RelativeDamping(each, text) for each in present_numbers(scene, target, "ties")]
+    with within("ties."):
+        for tie in ties:
+            tie.value(scene)  # raises an error for a wrong text
+    return ties
+
+
+def _in_order(scene: Scene, ties: Sequence[Tie | RelativeDamping]) -> tuple[Tie | RelativeDamping, ...]:
     """Return the ties in an order in which each follows the ties that determine its source."""
-    before = {k: [n for n, other in enumerate(ties) if other.target.entries & tie.source.entries] for k, tie in enumerate(ties)}
+    sources = [tie.sources(scene) for tie in ties]
+    before = {k: [n for n, other in enumerate(ties) if other.target.entries & each] for k, each in enumerate(sources)}
     try:
         return tuple(ties[k] for k in TopologicalSorter(before).static_order())
     except CycleError as error:

@@ -438,7 +438,7 @@ def _table(
     after the search."""
     table = []
     changed = [(number, "") for number in (*space.free, *(column.target for column in space.columns))]
-    for number, mark in changed + [(tie.target, " (tied)") for tie in space.ties]:
+    for number, mark in changed + [(tie.target, f" ({tie.mark})") for tie in space.ties]:
         start, end = (np.asarray(number.read(each)) for each in (space.scene, scene))
         is_new = number.spec.zero_is_absent & (start == 0.0) & (end != 0.0)
         for word, new, a, b in zip(number.words(space.scene), is_new, start, end, strict=True):

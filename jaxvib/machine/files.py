@@ -10,6 +10,7 @@ import tomllib
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -444,13 +445,24 @@ def _build_entries(build: Callable[..., object], tables: object, section: str) -
     return parts
 
 
-def rebuild_part(part: Any, section: str) -> Any:
+def rebuild_part(part: Any, section: str, given: Mapping[tuple[str | int, ...], str] = MappingProxyType({})) -> Any:
     """Construct a part of a scene again from its parameters, which validates them. Parts of types from outside the package are
-    returned unchanged."""
+    returned unchanged.
+
+    **Arguments**: `given`: texts in place of numbers, by their paths in the part, such as ("damping", 0).
+    """
     build = {**MACHINES, **LOADS, **DRIVES, **EFFECTS}.get(part.kind)
     if build is None or not all(hasattr(part, name) for name in inspect.signature(build).parameters):
         return part
-    return build_part(build, _fields(part, build, _si_numbers), section)
+    fields = _fields(part, build, _si_numbers)
+    for (*outer, name, entry), text in given.items():
+        table: Any = fields
+        for step in outer:
+            table = table[step]
+        values: Any = list(table[name]) if isinstance(table[name], list) or np.ndim(table[name]) else [table[name]]
+        values[entry] = text
+        table[name] = values if len(values) > 1 else text
+    return build_part(build, fields, section)
 
 
 @validated

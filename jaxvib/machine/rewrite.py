@@ -79,8 +79,8 @@ def rewrite_scene(text: str, scene: Scene) -> str:
         old = tomllib.loads(scene_to_toml(scene_from_toml(text)))
     except ValueError:  # the text refers to a file of torques, whose folder is not known here
         return scene_to_toml(scene)
-    kept = old
-    for _ in range(2):  # the second time also values that follow from changed ones, such as a damping from its ratio
+    kept = new
+    for _ in range(2):  # the second time also dampings that no longer have the ratio of their texts
         result = _with_edits(text, _edits(text, old, kept, new))
         try:
             kept = tomllib.loads(scene_to_toml(scene_from_toml(result)))
@@ -233,7 +233,8 @@ def _changes(text: str, value: _Value, label: str, values: _Values) -> list[_Edi
     """Return the edits that make a value of a file new. `label`: its path from the name of its entry on, for the comment."""
     read, old, kept, new = values
     was = in_one_line(text[value.start : value.end])
-    if old is None or new is None or (_is_close(old, new) and _is_close(kept, new)):
+    is_relative = isinstance(read, str) and bool(_RELATIVE.search(read))
+    if old is None or new is None or (_is_close(kept, new) and (is_relative or _is_close(old, new))):
         return []
     below = label if "[" in label else label.partition(".")[2]
     former = f"{below} = {was}" if below else was

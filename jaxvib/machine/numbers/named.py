@@ -68,6 +68,11 @@ class NamedNumber(NamedTuple):
         """Path and index of each parameter. Two names with the same path and index mean the same parameter."""
         return {(self.path, k) for k in (range(self.size) if self.entry is None else (self.entry,))}
 
+    @property
+    def is_damping(self) -> bool:
+        """True for the damping of a support or of a link."""
+        return "damping" in str(self.path[-1])
+
     def leaf(self, scene: Scene) -> Array:
         """Return the array that contains the parameter."""
         part: Any = scene

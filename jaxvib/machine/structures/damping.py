@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import TypeGuard
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,25 +39,39 @@ def damping_constants(damping: Numbers, field: str, stiffness: Array, mass: Call
     """
     if isinstance(damping, (list, tuple)):
         k = jnp.broadcast_to(stiffness, (len(damping),)) if np.ndim(stiffness) == 0 else stiffness
-        if not any(map(_is_relative, damping)):
+        if not any(map(is_relative, damping)):
             return damping
         if len(damping) != np.size(k):
             raise InputError(field, f"has {counted(len(damping))}; the number of springs is {np.size(k)}")
         m = [None] * len(damping) if mass is None else jnp.broadcast_to(mass(), np.shape(k))
         return [_constant(value, f"{field}[{i}]", k[i], m[i]) for i, value in enumerate(damping)]
-    if not isinstance(damping, str) or not _is_relative(damping):
+    if not is_relative(damping):
         return damping
     if np.ndim(stiffness) == 0:
         return _constant(damping, field, stiffness, None if mass is None else mass())
     return damping_constants([damping] * np.size(stiffness), field, stiffness, mass)
 
 
-def _is_relative(value: object) -> bool:
+def is_relative(value: object) -> TypeGuard[str]:
+    """Return True for a damping that is given as a ratio or as a loss factor."""
     return isinstance(value, str) and ("%" in value or value.strip().startswith("loss"))
 
 
+def relative_dampings(value: object, name: str) -> dict[str, str]:
+    """Return the dampings that a table of a scene file, or a `value` in it, gives as ratios or loss factors, by their names.
+
+    >>> relative_dampings({"kind": "two_mass", "damping": ["3 %", 0], "link_damping": "2 %"}, "machine")
+    {'machine.damping[0]': '3 %', 'machine.link_damping': '2 %'}
+    """
+    if is_relative(value):
+        return {name: value}
+    inner = {f"{name}.{key}": each for key, each in value.items()} if isinstance(value, Mapping) else {}
+    inner |= {f"{name}[{k}]": each for k, each in enumerate(value)} if isinstance(value, list) else {}
+    return {found: text for key, each in inner.items() for found, text in relative_dampings(each, key).items()}
+
+
 def _constant(value: Number, field: str, stiffness: Array, mass: Array | None) -> Number:
-    if not isinstance(value, str) or not _is_relative(value):
+    if not is_relative(value):
         return value
     ratio, loss = _RATIO.fullmatch(value.strip()), _LOSS.fullmatch(value.strip())
     if ratio is None and loss is None:
