@@ -45,8 +45,8 @@ ANGLES_TYPE = TypeWithUnit("angles", "deg", "rad", several=True)
 SEPARATION = click.option(
     "--separation",
     type=ANGLE_TYPE,
-    help="Initial angle between neighbouring loads, such as '3 deg' [at rest: side by side if the ball_radius is given, "
-    "otherwise 1 deg; in a jam: 0, for `settle` 1 deg].",
+    help="Initial angle between neighbouring loads, such as '60 deg' for six equally spaced loads [at rest: side by side if "
+    "the ball_radius is given, otherwise 1 deg; in a jam: 0, for `settle` 1 deg].",
 )
 
 

@@ -302,7 +302,7 @@ def convergence(history: np.ndarray, is_met: np.ndarray, *, best: int, label: st
     value, met = history[:, best], is_met[:, best]
     axis.plot(np.where(met, value, np.nan), color=COLORS[1], lw=2.0, label="best start")
     if not np.all(met):
-        axis.plot(value, color=COLORS[1], lw=1.0, ls="--", label="best start, before it meets the demands")
+        axis.plot(value, color=COLORS[1], lw=1.0, ls="--", label="best start while it violates demands")
     if np.nanmin(history) > 0.0:
         axis.set_yscale("log")
         log_ticks(axis)

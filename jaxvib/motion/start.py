@@ -23,7 +23,7 @@ from jaxvib.machine.effects.terms import DrillingSpinRelease, LoadInteraction, S
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
-from jaxvib.runtime.devices import numpy_if_known, on_device
+from jaxvib.runtime.devices import array_module, numpy_if_known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes, jams_of, require_mode_of
 from jaxvib.units import Number, Numbers, known_number, numbers
@@ -63,8 +63,8 @@ def initial_state(
     - `angles` (count,): the angles of the loads about the axis of the rotor, rad; or one value for the middle of all loads
       (default: the angle of `Loads.rest` at rest, and 0 in a jam). In a jam the displacements are those of coincident loads at
       the mean angle; typical: -pi to pi
-    - `separation`: angle between neighbouring loads, rad; typical: 0.02. For loads that touch (`LoadContact`) it is added to
-      the angle at which they are side by side. Default at rest: side by side if the loads have a `ball_radius`, otherwise
+    - `separation`: angle between neighbouring loads, rad; typical: 0.02, or 1.05 to space six loads equally. Loads that touch
+      (`LoadContact`) are at least side by side. Default at rest: side by side if the loads have a `ball_radius`, otherwise
       1 degree. Default in a jam (whose theory assumes coincident loads) and for `angles` (count,): 0. Loads with the same
       parameters that start at exactly one angle (`separation=0`) stay at one angle, even if slightly separated loads would not
     - `throw`: True to raise `ComputationError` if the mode does not exist; otherwise, and under a JAX transformation, the state
@@ -153,7 +153,10 @@ def _load_offsets(
     else:
         gap = min(START_SEPARATION, math.pi / n) if is_default and not (has_size or one_each) else 0.0
     offsets = gap * (np.arange(n) - 0.5 * (n - 1)).astype(exciter.drive.speed.dtype)
-    return offsets + numpy_if_known(loads.offsets()) if side_by_side else offsets
+    if not side_by_side:
+        return offsets
+    touching = numpy_if_known(loads.offsets())
+    return array_module(touching).where(abs(offsets) > abs(touching), offsets, touching)  # both have equal steps
 
 
 @cached

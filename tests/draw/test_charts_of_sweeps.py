@@ -165,8 +165,8 @@ def test_convergence_has_the_best_start_in_bold(least, scale):
     axis = convergence(history, is_met, best=1, label="force, N").axes[0]
     lines = {line.get_label(): line for line in axis.lines}
     np.testing.assert_array_equal(lines["best start"].get_ydata(), [np.nan, least, least])
-    dashed = lines["best start, before it meets the demands"]
+    dashed = lines["best start while it violates demands"]
     assert dashed.get_ydata().tolist() == [4.0, least, least] and dashed.get_linestyle() == "--"
     assert axis.get_yscale() == scale
     always = convergence(history, np.ones((3, 2), bool), best=1, label="force, N").axes[0]
-    assert [line.get_label() for line in always.lines].count("best start, before it meets the demands") == 0
+    assert [line.get_label() for line in always.lines].count("best start while it violates demands") == 0

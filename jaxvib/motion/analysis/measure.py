@@ -42,6 +42,8 @@ _MAX_SPREAD_OF_MEAN = 0.2
 _MIN_SHOWN_RIPPLE = 0.01
 """Smallest variation of the rotor speeds about their means, relative to the largest speed, that the text of a run states."""
 
+_AT_END = " at the end"
+
 _MAX_SHOWN_AS_MEAN = 0.03
 """Largest difference between the mean speeds at the end of a window and in the whole window, relative to the largest speed, of
 a text that states the means of the window only."""
@@ -156,11 +158,11 @@ class AbstractMeasured(Readable):
             recent = [np.asarray(speeds)[last_samples(len(speeds))] for speeds in rotor_speeds]
             at_end = dataclasses.replace(self, load_speed=end, omega=np.mean(turning_directions(scene) * end))
             means = f"means of the window, in which the speeds change: {speed_text(mean, 6)}"
-            return f"at the end, {at_end.speeds_text(scene, recent)}; {means}"
+            return f"at the end, {at_end.speeds_text(scene, recent).replace(_AT_END, '')}; {means}"
         exciters = [*zip(scene.exciters, map(np.asarray, rotor_speeds), strict=True)]
         histories = [speeds for exciter, speeds in exciters if exciter.loads is not None]
         changes = any(np.ptp(speeds) > _MAX_CONSTANT_SPREAD * np.max(np.abs(speeds)) for speeds in histories)
-        last = speed_text([speeds[-1] for speeds in histories], 6) + (" at the end" if changes else "")
+        last = speed_text([speeds[-1] for speeds in histories], 6) + (_AT_END if changes else "")
         rotor = f", {'rotor' if len(histories) == 1 else 'rotors'} at {last}" if histories else ""
         clockwise = np.any(np.asarray([exciter.direction for exciter in scene.exciters]) < 0)
         each = speed_text(self.load_speed, 6) + ("; negative: clockwise" if clockwise else "")

@@ -159,6 +159,16 @@ def test_loads_of_known_size_start_side_by_side():
     np.testing.assert_allclose(np.mean(angle), -np.pi / 2, rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("separation", "degrees"), [("90 deg", 90.0), ("1 deg", 2.0 * np.rad2deg(np.arcsin(0.11))), (0.0, None)]
+)
+def test_touching_loads_start_at_the_given_angle(separation, degrees):
+    s = three_balls(ball_radius=0.011)
+    s = jv.Scene(s.machine, s.loads, s.drive, (*s.effects, jv.LoadContact(1e6)))
+    angle = np.asarray(jv.initial_state(s, separation=separation).azimuth)
+    np.testing.assert_allclose(np.rad2deg(np.diff(angle)), degrees or 2.0 * np.rad2deg(np.arcsin(0.11)), rtol=1e-12)
+
+
 def test_no_two_of_many_loads_start_at_one_angle():
     loads = jv.balls(count=720, mass=0.001, radius=0.1, drag=0.1)
     s = jv.Scene(jv.planar_rotor(mass=25.0, stiffness=5e5, damping=300.0), loads, jv.ConstantSpeed(60.0))
