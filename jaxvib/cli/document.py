@@ -251,11 +251,11 @@ def run_text(run: jv.Run, measures: jv.VibrationMeasures | None) -> str:
 
 def force_lines(scene: jv.Scene) -> list[str]:
     """Return lines about the foundation force of a table."""
-    from jaxvib.motion.analysis.measure import ROOT_SUM_SQUARE  # slow import, which --help does not need
+    from jaxvib.motion.analysis.measure import ROOT_SUM_SQUARE, ROTATING_FORCE  # slow import, which --help does not need
 
     if len(scene.machine.structure().foundation_directions) == 1:
         return ["foundation force: zero to peak"]
-    return [f"foundation force: zero to peak, {ROOT_SUM_SQUARE}", "  (sqrt(2) times a force that rotates)"]
+    return [f"foundation force: zero to peak, {ROOT_SUM_SQUARE}", f"  ({ROTATING_FORCE})"]
 
 
 def indented(title: str, measures: jv.VibrationMeasures) -> str:

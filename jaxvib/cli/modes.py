@@ -60,10 +60,7 @@ def modes(
         raise InputError(
             "--phases", "cannot be combined with --exact; jams with unequal phases are computed for light loads only"
         )
-    if tolerances and (exact or phases or loaded.mounting.axes != (1,)):
-        raise InputError(
-            "--tolerance", "is for light, coincident loads on platforms; leave it out, or leave out --exact and --phases"
-        )
+    _require_light_jams(loaded, tolerances, exact, phases)
     require_tolerances(loaded, tolerances)
     if exact:
         _print_exact_jams(loaded, csv, output)
@@ -76,6 +73,19 @@ def modes(
         _print_phase_jams(loaded, output)
         return
     _print_light_jams(loaded, csv, tolerances, output)
+
+
+def _require_light_jams(scene: jv.Scene, tolerances: tuple[str, ...], exact: bool, phases: bool) -> None:
+    """**Raises** `InputError` for tolerances of jams other than those of light, coincident loads on platforms."""
+    if not tolerances:
+        return
+    if scene.mounting.axes != (1,):
+        problem = "is for jams on platforms; modes has no tolerances of this machine, which moves in two directions"
+        remedy = "leave it out, and compute runs for several values with jaxvib sweep (jaxvib new sweep > study.toml)"
+        raise InputError("--tolerance", f"{problem}; {remedy}")
+    if exact or phases:
+        option = "--exact" if exact else "--phases"
+        raise InputError("--tolerance", f"is for light, coincident loads; leave out {option}, or leave out --tolerance")
 
 
 def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], output: Output) -> None:

@@ -192,6 +192,12 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path, monkeypatc
     assert "│ 1904" not in merged and "│ 1572" in merged and merged.count("images)") == 1
     assert "jaxvib simulate rotor.toml --until 100s --start spin_up" in out
     assert "zero to peak, root sum square of both directions\n  (sqrt(2) times" in out
+    code, _, err = typed("modes", "rotor.toml", "--tolerance", "stiffness=5%")
+    assert code == 2 and "modes has no tolerances of this machine, which moves in two directions; leave it out" in err
+    assert "jaxvib sweep" in err and "--exact" not in err and "--phases" not in err
+    for option, other in (("--exact", "--phases"), ("--phases", "--exact")):
+        err = typed("modes", "machine.toml", option, "--tolerance", "stiffness=5%")[2]
+        assert f"leave out {option}, or leave out --tolerance" in err and other not in err
     (tmp_path / "stations.toml").write_text(TEMPLATES["rotor"])
     for words in (("modes", "--exact"), ("criterion",)):
         code, out, err = typed(words[0], "stations.toml", *words[1:])

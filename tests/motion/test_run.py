@@ -92,6 +92,9 @@ def test_largest_force_is_a_magnitude():
     np.testing.assert_allclose(run.largest_force, np.max(np.hypot(*force.T)), rtol=1e-5)
     assert float(run.largest_force) < 0.9 * np.hypot(*np.max(np.abs(force), axis=0))
     assert f"magnitude of the foundation force {float(run.largest_force):.4g} N" in run.summary()
+    # One rotating force has both values in the summary.
+    relation = "root sum square of both directions: sqrt(2) times the magnitude of a force that rotates"
+    assert f"foundation force {float(run.foundation_force):.4g} N ({relation})" in run.summary()
 
 
 def test_forces_of_a_rotor_are_labelled_by_direction():

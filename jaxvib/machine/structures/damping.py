@@ -17,6 +17,7 @@ from jaxvib.units.known import when_known
 _NUMBER_PATTERN = r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
 _RATIO = re.compile(_NUMBER_PATTERN + r"\s*%(?:\s*of\s+(.+))?")
 _LOSS = re.compile(r"loss(?:\s+factor)?\s+" + _NUMBER_PATTERN + r"\s+at\s+(.+)")
+_LOSS_ALONE = re.compile(r"loss(?:\s+factor)?\s+" + _NUMBER_PATTERN + r"\s*(%?)")
 
 
 def damping_constants(damping: Numbers, field: str, stiffness: Array, mass: Callable[[], Array] | None = None) -> Numbers:
@@ -75,6 +76,8 @@ def _constant(value: Number, field: str, stiffness: Array, mass: Array | None) -
         return value
     ratio, loss = _RATIO.fullmatch(value.strip()), _LOSS.fullmatch(value.strip())
     if ratio is None and loss is None:
+        if alone := _LOSS_ALONE.fullmatch(value.strip()):
+            raise InputError(field, _frequency_problem(value, float(alone[1]) / (100.0 if alone[2] else 1.0), stiffness, mass))
         forms = "'5 %', '5 % of 250 kg', 'loss factor 0.1 at 16 Hz' or '40 N s/m'"
         raise InputError(field, f"is {quoted(value)}; write a damping as {forms}")
     size = float((ratio or loss)[1])  # pyright: ignore[reportOptionalSubscript]
@@ -95,6 +98,14 @@ def _constant(value: Number, field: str, stiffness: Array, mass: Array | None) -
         constant = 0.02 * size * jnp.sqrt(stiffness * carried)
     known = when_known(float, constant)
     return constant if known is None else known
+
+
+def _frequency_problem(value: str, loss: float, stiffness: Array, mass: Array | None) -> str:
+    """Return the message about a loss factor without a frequency, with the resonance on this spring if it is known."""
+    resonance = None if mass is None else when_known(lambda k, m: float(jnp.sqrt(k / m) / (2.0 * jnp.pi)), stiffness, mass)
+    place = "for a rotor, that of its resonance" if not resonance else f"at resonance on this spring it is {resonance:.4g} Hz"
+    example = quoted(f"loss factor {loss:.6g} at {resonance or 16.0:.4g} Hz")
+    return f"is {quoted(value)}, without the frequency of the vibration; write for example {example} ({place})"
 
 
 def _require_spring(stiffness: float, field: str, value: str) -> None:

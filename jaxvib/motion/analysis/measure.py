@@ -32,6 +32,9 @@ needed because the amplitude and the force of a balanced rotor are almost zero."
 ROOT_SUM_SQUARE = "root sum square of both directions"
 """Text on a foundation force of two directions: the root of the sum of the squares of both peaks."""
 
+ROTATING_FORCE = "sqrt(2) times the magnitude of a force that rotates"
+"""Relation of `ROOT_SUM_SQUARE` and the magnitude of a foundation force that rotates."""
+
 _POINTS_IN_STEP = 8
 """Number of points in each sampling step at which a kinked force is searched for extrema. A second search covers the distance
 to the next point on each side of the extremum. It divides each of these two distances into the same number of parts."""
@@ -142,7 +145,11 @@ class AbstractMeasured(Readable):
         named = zip(structure.coordinates, self.amplitude, structure.units, strict=True)
         amplitude = ", ".join(f"{name} {quantity_text(a, unit, 4)}" for name, a, unit in named)
         force = quantity_text(self.foundation_force, "N", 4) if scene.machine.has_foundation else "unknown"
-        kind = f" ({ROOT_SUM_SQUARE})" if scene.machine.has_foundation and len(structure.foundation_directions) > 1 else ""
+        kind = (
+            f" ({ROOT_SUM_SQUARE}: {ROTATING_FORCE})"
+            if scene.machine.has_foundation and len(structure.foundation_directions) > 1
+            else ""
+        )
         return f"amplitude, zero to peak: {amplitude}; foundation force {force}{kind}"
 
     def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array], last_speed: Array | None = None) -> str:

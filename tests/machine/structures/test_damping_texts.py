@@ -58,12 +58,26 @@ def test_a_support_of_a_body_needs_the_mass_it_carries():
     np.testing.assert_allclose(found, 0.1 * np.sqrt([1e5 * 250.0, 4e5 * 250.0]), rtol=1e-12)
 
 
+def test_a_loss_factor_at_the_frequency_of_the_message_is_read():
+    """At the resonance of a rotor a loss factor is twice a damping ratio."""
+    rotor = {"mass": 62.0, "stiffness": 95e3}
+    with pytest.raises(jv.InputError, match=r"'loss factor 0\.08 at 6\.23 Hz'"):
+        jv.planar_rotor(**rotor, damping="loss factor 8 %")
+    found, ratio = (jv.planar_rotor(**rotor, damping=each).damping for each in ("loss factor 0.08 at 6.23 Hz", "4 %"))
+    np.testing.assert_allclose(found, ratio, rtol=1e-3)
+    spring = {"at": (0.0, 0.0), "stiffness": (1e5, 4e5)}
+    with pytest.raises(jv.InputError, match=r"'loss factor 0.08 at 16 Hz' \(for a rotor, that of its resonance\)"):
+        jv.support(**spring, damping="loss factor 8 %")
+
+
 @pytest.mark.parametrize(
     ("damping", "words"),
     [
         ("-5 %", "must be at least 0"),
         ("5 % of 3 m", "not in kg"),
-        ("loss 0.1", "write a damping as '5 %'"),
+        ("loss 0.1", "without the frequency of the vibration; write for example 'loss factor 0.1 at 4.502 Hz'"),
+        ("loss factor 8 %", r"'loss factor 0.08 at 4.502 Hz' \(at resonance on this spring it is 4.502 Hz\)"),
+        ("loss factor high", "write a damping as '5 %'"),
         ("% 5", "write a damping as '5 %'"),
         ("loss factor 0.1 at 3 kg", "not in rad/s"),
         ("loss factor 0.1 at 16", "write the frequency with its unit: 'loss factor 0.1 at 16 Hz'"),
