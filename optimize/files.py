@@ -224,11 +224,8 @@ def quantity_from_table(
             raise InputError(
                 f"{section}.statistic", f"is {quoted(statistic)}; {suggest_name(str(statistic), list(_STATISTICS))}"
             )
-        is_least = is_large_good and statistic == "worst"
-        over = _STATISTICS[statistic](
-            -quantity if is_least else quantity, table["tolerances"], samples=table.get("samples", 64)
-        )
-        quantity = (-over).named(f"worst {quantity.words}") if is_least else over
+        sense = {"is_large_good": is_large_good} if statistic == "worst" else {}
+        quantity = _STATISTICS[statistic](quantity, table["tolerances"], samples=table.get("samples", 64), **sense)
     return quantity, {k: table[k] for k in more if k in table}
 
 

@@ -31,7 +31,7 @@ _PERCENT = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*%")
 _RANGE = re.compile(r"(.+?)\.\.(.+)")
 _MATERIAL = re.compile(r"material(?:\[(\d+)\])?")
 
-_STATISTIC = re.compile(r"\b(worst|expected|\d+% quantile of) ")
+_STATISTIC = re.compile(r"\b(worst \((?:highest|lowest)\)|expected|\d+ % quantile of) ")
 """Pattern of the names of statistics over machines."""
 
 _DEFAULT_SAMPLES = 128

@@ -347,9 +347,10 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("peak_force", until=1.0, spin_up=0.5)
     yield call("settling_time", until=1.0, spin_up=0.5, within=0.05, of=1)
     yield call("spring_cost", prices=[(1e4, 10.0), (1e5, 20.0)], unit="EUR")
-    for name in ("expected", "worst"):
-        yield call(name, quantity=force, tolerances={"machine.stiffness": 0.05}, samples=4, seed=0)
-    yield call("quantile", quantity=force, level=0.9, tolerances={"machine.stiffness": 0.05}, samples=4, seed=0)
+    of_samples = dict(tolerances={"machine.stiffness": 0.05}, samples=4, seed=0)
+    yield call("expected", quantity=force, **of_samples)
+    yield call("worst", quantity=force, is_large_good=False, **of_samples)
+    yield call("quantile", quantity=force, level=0.9, **of_samples)
     yield call("under", quantity=force, name="slow", changes={"drive.speed": "1200 rpm"})
     yield call("hold", quantity=force, value=10.0)
     yield call("largest", lambda: lambda first: op.largest(first), first=force)

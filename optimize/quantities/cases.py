@@ -204,7 +204,7 @@ def _robust(
             raise InputError(f"tolerances.{name}", f"is {quoted(value)}; it must be between 0 and 1, such as 0.05 for 5 %")
     size = count(samples, "samples", low=2, each=64.0 * len(tolerances))
     case = Sampled(tuple((k, float(v)) for k, v in tolerances.items()), size, count(seed, "seed", low=0))
-    words = statistic if statistic != "quantile" else f"{100.0 * level:.0f} % quantile of"
+    words = {"worst": "worst (highest)", "quantile": f"{100.0 * level:.0f} % quantile of"}.get(statistic, statistic)
     return Robust(
         f"{words} {quantity.words}",
         quantity.unit,
@@ -240,12 +240,16 @@ def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: in
 
 
 @quantity_function
-def worst(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0) -> Quantity:
+def worst(
+    quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0, is_large_good: bool = False
+) -> Quantity:
     """Return the largest value of a quantity over machines whose parameters deviate from the design, see `expected`.
 
-    The smallest value of a quantity that should be large is `-worst(-quantity, ...)`.
+    **Arguments**
 
-    **Arguments**: `quantity`, `tolerances`, `samples` and `seed`: as for `expected`; typical: 64 samples (the default).
+    - `quantity`, `tolerances`, `samples` and `seed`: as for `expected`; typical: 64 samples (the default)
+    - `is_large_good`: True for a quantity that should be large; the result is then the smallest value; typical: False (the
+      default)
 
     **Returns** `Quantity`, NaN if it does not exist for one of the machines. **Raises** `InputError` for wrong tolerances.
 
@@ -253,6 +257,9 @@ def worst(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int =
     >>> worst(foundation_force(mode=3), {"machine.damping": 0.3}).unit
     'N'
     """
+    if is_large_good:
+        largest = _robust(-quantity, tolerances, samples, seed, "worst", 0.0)
+        return (-largest).named(f"worst (lowest) {quantity.words}")
     return _robust(quantity, tolerances, samples, seed, "worst", 0.0)
 
 

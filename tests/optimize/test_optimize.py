@@ -237,7 +237,7 @@ def test_design_file_is_read(tmp_path):
     (tmp_path / "design.toml").write_text(more)
     design = load_design(tmp_path / "design.toml")
     assert [d.words for d in design.subject_to] == ["amplitude of platform 1 against 2, mode 3, exact at least 2 mm"]
-    assert design.space.counts == (2, 3, 4) and design.objective.words.startswith("worst force per amplitude")
+    assert design.space.counts == (2, 3, 4) and design.objective.words.startswith("worst (highest) force per amplitude")
     every = (
         DESIGNS["design"].replace("# iterations", "iterations").replace("# rate", "rate").replace("# polishing", "polishing")
     )
@@ -305,7 +305,8 @@ def test_worst_machine_of_a_maximum_has_the_least_value(tmp_path):
     assert float(design.objective(design.space.scene)) == -least > -most
     assert [float(d.quantity(design.space.scene)) for d in design.subject_to] == [most, least]
     assert [d.words for d in design.subject_to] == [
-        f"worst mass of platforms and loads at {x} kg" for x in ("most 999", "least 1")
+        f"worst ({x} kg"
+        for x in ("highest) mass of platforms and loads at most 999", "lowest) mass of platforms and loads at least 1")
     ]
 
 
