@@ -173,8 +173,7 @@ def sensor_rows(scene: Scene, carrier: Carrier, channels: tuple[Channel, ...]) -
     found = []
     for channel in channels:
         if channel.kind == "force":
-            directions = carrier.foundation_directions
-            weights = jnp.asarray([channel.direction[0 if each == "across" else 1] for each in directions])
+            weights = jnp.asarray(channel.direction[-len(carrier.foundation_directions) :])  # a single direction is up
             stiffness, damping = weights @ carrier.foundation_stiffness, weights @ carrier.foundation_damping
             found.append(jnp.stack([stiffness, damping, jnp.zeros_like(stiffness)]))
         else:

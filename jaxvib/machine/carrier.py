@@ -157,6 +157,18 @@ def _combine(levers: Sequence[Array | None], values: Sequence[Array]) -> Array:
     return sum(terms[1:], terms[0])
 
 
+def force_directions(coordinates: Sequence[str], count: int) -> tuple[str, ...]:
+    """Return the names of the `count` directions of the force on the foundation: "up", or "across" and "up".
+
+    Those of a rotor are its coordinates "y" and "z", because its axis may be vertical.
+
+    >>> force_directions(("y", "z"), 2), force_directions(("x", "y", "psi"), 2), force_directions(("y1",), 1)
+    (('y', 'z'), ('across', 'up'), ('up',))
+    """
+    rotor = ("y", "z")
+    return ("up",) if count == 1 else rotor if tuple(coordinates[:2]) == rotor else ("across", "up")
+
+
 class Carrier(Readable):
     """Linear structure of a machine.
 
@@ -223,8 +235,8 @@ class Carrier(Readable):
 
     @property
     def foundation_directions(self) -> tuple[str, ...]:
-        """Names of the directions of the force on the foundation: "up", or "across" and "up"."""
-        return ("up",) if self.foundation_stiffness.shape[0] == 1 else ("across", "up")
+        """Names of the directions of the force on the foundation, see `force_directions`."""
+        return force_directions(self.coordinates, self.foundation_stiffness.shape[0])
 
     def foundation_force(self, displacement: Array, velocity: Array) -> Array:
         """Return the force on the foundation, T_K q + T_C q', N, one entry for each direction, without effects.

@@ -186,7 +186,8 @@ class VibrationMeasures(Readable):
             named = [f"{name} {quantity_text(each, 'm', 4)}" for name, each in sagging if (name[0] == "x") == across]
             lines += [f"static deflection{of}, {way}: {', '.join(named)}"] if named else []
         for k, each in enumerate(zip(self.static_load, self.dynamic_load, self.side_load, strict=True)):
-            named = zip(each, ("static", "dynamic", "to the sides"), strict=True)
+            words = ("static", "dynamic in z", "dynamic in y") if self._is_rotor else ("static", "dynamic", "to the sides")
+            named = zip(each, words, strict=True)
             largest = np.max(np.abs(each), initial=0.0, where=~np.isnan(each))
             parts = [
                 f"{quantity_text(load, 'N', 4)} {word}" for load, word in named if abs(load) > _NEGLIGIBLE_FRACTION * largest
@@ -194,7 +195,8 @@ class VibrationMeasures(Readable):
             lines += [f"support {k + 1}: {', '.join(parts)}"] if parts else []
         if len(self.directions) > 1 and not np.any(np.isnan(self.foundation_load)):
             loads = zip(self.foundation_load, self.directions, strict=True)
-            forces = ", ".join(f"{quantity_text(force, 'N', 4)} {name}" for force, name in loads)
+            along = "in " if self._is_rotor else ""
+            forces = ", ".join(f"{quantity_text(force, 'N', 4)} {along}{name}" for force, name in loads)
             lines.append(f"foundation: {forces} (dynamic)")
         lines += self._transmissibility_text()
         shafts = [

@@ -103,8 +103,13 @@ def test_forces_of_a_rotor_are_labelled_by_direction():
     s = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(60.0), unbalance=0.02)])
     run = jv.simulate(s, 1.0, estimate=False)
     force = run.to_xarray()["foundation_force"]
-    np.testing.assert_array_equal(force.sel(direction="up"), run.trajectory.foundation_force[:, 1])
-    assert {"foundation_force across (N)", "foundation_force up (N)"} <= set(run.to_pandas())
+    np.testing.assert_array_equal(force.sel(direction="z"), run.trajectory.foundation_force[:, 1])
+    assert {"foundation_force y (N)", "foundation_force z (N)"} <= set(run.to_pandas())
+    measures = jv.vibration_measures(s, run.vibration())
+    y, z = (f"{float(each):.4g} N" for each in measures.foundation_load)
+    text = measures.summary()
+    assert f"foundation: {y} in y, {z} in z (dynamic)" in text
+    assert f"support 1: {z} dynamic in z, {y} dynamic in y" in text
 
 
 def test_loads_run_together_that_have_one_angle_all_the_time():

@@ -12,6 +12,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, quantity_text, speed_text
 from jaxvib.equations.jammed_bodies import JammedBodies
 from jaxvib.errors import InputError
+from jaxvib.machine.carrier import force_directions
 from jaxvib.numerics.extrema import greatest
 from jaxvib.numerics.fourier import Grid, deviation_synthesis, grid_of, synthesized
 from jaxvib.numerics.sincos import sine_and_cosine
@@ -207,7 +208,7 @@ def plot_period(
             labels,
         ),
         (title, angles_in_degrees, numbered if len(numbered) > 1 else [alone]),
-        ("foundation force, N", forces, ["across", "up"][-forces.shape[1] :]),
+        ("foundation force, N", forces, list(force_directions(names, forces.shape[1]))),
     ]
     return signals_chart(np.rad2deg(theta), panels, x_label="load angle Ωt, degrees", ax=ax)
 
