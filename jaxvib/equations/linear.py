@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.equations.modal import ModalResponse, modal_response
 from jaxvib.equations.model import Model, assemble
 from jaxvib.errors import InputError, quoted
@@ -385,9 +386,15 @@ def require_circular(loads: Loads, drive: Drive) -> None:
     if not drive.ideal:
         raise InputError(
             "drive.kind",
-            f"is {quoted(drive.kind)}; this function needs a prescribed rotor speed (property ideal), such as "
-            "ConstantSpeed; use simulate for loads on the rotor of a motor",
+            f"is {quoted(drive.kind)}; this function needs a prescribed rotor speed (property ideal); use simulate for loads "
+            f"on the rotor of a motor, or ConstantSpeed{_no_load_text(drive)}",
         )
+
+
+def _no_load_text(drive: Drive) -> str:
+    """Return the no-load speed of the rotor as the argument of `ConstantSpeed`; "" for a traced speed."""
+    speed = when_known(speed_text, drive.speed)
+    return "" if speed is None else f"({quoted(speed)}) at the no-load speed of the rotor"
 
 
 def require_terms(

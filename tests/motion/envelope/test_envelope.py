@@ -262,7 +262,7 @@ class Wind(jv.Effect):
         (dict(max_steps=0), "max_steps is 0"),
         (
             dict(scene=eqx.tree_at(lambda s: s.drive, small(), MOTOR)),
-            "drive.kind is .* this function needs a prescribed rotor speed",
+            r"drive.kind is .* a prescribed rotor speed .* or ConstantSpeed\('.* rpm'\) at the no-load speed of the rotor",
         ),
         (dict(scene=small(effects=(Wind(),))), "effects.wind is not included in this function"),
         (
