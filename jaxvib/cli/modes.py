@@ -383,11 +383,12 @@ def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None
     }
 
     def text() -> str:
-        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
+        from jaxvib.display import speed_text, speed_unit  # slow imports, which --help does not need
+        from jaxvib.steady.jams.branch_plot import KINDS
 
         unit, scale = speed_unit()
         head, *rows = _exact_table(scene, existing)
-        points = [[p.kind.replace("_", " "), f"{scale * p.omega:.6g}", f"{scale * p.rotor_speed:.6g}"] for p in diagram.special]
+        points = [[KINDS[p.kind], f"{scale * p.omega:.6g}", f"{scale * p.rotor_speed:.6g}"] for p in diagram.special]
         lines = [
             f"rotor {speed_text(scene.drive.speed)}",
             table("exact jams; amplitudes and force are zero to peak", head, rows),

@@ -30,7 +30,7 @@ from jaxvib.draw.style import (
     stacked_looks,
 )
 
-_DASHES = {"fold": "-", "torus": "--", "period doubling": "-.", "symmetry": ":"}
+_DASHES = {"fold": "-", "torus bifurcation": "--", "period doubling": "-.", "loss of symmetry": ":"}
 
 
 def label_map(
@@ -100,7 +100,7 @@ def _bifurcation_lines(
         inside = inside or bool(np.any(within))
         marker = "." if xs.size == 1 else None
         axis.plot(drawn[0][1](xs), drawn[1][1](ys), color="black", lw=width, ls=dashes, marker=marker)
-    return [Line2D([], [], color="black", lw=width, ls=dashes, label=f"{kind} bifurcations of exact jams")] if inside else []
+    return [Line2D([], [], color="black", lw=width, ls=dashes, label=f"{kind} of exact jams")] if inside else []
 
 
 def _hatch(axis: Axes, mesh: QuadMesh, chosen: np.ndarray, look: Look) -> None:

@@ -16,6 +16,7 @@ from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.files import scene_from_toml
 from jaxvib.machine.numbers.named import find_number
 from jaxvib.results.estimate import wilson
+from jaxvib.steady.jams.branch_plot import KINDS
 from jaxvib.steady.orbits.diagram import exact_branches
 from jaxvib.sweeps.axes import SAMPLE, axis_of, put_values
 from jaxvib.sweeps.definition import WITH_RESULTS
@@ -441,7 +442,7 @@ def _theory_lines(
             return {}
         kinds: dict[str, list[float]] = {}
         for point in special:
-            kinds.setdefault(point.kind.replace("_", " "), []).append(point.rotor_speed)
+            kinds.setdefault(KINDS[point.kind], []).append(point.rotor_speed)
         kinds_of_rows.append(kinds)
     kinds_of_rows = kinds_of_rows * 2 if fixed else kinds_of_rows
     lines: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}

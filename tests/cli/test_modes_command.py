@@ -232,7 +232,11 @@ def test_exact_modes_json_has_the_promised_keys(typed):
     measured = jv.vibration_measures(jv.load_scene("machine.toml"), jv.jam_orbit(jv.load_scene("machine.toml"), mode=3))
     np.testing.assert_allclose(jams[3]["measures"]["stroke"], measured.stroke, rtol=1e-9)
     assert {k for k, each in jams.items() if "measures" in each} == {k for k, each in jams.items() if each["stable"]}
+    loads = [each["measures"]["foundation_load"][0] for each in jams.values() if "measures" in each]
+    forces = [each["foundation_force"] for each in jams.values() if "measures" in each]
+    np.testing.assert_allclose(loads, forces, rtol=1e-9)
     out = typed("modes", "machine.toml", "--exact", "--unit", "si")[1]
+    assert " loss of symmetry " in out and " symmetry  " not in out.replace("loss of symmetry", "")
     assert "y1, m " in out and " m/s RMS" in out and " mm" not in out
 
 

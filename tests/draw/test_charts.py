@@ -231,17 +231,16 @@ def test_a_regime_and_a_mode_have_their_colour_in_every_map():
 
 def test_a_line_of_folds_reaches_the_edges_of_its_map():
     x, y = np.linspace(0.0, 4.0, 5), np.linspace(0.0, 2.0, 3)
-    lines = {"fold": [(np.array([1.0, 2.0, 3.0]), y)], "torus": [(np.array([7.0, 7.0]), y[[0, -1]])]}
+    lines = {"fold": [(np.array([1.0, 2.0, 3.0]), y)], "torus bifurcation": [(np.array([7.0, 7.0]), y[[0, -1]])]}
     axis = label_map(x, y, np.zeros((3, 5), int), ["a"], x_label="x", y_label="y", lines=lines).axes[0]
     np.testing.assert_allclose(axis.lines[0].get_xydata()[[0, -1]], [[0.8, -0.2], [3.2, 2.2]])
-    assert [t.get_text() for t in axis.get_legend().get_texts()] == ["a", "fold bifurcations of exact jams", "case"]
+    assert [t.get_text() for t in axis.get_legend().get_texts()] == ["a", "fold of exact jams", "case"]
 
 
 def test_a_dotted_line_of_a_map_remains_visible_on_a_solid_one():
     x, y, line = np.linspace(0.0, 4.0, 5), np.linspace(0.0, 2.0, 3), [(np.array([1.0, 1.0]), np.array([0.0, 2.0]))]
-    axis = label_map(x, y, np.zeros((3, 5), int), ["a"], x_label="x", y_label="y", lines={"fold": line, "symmetry": line}).axes[
-        0
-    ]
+    lines = {"fold": line, "loss of symmetry": line}
+    axis = label_map(x, y, np.zeros((3, 5), int), ["a"], x_label="x", y_label="y", lines=lines).axes[0]
     fold, symmetry, _ = axis.lines
     assert symmetry.get_linewidth() > 2.0 * fold.get_linewidth()
 

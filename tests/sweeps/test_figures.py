@@ -85,7 +85,7 @@ def test_each_label_has_a_colour_and_so_has_a_missing_label():
         "a",
         "c",
         "no result",
-        "fold bifurcations of exact jams",
+        "fold of exact jams",
         "case",
     ]
 

@@ -78,7 +78,9 @@ def stability_map(
 
 
 def _special_text(points: list[dict], scale: float) -> str:
-    return ", ".join(f"{p['kind'].replace('_', ' ')} {scale * p['omega']:.5g}" for p in points) or "nowhere"
+    from jaxvib.steady.jams.branch_plot import KINDS  # slow import, which --help does not need
+
+    return ", ".join(f"{KINDS[p['kind']]} {scale * p['omega']:.5g}" for p in points) or "nowhere"
 
 
 @command("onset")
@@ -105,6 +107,8 @@ def onset(
     output: Output,
 ) -> None:
     """Find the value of a parameter at which a torus bifurcation, or another special point, appears in the diagram of SCENE."""
+    from jaxvib.steady.jams.branch_plot import KINDS  # slow import, which --help does not need
+
     loaded = loaded_scene(scene, without)
     make, read = _scene_function_and_reader(loaded, vary)
     low, high = (read(value, "--between") for value in between)
@@ -112,8 +116,7 @@ def onset(
     document = {"vary": vary, "kind": kind, "value": found, "accuracy": accuracy, "between": [low, high]}
     words, unit = _words_and_unit(loaded, vary)
     value = f"{found:.6g} {unit}".rstrip()
-    name = {"torus": "torus bifurcation", "symmetry": "loss of symmetry"}.get(kind, kind.replace("_", " "))
-    sentence = f"{name}: appears when {words} increases to {value} (relative accuracy {accuracy:g})"
+    sentence = f"{KINDS[kind]}: appears when {words} increases to {value} (relative accuracy {accuracy:g})"
     output.done(document, lambda: sentence, "onset")
 
 

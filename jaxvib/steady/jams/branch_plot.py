@@ -34,13 +34,22 @@ def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], s
         f"{omega.size} points from {ends}, {100.0 * np.mean(stable):.1f} % of them stable {stability_text}; "
         f"resonances {speed_text(estimated_frequencies(branch.scene), 6)}"
     ]
-    names = [(kind.replace("_", " "), w, n) for kind, w, n in marks]
-    return "\n".join([*lines, *(f"  {kind}: Omega {speed_text(w, 6)}, rotor {speed_text(n, 6)}" for kind, w, n in names)])
+    return "\n".join(
+        [*lines, *(f"  {KINDS[kind]}: Omega {speed_text(w, 6)}, rotor {speed_text(n, 6)}" for kind, w, n in marks)]
+    )
 
+
+KINDS = {
+    "fold": "fold",
+    "torus": "torus bifurcation",
+    "symmetry": "loss of symmetry",
+    "period_doubling": "period doubling",
+}
+"""Names of special points, for texts and tables."""
 
 MARKS = {
     "fold": "fold: the jam ends and the loads jump",
-    "torus": "torus: the jam begins to pulsate",
+    "torus": "torus bifurcation: the jam begins to pulsate",
     "symmetry": "loss of symmetry: loads separate, or the two halves of a turn differ",
     "period_doubling": "period doubles",
 }

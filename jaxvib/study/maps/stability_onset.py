@@ -16,7 +16,7 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.parallel import in_parallel
-from jaxvib.steady.jams.branch_plot import MARKS
+from jaxvib.steady.jams.branch_plot import KINDS, MARKS
 from jaxvib.steady.orbits.diagram import ExactBranches, SpecialPoint, exact_branches
 from jaxvib.units import number
 
@@ -53,7 +53,7 @@ class StabilityMap(Result):
         """Return a line of text for each value: the stable share of the range, and the special points."""
         lines = []
         for x, share, points in zip(self.value, self.stable_share, self.special, strict=True):
-            kinds = ", ".join(f"{point.kind.replace('_', ' ')} at {speed_text(point.omega, 6)}" for point in points)
+            kinds = ", ".join(f"{KINDS[point.kind]} at {speed_text(point.omega, 6)}" for point in points)
             lines.append(f"{x:.6g}: {100.0 * share:.1f} % of the load speeds stable; {kinds or 'no special point'}")
         return "\n".join(lines)
 
@@ -64,7 +64,7 @@ class StabilityMap(Result):
         marks: dict[str, list[tuple[float, float]]] = {}
         for x, points in zip(self.value, self.special, strict=True):
             for point in points:
-                marks.setdefault(MARKS.get(point.kind, point.kind), []).append((point.omega, float(x)))
+                marks.setdefault(MARKS[point.kind], []).append((point.omega, float(x)))
         from jaxvib.draw.comparison import stability_chart  # slow import
 
         return stability_chart(
@@ -171,8 +171,8 @@ def stability_onset(
 
     number(accuracy, "", "accuracy", low=1e-12)
     _require_points(points)
-    if kind not in MARKS:
-        raise InputError("kind", f"is {quoted(kind)}; it must be one of {', '.join(MARKS)}")
+    if kind not in KINDS:
+        raise InputError("kind", f"is {quoted(kind)}; it must be one of {', '.join(KINDS)}")
     low, high = between
     if not 0.0 < low < high:
         raise InputError("between", f"is {quoted(between)}; it must be two positive values, the lower one first")
