@@ -405,7 +405,8 @@ def _standard_rows(scene: Scene, motion: _Motion, of: Pair) -> list[tuple[str, Q
     rows = [("jam frequency", jam_frequency(mode=mode))]
     rows += [(name, amplitude(mode=mode, of=k + 1)) for k, name in enumerate(amplitude_names(scene))]
     rows += [("foundation force", foundation_force(mode=mode))]
-    return [*rows, ("force per amplitude", force_per_amplitude(mode=mode, of=of))]
+    names = [scene.machine.structure().coordinates[number - 1] for number in np.ravel(resolve_pair(scene, of))]
+    return [*rows, (f"force per amplitude of {' against '.join(names)}", force_per_amplitude(mode=mode, of=of))]
 
 
 def _named_quantities(

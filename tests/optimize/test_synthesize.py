@@ -40,7 +40,7 @@ def test_the_table_has_each_quantity_once():
         "amplitude of platform 1 (y1)",
         "amplitude of platform 2 (y2)",
         "foundation force",
-        "force per amplitude",
+        "force per amplitude of y1 against y2",
     ]
     assert [name for name, _ in _standard_rows(SCENE, 3, None)] == standard and _standard_rows(SCENE, None, None) == []
     force, mass = foundation_force(mode=3), total_mass()
