@@ -88,6 +88,7 @@ def drag_of(
 
     - oil: the oil turns with the rotor. The formula is that of a ball far from walls. A ball on its track has a larger
       drag, especially in a channel narrower than about five ball diameters. Measure this drag
+    - oil: the formula is that of a sphere, also for a roller, whose length it ignores: measure the drag of a roller
     - bearing: the values of mu for rolling bearings hold for open bearings with good lubrication, at about a tenth of their
       dynamic load rating. Seals add their own friction
 
