@@ -28,6 +28,7 @@ from jaxvib.motion.analysis.beat import beat_period
 from jaxvib.motion.analysis.caught import held_lines, held_rotors
 from jaxvib.motion.analysis.creep import creep_text
 from jaxvib.motion.analysis.measure import (
+    STILL_SHARE,
     AbstractMeasured,
     Measured,
     Trajectory,
@@ -50,7 +51,7 @@ from jaxvib.motion.analysis.points import (
     samples_of,
     vibration_of,
 )
-from jaxvib.motion.analysis.regime import STILL_SHARE, Regime, balancing_time_text, regime
+from jaxvib.motion.analysis.regime import Regime, balancing_time_text, regime
 from jaxvib.motion.analysis.separation import has_collision, has_overlap, would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
 from jaxvib.motion.analysis.stays import Stay, find_stays

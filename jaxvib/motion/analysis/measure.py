@@ -45,6 +45,9 @@ _MAX_SPREAD_OF_MEAN = 0.2
 _MIN_SHOWN_RIPPLE = 0.01
 """Smallest variation of the rotor speeds about their means, relative to the largest speed, that the text of a run states."""
 
+STILL_SHARE = 0.01
+"""Speed of a rotor, relative to a working or resonance speed, below which texts state that it is at rest."""
+
 _AT_END = " at the end"
 
 _MAX_SHOWN_AS_MEAN = 0.03
@@ -161,7 +164,9 @@ class AbstractMeasured(Readable):
         (loads,), differ from those of the window, because a mass passed a resonance in it, the text begins with them.
         """
         mean, end = np.asarray(self.load_speed), np.asarray(self.load_speed if last_speed is None else last_speed)
-        if not bool(self.settled) and np.max(np.abs(end - mean)) > _MAX_SHOWN_AS_MEAN * np.max(np.abs(end)):
+        fastest = np.max(np.abs(end))
+        turns = fastest > STILL_SHARE * float(scene.top_speed)
+        if turns and not bool(self.settled) and np.max(np.abs(end - mean)) > _MAX_SHOWN_AS_MEAN * fastest:
             recent = [np.asarray(speeds)[last_samples(len(speeds))] for speeds in rotor_speeds]
             at_end = dataclasses.replace(self, load_speed=end, omega=np.mean(turning_directions(scene) * end))
             means = f"means of the window, in which the speeds change: {speed_text(mean, 6)}"

@@ -16,7 +16,7 @@ from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
-from jaxvib.motion.analysis.measure import Trajectory, mean_speeds
+from jaxvib.motion.analysis.measure import STILL_SHARE, Trajectory, mean_speeds
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import sentence, status_name
@@ -39,9 +39,6 @@ _LOCKED_PHASE_CHANGE = 0.1
 _MAX_LAG_CHANGE = 0.02
 """Relative difference between the lags of a load (angles by which it falls behind the rotor) in the two halves of the window,
 below which the lag is steady. A load with a steady lag is jammed, even if the lag is small."""
-
-STILL_SHARE = 0.01
-"""Speed of a rotor, relative to a working or resonance speed, below which texts state that it is at rest."""
 
 _MAX_BACKWARD_DIRECTIVITY = -0.98
 """Directivity of a whirl up to which it counts as a backward circle, that is with at most 1 % of forward motion."""
