@@ -25,6 +25,7 @@ from jaxvib.machine.effects.base import static_imbalances, total_gravity
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import MAX_USUAL_SPEED, Exciter, Scene, read_unbalance, require_comparable, require_parts
+from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.runtime.devices import float_dtype
 from jaxvib.units import conditions_of_traced_values
@@ -235,6 +236,29 @@ def implausible_numbers(scene: Scene) -> list[str]:
         if mass >= _MIN_MASS and 0.0 < total * _MAX_SAG < STANDARD_GRAVITY * likely_mass:
             value = f"so small that the machine sags by {STANDARD_GRAVITY * likely_mass / total:.3g} m"
             note(f"machine.{name}", value, "N/m", f"{float(np.max(stiffness)):g} N/mm")
+    return [*notes, *(_damping_notes(scene.machine) if mass >= _MIN_MASS else ())]
+
+
+_MIN_DAMPING_RATIO, _MAX_PERCENT = 1e-3, 20.0
+"""Smallest usual ratio of a damper to the critical damping, and largest usual ratio in percent."""
+
+
+def _damping_notes(machine: Machine) -> list[str]:
+    """Return a sentence for each damper of platforms that was probably intended as a ratio in percent."""
+    if not isinstance(machine, Platforms):
+        return []
+    mass, ends = np.asarray(machine.mass), np.reshape(np.asarray(machine.links, int), (-1, 2)) - 1
+    joined = 1.0 / np.sum(1.0 / mass[ends], axis=1)
+    springs = (("damping", machine.damping, machine.stiffness, mass),)
+    springs += (("link_damping", machine.link_damping, machine.link_stiffness, joined),)
+    notes = []
+    for name, dampings, stiffness, masses in springs:
+        for i in np.flatnonzero(stiffness):
+            c, ratio = float(dampings[i]), float(dampings[i] / (2.0 * np.sqrt(stiffness[i] * masses[i])))
+            if 0.0 < ratio < _MIN_DAMPING_RATIO and 1.0 <= c <= _MAX_PERCENT:
+                value = f"machine.{name}{f'[{i}]' * (np.size(dampings) > 1)} is {c:g} N s/m, {100.0 * ratio:.2g} %"
+                meant = f"of the critical damping; a plain number is in N s/m: did you mean '{c:g} %'?"
+                notes.append(f"{value} {meant}")
     return notes
 
 

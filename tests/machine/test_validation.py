@@ -218,6 +218,14 @@ def test_a_stiffness_far_below_the_others_is_noted():
     assert implausible_numbers(jv.scene_from_toml(two.replace("40.0]", "0.0]"))) == []
 
 
+def test_a_damping_without_its_percent_sign_is_noted():
+    says = "machine.link_damping is 2 N s/m, {} % of the critical damping; a plain number is in N s/m: did you mean '2 %'?"
+    two = TEMPLATES["two_mass"].replace("link_damping = 60.0", 'link_damping = "2"')
+    (note,) = implausible_numbers(jv.scene_from_toml(two))
+    assert note == says.format(note.split()[5])
+    assert implausible_numbers(jv.scene_from_toml(two.replace('"2"', '"2 %"'))) == []
+
+
 def test_implausible_bodies_in_a_plane_are_noted():
     wrong = SCREENS["linear_screen"].replace("2600.0", "450e3").replace("[0.46, 0.81]", "[460, 810]")
     notes = implausible_numbers(jv.scene_from_toml(wrong.replace("280 N/mm", "280 N/m").replace("460 N/mm", "460 N/m")))
