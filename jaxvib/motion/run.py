@@ -371,7 +371,20 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
             strict=True,
         )
         *named, force = (f"{name} {quantity_text(x, unit, 4)}{time}" for name, x, unit, time in largest)
-        return f"largest on the way{when}, zero to peak: {', '.join(named)}; {force}"
+        start = "; the loads began side by side, another separation changes these values" if self._begins_side_by_side else ""
+        return f"largest on the way{when}, zero to peak: {', '.join(named)}; {force}{start}"
+
+    @property
+    def _begins_side_by_side(self) -> bool:
+        """True if loads with a size that are at rest at the beginning of the stored motion lie side by side."""
+        first = jax.tree.map(lambda values: np.asarray(values)[0], self._stored.state.exciters)
+        return any(
+            getattr(exciter.loads, "ball_radius", None) is not None
+            and np.size(own.angle[0]) > 1
+            and not np.any(own.rate[0])
+            and np.allclose(np.diff(own.angle[0]), np.diff(np.asarray(exciter.loads.offsets())), rtol=1e-6, atol=0.0)
+            for exciter, own in zip(self.scene.exciters, first, strict=True)
+        )
 
     def _detachment(self) -> list[str]:
         times = np.asarray(self.detached)

@@ -153,6 +153,12 @@ def test_loads_start_one_degree_apart_at_rest(given, expected):
         np.testing.assert_allclose(jv.initial_state(scene(), start, **given).azimuth + np.pi / 2, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize(("given", "says"), [({}, True), ({"separation": "60 deg"}, False), ({"save": "window"}, False)])
+def test_summaries_state_that_loads_begin_side_by_side(given, says):
+    run = jv.simulate(three_balls(ball_radius=0.011), 2.0, estimate=False, **given)
+    assert ("; the loads began side by side, another separation changes these values" in run.summary()) == says
+
+
 def test_loads_of_known_size_start_side_by_side():
     angle = np.asarray(jv.initial_state(three_balls(ball_radius=0.011)).azimuth)
     np.testing.assert_allclose(np.diff(angle), 2.0 * np.arcsin(0.11), rtol=1e-12)
