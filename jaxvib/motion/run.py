@@ -379,7 +379,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """True if loads with a size that are at rest at the beginning of the stored motion lie side by side."""
         first = jax.tree.map(lambda values: np.asarray(values)[0], self._stored.state.exciters)
         return any(
-            getattr(exciter.loads, "ball_radius", None) is not None
+            exciter.loads is not None
+            and getattr(exciter.loads, "ball_radius", None) is not None
             and np.size(own.angle[0]) > 1
             and not np.any(own.rate[0])
             and np.allclose(np.diff(own.angle[0]), np.diff(np.asarray(exciter.loads.offsets())), rtol=1e-6, atol=0.0)

@@ -41,7 +41,7 @@ def periodic_samples(orders: tuple[int, ...], speed: Array, displacement: Array,
     k, theta = np.asarray(orders), 2.0 * np.pi * np.arange(2 * _PERIOD_SAMPLES + 1) / _PERIOD_SAMPLES
     wave = jnp.asarray(np.exp(1j * np.outer(k, theta)), displacement.dtype)
     q, v, a = ((displacement * ((1j * k * speed) ** order)[None] @ wave).real.T for order in range(3))
-    return Samples(theta / speed, q, v, a, (force @ wave).real.T)
+    return Samples(jnp.asarray(theta) / speed, q, v, a, (force @ wave).real.T)
 
 
 @with_known_names

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from jaxvib.display import quantity_text, speed_text
 from jaxvib.equations.dynamics import Dynamics
@@ -155,7 +156,7 @@ class AbstractMeasured(Readable):
         )
         return f"amplitude, zero to peak: {amplitude}; foundation force {force}{kind}"
 
-    def speeds_text(self, scene: Scene, rotor_speeds: Sequence[Array], last_speed: Array | None = None) -> str:
+    def speeds_text(self, scene: Scene, rotor_speeds: Sequence[ArrayLike], last_speed: Array | None = None) -> str:
         """Return a line of text with the speeds of the turning masses, the last of the `rotor_speeds` (nt,), rad/s, of each
         exciter with loads, and in a settled motion the variation of the speeds of the other rotors.
 
