@@ -168,7 +168,7 @@ class AbstractMeasured(Readable):
         fastest = np.max(np.abs(end))
         turns = fastest > STILL_SHARE * float(scene.top_speed)
         if turns and not bool(self.settled) and np.max(np.abs(end - mean)) > _MAX_SHOWN_AS_MEAN * fastest:
-            recent = [np.asarray(speeds)[last_samples(len(speeds))] for speeds in rotor_speeds]
+            recent = [speeds[last_samples(len(speeds))] for speeds in map(np.asarray, rotor_speeds)]
             at_end = dataclasses.replace(self, load_speed=end, omega=np.mean(turning_directions(scene) * end))
             means = f"means of the window, in which the speeds change: {speed_text(mean, 6)}"
             return f"at the end, {at_end.speeds_text(scene, recent).replace(_AT_END, '')}; {means}"
