@@ -140,23 +140,28 @@ def largest_extent(path: Array) -> Extent:
     directions are equal, one of them is used.
     """
 
-    def width(direction: Array) -> Array:
+    known = jax.lax.stop_gradient(path)
+
+    def width(direction: Array, path: Array) -> Array:
         return 2.0 * half_range(path @ jnp.stack([jnp.cos(direction), jnp.sin(direction)]))
 
-    def improved(direction: Array) -> Array:
+    def improved(direction: Array, path: Array) -> Array:
         """The direction after a step of Newton's method."""
-        bend = jax.lax.stop_gradient(jax.grad(jax.grad(width))(direction))
+        one = jnp.ones_like(direction)
+        slope, bend = jax.jvp(lambda a: jax.jvp(lambda b: width(b, path), (a,), (one,))[1], (direction,), (one,))
+        bend = jax.lax.stop_gradient(bend)
         moves = has_axis & (bend < 0.0)
-        change = jnp.where(moves, jax.grad(width)(direction), 0.0) / jnp.where(moves, -bend, 1.0)
+        change = jnp.where(moves, slope, 0.0) / jnp.where(moves, -bend, 1.0)
         return direction + jnp.clip(change, -_SPACING, _SPACING)
 
     angles = jnp.asarray(_SPACING * np.arange(1, _DIRECTIONS + 1) - 0.5 * np.pi, path.dtype)
-    widths = jnp.ptp(jax.lax.stop_gradient(path) @ jnp.stack([jnp.cos(angles), jnp.sin(angles)]), axis=0)
+    widths = jnp.ptp(known @ jnp.stack([jnp.cos(angles), jnp.sin(angles)]), axis=0)
     has_axis = jnp.min(widths) < (1.0 - _MIN_DIFFERENCE) * jnp.max(widths)
-    direction = angles[jnp.argmax(widths)]
-    for _ in range(_DIRECTION_STEPS):
-        direction = improved(jax.lax.stop_gradient(direction))
-    stroke = width(jax.lax.stop_gradient(direction))
+    best = angles[jnp.argmax(widths)]
+    # A loop is compiled in a fraction of the time of its steps one after another. The last step carries the derivatives.
+    found = jax.lax.fori_loop(0, _DIRECTION_STEPS - 1, lambda _, direction: improved(direction, known), best)
+    direction = improved(jax.lax.stop_gradient(found), path)
+    stroke = width(jax.lax.stop_gradient(direction), path)
     turned = jnp.where(has_axis, direction, 0.0)
     return Extent(stroke, 0.5 * jnp.arctan2(jnp.sin(2.0 * turned), jnp.cos(2.0 * turned)))
 

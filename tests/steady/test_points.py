@@ -258,12 +258,12 @@ def sampled_path(harmonics, count=1024, further=2):
 def test_largest_extent_is_that_of_a_dense_sampling(seed):
     rng = np.random.default_rng(seed)
     parts = rng.normal(size=(2, 4, 2)) / np.array([1.0, 2.0, 5.0, 10.0])[:, None]
-    found = largest_extent(sampled_path(parts[0] + 1j * parts[1]))
-    angle, width = widths(np.asarray(sampled_path(parts[0] + 1j * parts[1], 4000)))
-    np.testing.assert_allclose(found.stroke, np.max(width), rtol=2e-6)
-    np.testing.assert_allclose(found.direction, angle[np.argmax(width)], atol=2e-3)
-
     extent = jax.jit(lambda x: jnp.stack(largest_extent(sampled_path(x[0] + 1j * x[1]))))
+    stroke, direction = extent(jnp.asarray(parts))
+    angle, width = widths(np.asarray(sampled_path(parts[0] + 1j * parts[1], 4000)))
+    np.testing.assert_allclose(stroke, np.max(width), rtol=2e-6)
+    np.testing.assert_allclose(direction, angle[np.argmax(width)], atol=2e-3)
+
     change, step = rng.normal(size=parts.shape), 1e-6
     slope = jax.jvp(extent, (jnp.asarray(parts),), (jnp.asarray(change),))[1]
     ends = [extent(jnp.asarray(parts + sign * step * change)) for sign in (-1.0, 1.0)]
