@@ -402,12 +402,11 @@ def test_converter_that_comes_to_rest_has_its_working_speed():
     stop = jv.SpeedProfile([0.0, 5.0, 60.0, 65.0], [0.0, 90.0, 90.0, 0.0])
     converter = jv.Converter(jv.DCMotor(120.0, stall_torque=8.0, inertia=0.1), stop)
     shifted = jv.DCMotor(90.0, stall_torque=6.0, inertia=0.1)  # the same line, moved to the no-load speed 90 rad/s
-    for count in (1, 2):
-        first, second = (body([jv.Exciter(drive=drive, unbalance=S)] * count) for drive in (converter, shifted))
-        found, exact = (jv.response(scene, SPEEDS) for scene in (first, second))
-        np.testing.assert_allclose(found.motor_torque, exact.motor_torque, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(found.operating.speed, exact.operating.speed, rtol=1e-9)
-        np.testing.assert_allclose(found.folds.factor, exact.folds.factor, rtol=1e-9)
+    first, second = (body([jv.Exciter(drive=drive, unbalance=S)] * 2) for drive in (converter, shifted))
+    found, exact = (jv.response(scene, SPEEDS) for scene in (first, second))
+    np.testing.assert_allclose(found.motor_torque, exact.motor_torque, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(found.operating.speed, exact.operating.speed, rtol=1e-9)
+    np.testing.assert_allclose(found.folds.factor, exact.folds.factor, rtol=1e-9)
     found, exact = map(jv.synchronous_regimes, (first, second))
     np.testing.assert_allclose(found.speed, exact.speed, rtol=1e-9)
     np.testing.assert_allclose(found.power, exact.power, rtol=1e-7, atol=1e-9)
