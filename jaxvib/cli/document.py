@@ -159,22 +159,26 @@ def note_loads(scene: jv.Scene, stable: Sequence[float], path: Path | None, *, a
     from jaxvib.machine.files import read_toml  # slow imports, which --help does not need
     from jaxvib.machine.validation import load_weight_notes
 
-    drag_notes = [] if path is None else drag_speed_notes(read_toml(path), stable)
-    for each in (*load_weight_notes(scene, min(stable, default=None) if averaged else None), *drag_notes):
+    of_drag = [] if path is None else drag_notes(read_toml(path), stable)
+    for each in (*load_weight_notes(scene, min(stable, default=None) if averaged else None), *of_drag):
         note(f"note: {each}")
 
 
-def drag_speed_notes(tables: Mapping[str, Any], stable: Sequence[float]) -> list[str]:
-    """Return a note for each drag that the tables of a scene file compute for a load speed at which no jam is; `stable`: as
-    above."""
+def drag_notes(tables: Mapping[str, Any], stable: Sequence[float]) -> list[str]:
+    """Return a note for each drag that the tables of a scene file compute for a load speed at which no jam is, and for each
+    drag of rollers in oil; `stable`: as above."""
     from jaxvib.display import speed_text  # slow imports, which --help does not need
     from jaxvib.units import number
 
     notes, owners = [], {"": tables} | {f"exciters[{k}].": table for k, table in enumerate(tables.get("exciters", []))}
-    for prefix, owner in owners.items() if stable else ():
+    for prefix, owner in owners.items():
         loads = owner.get("loads", {})
         drag = loads.get("drag") if isinstance(loads, Mapping) else None
-        if not isinstance(drag, Mapping) or "load_speed" not in drag:
+        if not isinstance(drag, Mapping):
+            continue
+        if loads.get("kind") == "roller" and drag.get("cause") == "oil":
+            notes.append(f"{prefix}loads.drag is that of a sphere in oil; that of a roller depends on its length: measure it")
+        if not stable or "load_speed" not in drag:
             continue
         given = float(number(drag["load_speed"], "rad/s", "load_speed"))
         nearest = min(stable, key=lambda speed: abs(speed - given))

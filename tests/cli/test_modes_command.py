@@ -10,7 +10,7 @@ import numpy as np
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.cli.document import drag_speed_notes
+from jaxvib.cli.document import drag_notes
 from jaxvib.cli.modes import _drag_lines, _fold_lines, _imbalance_lines
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.steady.jams.phase_search import PhaseJams
@@ -86,13 +86,15 @@ def test_folds_far_above_the_rotor_speed_are_only_counted():
 
 def test_a_drag_for_another_load_speed_has_a_note():
     tables = {"loads": {"drag": {"cause": "bearing", "load_speed": "600 rpm"}}}
-    (note,) = drag_speed_notes(tables, [10.0, 30.0])
+    (note,) = drag_notes(tables, [10.0, 30.0])
     assert note.startswith(
         "loads.drag is for 600 rpm, and the nearest stable jam is at 286.48 rpm: repeat with load_speed = '286"
     )
-    assert drag_speed_notes(tables, [62.0, 30.0]) == drag_speed_notes(tables, []) == []
-    assert drag_speed_notes({"loads": {"drag": 1.0}}, [30.0]) == []
-    (of_exciter,) = drag_speed_notes({"exciters": [{"unbalance": 0.1}, tables]}, [10.0, 30.0])
+    assert drag_notes(tables, [62.0, 30.0]) == drag_notes(tables, []) == []
+    assert drag_notes({"loads": {"drag": 1.0}}, [30.0]) == []
+    (of_roller,) = drag_notes({"loads": {"kind": "roller", "drag": {"cause": "oil"}}}, [])
+    assert of_roller == "loads.drag is that of a sphere in oil; that of a roller depends on its length: measure it"
+    (of_exciter,) = drag_notes({"exciters": [{"unbalance": 0.1}, tables]}, [10.0, 30.0])
     assert of_exciter == f"exciters[1].{note}"
 
 
