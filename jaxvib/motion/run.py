@@ -294,7 +294,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         if np.isnan(self.error):
             return "error not estimated"
         if self.error > _LARGE_ERROR:
-            return f"the phase of the motion is not determined (estimated error of the states in the window {self.error:.1e})"
+            size = f"(estimated error of the states in the window {self.error:.1e})"
+            return f"the phase of the motion is not determined {size}; small changes of the machine can change peaks on the way"
         states = "angles in the window" if no_vibration == ZERO_VIBRATION else "states in the window, phase included,"
         return f"estimated error of the {states} {float(self.error):.1e}"
 
