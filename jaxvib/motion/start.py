@@ -156,6 +156,8 @@ def _load_offsets(
     if not side_by_side:
         return offsets
     touching = numpy_if_known(loads.offsets())
+    if gap == 0.0:
+        return touching
     return array_module(touching).where(abs(offsets) > abs(touching), offsets, touching)  # both have equal steps
 
 
