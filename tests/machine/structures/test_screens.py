@@ -36,11 +36,11 @@ def test_circular_screen_moves_on_circles():
 
 
 def test_regime_of_a_screen_has_the_ellipses_of_its_run():
-    """The error of the averaged theory is about S^2/(2 M I), here 0.7 %: a second harmonic of this size, whose acceleration is
-    four times as large, 2.8 %."""
+    """The error of the averaged theory is about S^2/(2 M I), here 0.7 %. It omits the second and third harmonics, which are 1.4
+    and 1.5 % of the acceleration."""
     scene = jv.scene_from_toml(SCREENS["linear_screen"])
     averaged = jv.synchronous_regimes(scene).select(0).ellipse((1.5, 0.1))
     settled = jv.simulate(scene, 15.0, save="window", estimate=False).ellipse((1.5, 0.1))
     np.testing.assert_allclose(averaged.semi_major, settled.semi_major, rtol=0.01)
     np.testing.assert_allclose(averaged.direction, settled.direction, atol=0.01)
-    np.testing.assert_allclose(averaged.throw_number, settled.throw_number, rtol=4 * 0.0072)
+    np.testing.assert_allclose(averaged.throw_number, settled.throw_number, rtol=0.014 + 0.015)
