@@ -139,14 +139,13 @@ def largest_extent(path: Array) -> Extent:
     the derivatives of the stroke; those of the direction follow from the implicit function theorem. If the extents in several
     directions are equal, one of them is used.
     """
-
     known = jax.lax.stop_gradient(path)
 
     def width(direction: Array, path: Array) -> Array:
         return 2.0 * half_range(path @ jnp.stack([jnp.cos(direction), jnp.sin(direction)]))
 
     def improved(direction: Array, path: Array) -> Array:
-        """The direction after a step of Newton's method."""
+        """Return the direction after a step of Newton's method."""
         one = jnp.ones_like(direction)
         slope, bend = jax.jvp(lambda a: jax.jvp(lambda b: width(b, path), (a,), (one,))[1], (direction,), (one,))
         bend = jax.lax.stop_gradient(bend)

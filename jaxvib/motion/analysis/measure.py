@@ -196,6 +196,7 @@ def last_samples(count: int) -> slice:
     return slice(count - max(2, count // _LAST_PARTS), None)
 
 
+@cached
 def last_mean_speeds(times: Array, angle: Array, rate: Array) -> Array:
     """Return the mean speeds (m,), rad/s, over the whole turns at the end of a window, for arguments as in `mean_speeds`."""
     return mean_speeds(times, angle, rate, (last_samples(len(times)).start,))[0]
